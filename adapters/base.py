@@ -12,7 +12,6 @@ import contextlib
 import dataclasses
 import fnmatch
 import glob
-import importlib
 import itertools
 import math
 import os
@@ -54,18 +53,17 @@ def open_scene(uri: str) -> Scene:
         near = nearest_word(scheme, tuple(SCHEMES))
         guess = f"; did you mean {near}?" if near else ";"
         raise AdapterError(f"unknown scheme {scheme!r} in {uri!r}{guess} known: {known_schemes()}")
-    opener = getattr(importlib.import_module(entry.module), entry.function)
     if entry.builtin:
         if path not in entry.builtin:
             raise AdapterError(
                 f"{scheme}:{path}: {scheme} scenes are {', '.join(entry.builtin)}; got {path!r}. "
                 f"Example: {entry.example}"
             )
-        scene = opener(query)
+        scene = entry.open(query)
     else:
         _check_there(Path(path))
         try:
-            scene = opener(path, query)
+            scene = entry.open(path, query)
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
     if ground_z is not None:

@@ -10,7 +10,6 @@ the scene was fitted to. `data` says where that is now, if it has moved.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -103,12 +102,8 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
     """
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
-    scheme = SCHEMES[recording.scheme]
-    if scheme.labels is None:
-        return None
     query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
-    find = getattr(importlib.import_module(scheme.module), scheme.labels)
-    return find(recording.path, query)
+    return SCHEMES[recording.scheme].open_labels(recording.path, query)
 
 
 def _given(uri: str) -> Recording:

@@ -6,13 +6,19 @@ that exists as written is taken as written. `+` stands for itself.
 
 from __future__ import annotations
 
+import importlib
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, unquote
 
 from augment.errors import AdapterError
+
+if TYPE_CHECKING:  # torch would be loaded with them
+    from augment.labels import LabelSource
+    from augment.scene import Scene
 
 CAMERA_PATH_KEY = "camera_path"
 GROUND_KEY = "ground_z"
@@ -21,64 +27,71 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 @dataclass(frozen=True)
 class Scheme:
-    """What opens a kind of scene. module, function: imported when used; from path and query to a
-    Scene whose `source` is `format_uri(scheme, path, query)`, with an AdapterError for keys that it
-    does not know. builtin: the names that the path may be where it is no file; the function takes
-    the query alone then. labels: the module's function from path and query to the labels alone (a
-    LabelSource or None), which a scene fitted to such data needs."""
+    """What opens a kind of scene; functions as module:name, imported when used.
 
-    module: str
-    function: str
+    opener: from path and query to a Scene whose `source` is `format_uri(scheme, path, query)`, with
+    an AdapterError for unknown keys. builtin: names that the path may be where it is no file; the
+    opener takes the query alone then. labels: from path and query to the labels alone (None where
+    there are none), which a scene fitted to such data needs."""
+
+    opener: str
     example: str
     builtin: tuple[str, ...] = ()
     labels: str | None = None
 
+    def open(self, *path_and_query: object) -> Scene:
+        return _imported(self.opener)(*path_and_query)
+
+    def open_labels(self, path: str, query: Mapping[str, str]) -> LabelSource | None:
+        return _imported(self.labels)(path, query) if self.labels else None
+
+
+def _imported(name: str) -> Callable[..., Any]:
+    module, function = name.split(":")
+    return getattr(importlib.import_module(module), function)
+
 
 SCHEMES = {
     "procedural": Scheme(
-        "adapters.procedural",
-        "open_procedural",
+        "adapters.procedural:open_procedural",
         "procedural:street?seed=3",
         ("street",),
-        labels="procedural_labels",
+        "adapters.procedural:procedural_labels",
     ),
     "pandaset": Scheme(
-        "adapters.pandaset", "open_pandaset", "pandaset:data/pandaset/002", labels="pandaset_labels"
+        "adapters.pandaset.adapter:open_pandaset",
+        "pandaset:data/pandaset/002",
+        labels="adapters.pandaset.files:pandaset_labels",
     ),
     "nuscenes": Scheme(
-        "adapters.nuscenes",
-        "open_nuscenes",
+        "adapters.nuscenes.adapter:open_nuscenes",
         "nuscenes:data/nuscenes?scene=scene-0061",
-        labels="nuscenes_labels",
+        labels="adapters.nuscenes.adapter:nuscenes_labels",
     ),
     "kitti": Scheme(
-        "adapters.kitti",
-        "open_kitti",
+        "adapters.kitti.adapter:open_kitti",
         "kitti:data/kitti/2011_09_26/2011_09_26_drive_0001_sync",
-        labels="kitti_labels",
+        labels="adapters.kitti.adapter:kitti_labels",
     ),
     "street_gaussians": Scheme(
-        "adapters.street_gaussians.adapter",
-        "open_street_gaussians",
+        "adapters.street_gaussians.adapter:open_street_gaussians",
         "street_gaussians:output/waymo/002?data=data/waymo/002",
-        labels="street_gaussians_labels",
+        labels="adapters.street_gaussians.adapter:street_gaussians_labels",
     ),
     "drivestudio": Scheme(
-        "adapters.drivestudio.adapter",
-        "open_drivestudio",
+        "adapters.drivestudio.adapter:open_drivestudio",
         "drivestudio:output/omnire/run?data=data/waymo/processed/training/023",
-        labels="drivestudio_labels",
+        labels="adapters.drivestudio.adapter:drivestudio_labels",
     ),
     "recording": Scheme(
-        "adapters.recording",
-        "open_recording",
+        "adapters.recording.adapter:open_recording",
         "recording:out/street-seed3/clear-000",
-        labels="recording_labels",
+        labels="adapters.recording.adapter:recording_labels",
     ),
     "gaussians": Scheme(
-        "adapters.gaussian_files", "open_gaussians", "gaussians:model/point_cloud.ply?up=-y"
+        "adapters.gaussian_files:open_gaussians", "gaussians:model/point_cloud.ply?up=-y"
     ),
-    "scene": Scheme("adapters.scene_folder", "open_scene_folder", "scene:out/fitted"),
+    "scene": Scheme("adapters.scene_folder:open_scene_folder", "scene:out/fitted"),
 }
 
 

@@ -10,13 +10,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from adapters.lidar_scene.fill import bridge_gaps, fill_ground, fill_walls
 from adapters.lidar_scene.image_views import Body, Seen, View, observe_views
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import ObjectTrack, PointSet, indices_between, is_flat, split_sweeps
 from adapters.lidar_scene.surfels import (
     Surfels,
     borrow_colours,
+    bridge_gaps,
+    fill_ground,
+    fill_walls,
     gaussians_from_surfels,
     surfels_from_points,
     thin_points,

@@ -21,17 +21,15 @@ from tqdm import tqdm
 from adapters.lidar_scene.scene import build_lidar_scene, views_of
 from adapters.lidar_scene.split import indices_between, inside_box, join_tracks
 from adapters.pandaset.files import (
-    Sequence,
-    read_cuboids,
-    read_lidar,
-    read_semantics,
-    read_sequence,
-)
-from adapters.pandaset.labels import (
     Objects,
     PandaSetLabels,
+    Sequence,
     boxes_of_cuboids,
+    read_cuboids,
+    read_lidar,
     read_objects,
+    read_semantics,
+    read_sequence,
     semantic_table,
     sensors_of,
 )

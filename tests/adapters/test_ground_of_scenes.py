@@ -16,7 +16,7 @@ from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
 from adapters.gaussian_files import open_gaussians
-from adapters.recording.labels import RecordingLabels
+from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import CAMBER, EGO_Y_M, road_z
 from augment.errors import BackendUnavailable
 from augment.files.ply import write_ply

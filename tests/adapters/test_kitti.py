@@ -15,7 +15,7 @@ import torch
 from shown import assert_same_bits, psnr, psnr_of, render
 
 from adapters.base import open_scene
-from adapters.kitti import kitti_labels, open_kitti
+from adapters.kitti.adapter import kitti_labels, open_kitti
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.kitti import kitti_labels, kitti_root, open_kitti
-from adapters.kitti import labels as tracklets
-from adapters.kitti.adapter import find_source
-from adapters.kitti.files import oxts_poses, registered_poses
-from adapters.kitti.labels import boxes_at
+from adapters.kitti import adapter as tracklets
+from adapters.kitti.adapter import boxes_at, find_source, kitti_labels, open_kitti
+from adapters.kitti.files import kitti_root, oxts_poses, registered_poses
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 

@@ -14,14 +14,13 @@ import pytest
 from drivestudio_files import write_run
 
 from adapters.drivestudio.adapter import drivestudio_labels
-from adapters.kitti.labels import KittiLabels
-from adapters.nuscenes.labels import nuscenes_labels
-from adapters.pandaset.files import read_lidar
-from adapters.pandaset.labels import SENSORS_M, PandaSetLabels, places_at
+from adapters.kitti.adapter import KittiLabels
+from adapters.nuscenes.adapter import nuscenes_labels
+from adapters.pandaset.files import SENSORS_M, PandaSetLabels, places_at, read_lidar
 from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
-from adapters.recording.labels import RecordingLabels
+from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import StreetParameters
-from adapters.street_gaussians.labels import ROOF_SENSOR_M, StreetGaussiansLabels
+from adapters.street_gaussians.adapter import ROOF_SENSOR_M, StreetGaussiansLabels
 from augment.labels import KnowsLidarOrigins, LidarSweep
 
 PANDASET = Path(__file__).resolve().parents[3] / "shared" / "data" / "pandaset_mini" / "002"

@@ -6,23 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar_scene.fill import (
-    CLOSE_M,
-    MAX_WALL_GAP_M,
-    bridge_gaps,
-    fill_ground,
-    fill_walls,
-    ground_points,
-)
 from adapters.lidar_scene.split import PointSet
 from adapters.lidar_scene.surfels import (
+    CLOSE_M,
     GROWTH,
+    MAX_WALL_GAP_M,
     NEAR_M,
     SplatShape,
     borrow_colours,
+    bridge_gaps,
     coarse_sample,
     edges_at,
+    fill_ground,
+    fill_walls,
     gaussians_from_surfels,
+    ground_points,
     surfels_from_points,
     thin_points,
 )

@@ -15,8 +15,7 @@ import torch
 from shown import assert_same_bits, psnr, psnr_of, render
 
 from adapters.base import open_scene, recognise
-from adapters.nuscenes import open_nuscenes
-from adapters.nuscenes.labels import EGO_HIGH_M, EGO_LOW_M
+from adapters.nuscenes.adapter import EGO_HIGH_M, EGO_LOW_M, open_nuscenes
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.labels import ClassifiesLidar

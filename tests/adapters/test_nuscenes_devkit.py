@@ -14,7 +14,8 @@ import numpy as np
 import nuscenes_files as files
 import pytest
 
-from adapters.nuscenes import frame_tokens, nuscenes_labels
+from adapters.nuscenes.adapter import nuscenes_labels
+from adapters.nuscenes.tables import frame_tokens
 
 VARIABLE = "CLIMATEGS_NUSCENES_DEVKIT"
 SCRIPT = """

@@ -12,9 +12,9 @@ import nuscenes_files as files
 import pandaset_folder as street
 import pytest
 
-from adapters.nuscenes import frame_tokens, nuscenes_labels, open_nuscenes
 from adapters.nuscenes import tables as rows
-from adapters.nuscenes.tables import NuScenesOptions, read_tables
+from adapters.nuscenes.adapter import nuscenes_labels, open_nuscenes
+from adapters.nuscenes.tables import NuScenesOptions, frame_tokens, read_tables
 from augment.errors import AdapterError
 
 ONE, TWO = files.SCENES

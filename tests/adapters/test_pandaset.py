@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from shown import assert_same_bits, psnr, psnr_of, render
 
-from adapters.pandaset import open_pandaset
+from adapters.pandaset.adapter import open_pandaset
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.render.rasterize import rasterize

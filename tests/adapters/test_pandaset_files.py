@@ -11,8 +11,14 @@ import pytest
 import torch
 
 from adapters.pandaset.adapter import read_drive
-from adapters.pandaset.files import read_lidar, read_semantics, read_sequence
-from adapters.pandaset.labels import NO_SURFACE, PandaSetLabels, semantic_table
+from adapters.pandaset.files import (
+    NO_SURFACE,
+    PandaSetLabels,
+    read_lidar,
+    read_semantics,
+    read_sequence,
+    semantic_table,
+)
 from adapters.raw_drive import DriveOptions, FrameRange
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat

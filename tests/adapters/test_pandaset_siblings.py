@@ -8,8 +8,14 @@ import pandaset_folder as street
 import pytest
 
 from adapters.pandaset.adapter import read_drive
-from adapters.pandaset.files import read_cuboids, read_sequence
-from adapters.pandaset.labels import PandaSetLabels, boxes_of_cuboids, find_objects, read_objects
+from adapters.pandaset.files import (
+    PandaSetLabels,
+    boxes_of_cuboids,
+    find_objects,
+    read_cuboids,
+    read_objects,
+    read_sequence,
+)
 from augment.errors import AdapterError
 
 LINKS = ["cuboids.sibling_id"]

@@ -15,7 +15,7 @@ from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
 from adapters.plain_files import inside, read_image_size, read_json, read_numbers, read_pose
-from adapters.recording.labels import read_sweep
+from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
 from adapters.street_gaussians.model import read_config as street_gaussians_config
 from adapters.training_views.depth_priors import read_metric

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from adapters.pandaset.adapter import _frame
-from adapters.pandaset.files import read_sequence
-from adapters.pandaset.labels import PandaSetLabels
+from adapters.pandaset.files import PandaSetLabels, read_sequence
 from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
 from augment.scene import Scene

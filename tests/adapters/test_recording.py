@@ -20,7 +20,7 @@ from recording_folder import QUERY, write_recording
 from shown import assert_same_bits, psnr_of, render
 
 from adapters.base import open_scene, recognise
-from adapters.recording import open_recording
+from adapters.recording.adapter import open_recording
 from adapters.recording.files import read_calibration
 from adapters.uri import format_uri
 from augment.errors import AdapterError

@@ -15,8 +15,8 @@ import recording_folder as recording
 from recording_folder import edit_calibration, write_recording
 
 from adapters.raw_drive import read_objects
+from adapters.recording.adapter import RecordingLabels, all_boxes, read_lidar_drive, read_sweep
 from adapters.recording.files import find_images, numbered_files, read_calibration, unlisted_images
-from adapters.recording.labels import RecordingLabels, all_boxes, read_lidar_drive, read_sweep
 from augment.errors import AdapterError
 from augment.jobs.layout import folder_name
 from augment.jobs.tables import lidar_bytes

@@ -12,12 +12,11 @@ from fitted_scenes import assert_same, fitted_scene
 from pandaset_folder import write_sequence
 
 from adapters.base import open_scene, recognise
-from adapters.pandaset.labels import PandaSetLabels
+from adapters.pandaset.files import PandaSetLabels
 from adapters.scene_folder import storable
 from augment.errors import AdapterError, SceneError
 from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.processes import share_scene
-from augment.scene import Scene
 
 STREET = (
     "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
@@ -144,8 +143,8 @@ def test_a_scene_made_from_a_fitted_scene_keeps_its_recording(tmp_path):
 
 def test_workers_share_a_scene_folders_scene(tmp_path):
     scene = open_scene(f"scene:{save(tmp_path, recorded_source=STREET)}")
-    shared = share_scene(scene, tmp_path)
-    again: Scene = shared.open()
+    shared = share_scene(scene, scene.frames, tmp_path)
+    again, _ = shared.open()
     shared.remove()
     assert_same(scene, again, but=("labels",))
     assert again.labels == scene.labels

@@ -18,12 +18,12 @@ from drivestudio_files import write_run
 from recording_folder import write_recording
 
 from adapters.drivestudio.adapter import drivestudio_labels
-from adapters.kitti.labels import KittiLabels
-from adapters.nuscenes.labels import nuscenes_labels
-from adapters.pandaset.labels import PandaSetLabels
+from adapters.kitti.adapter import KittiLabels
+from adapters.nuscenes.adapter import nuscenes_labels
+from adapters.pandaset.files import PandaSetLabels
 from adapters.procedural import StreetLabels
-from adapters.recording.labels import RecordingLabels
-from adapters.street_gaussians.labels import StreetGaussiansLabels
+from adapters.recording.adapter import RecordingLabels
+from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError

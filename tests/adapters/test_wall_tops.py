@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.training_views.walls import wall_tops
+from adapters.training_views.starting_scene import wall_tops
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.reconstruct.view import RecordedView, ViewKey
@@ -136,7 +136,7 @@ def test_budget_repetition_and_no_views(monkeypatch):
     assert len(one) > 0
     source.train = ()
     assert len(wall_tops(scene, source)) == 0
-    monkeypatch.setattr("adapters.training_views.walls._MAX_GAUSSIANS", len(full) // 3)
+    monkeypatch.setattr("adapters.training_views.starting_scene._MAX_GAUSSIANS", len(full) // 3)
     few = wall_tops(scene, Images(scene, 6.5))
     assert 0 < len(few) <= len(full) // 3
     assert few.means[:, 2].max() == pytest.approx(6.5, abs=0.5)
