@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from jinja2 import Environment, PackageLoader
 from tqdm import tqdm
 
 from adapters.uri import parse_uri
@@ -33,7 +34,15 @@ from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from tools.drawing import color_bar, color_mapped, log_ticks, short_number, write, write_rgb
+from tools.drawing import (
+    color_bar,
+    color_mapped,
+    log_ticks,
+    resized,
+    short_number,
+    write,
+    write_rgb,
+)
 from tools.training import FIT_PANELS, write_curves
 
 if TYPE_CHECKING:
@@ -44,6 +53,14 @@ TRAINING_SAMPLE = 12  # beside the held-out views, to see what was learnt by hea
 MAX_TRUE_VIEWS = 24
 CURVES, PICTURES = "curves.png", "held_out.jpg"
 TRAINING_PICTURES = "training_views.jpg"
+MAX_ROWS = 12  # of the pictures
+MAX_OF_A_CAMERA = 3
+CELL_WIDTH = 480  # px of one image of the pictures
+_GAP, _EDGE = 6, 16
+_HEAD, _TITLE = 70, 34  # px above the first row, and above each row's images
+_BACKGROUND, _INK, _SOFT, _NOTHING = (250, 250, 250), (30, 30, 30), (110, 110, 110), (90, 90, 90)
+_BAR = (200, 10)
+_FLIP_COLORS, _DEPTH_COLORS = cv2.COLORMAP_MAGMA, cv2.COLORMAP_TURBO
 
 DEFINITIONS = {
     "picture": "rendered without weather, with the camera's recorded exposure, clamped to [0, 1] "
@@ -93,6 +110,11 @@ def write_report(
     """
     split, keys, note = _choose_split(source)
     scores = evaluate_views(scene, source, keys, progress=progress)
+    sample = None
+    if split == "test":
+        learnt = _spread(source.train, TRAINING_SAMPLE)
+        means = mean_scores(evaluate_views(scene, source, learnt, with_flip=False))
+        sample = {"views": len(learnt), **means}
     report = {
         **(facts or {}),
         "gaussians": sum(map(len, scene.all_gaussians)),
@@ -100,7 +122,7 @@ def write_report(
         "scored": {"split": split, "views": len(scores), "note": note},
         "mean": mean_scores(scores),
         "cameras": means_by_camera(scores),
-        "training_sample": _training_sample(scene, source) if split == "test" else None,
+        "training_sample": sample,
         "views": [{"frame": s.key.frame, "camera": s.key.camera, **s.numbers()} for s in scores],
         "history": list(history),
         "definitions": DEFINITIONS,
@@ -124,12 +146,6 @@ def _choose_split(source: ViewSource) -> tuple[str, tuple[ViewKey, ...], str]:
         f"so the figures say less than those of views it has never seen."
     )
     return "train", keys, note
-
-
-def _training_sample(scene: Scene, source: ViewSource) -> dict[str, float]:
-    keys = _spread(source.train, TRAINING_SAMPLE)
-    scores = evaluate_views(scene, source, keys, with_flip=False)
-    return {"views": len(scores), **mean_scores(scores)}
 
 
 def _spread(keys: Sequence[ViewKey], most: int) -> tuple[ViewKey, ...]:
@@ -178,63 +194,27 @@ def _write_pictures(
 
 
 def _markdown(scene: Scene, report: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
-    scored = report["scored"]
-    kind = "held-out" if scored["split"] == "test" else "training"
-    lines = [f"# Reconstruction of {scene.name}", ""]
-    lines += [f"- {line}" for line in _summary(scene, report)]
-    lines += ["", f"## {scored['views']} {kind} views", ""]
-    lines += [scored["note"], ""] if scored["note"] else []
-    lines += _table(report, " m" if scene.has_metric_scale else "")
-    lines += ["", *_training_line(report), "## Pictures", ""]
-    lines += [f"![{title}]({name})\n" for name, title in pictures.items()] or ["None.", ""]
-    lines += ["## What the figures mean", ""]
-    lines += [f"- {name}: {text}." for name, text in report["definitions"].items()]
-    problems = report.get("problems") or []
-    lines += ["", "## Problems found in the data", ""] if problems else []
-    lines += [f"- {problem}" for problem in problems]
-    if report.get("settings"):
-        lines += ["", "## Settings", ""]
-        lines += [f"- {name}: {value}" for name, value in report["settings"].items()]
-    return "\n".join(lines) + "\n"
-
-
-def _summary(scene: Scene, report: Mapping[str, Any]) -> list[str]:
-    lines = [f"made from {report['scene']}"] if "scene" in report else []
-    if "step" in report and "steps" in report:
-        done = f"{report['step']} of {report['steps']} steps"
-        took = f" in {report['seconds'] / 60:.1f} minutes" if "seconds" in report else ""
-        lines.append(done + took)
-    unit = "" if scene.has_metric_scale else "; the scene's unit is not known to be a metre"
-    return [*lines, f"{report['gaussians']:,} Gaussians, {report['actors']} actors{unit}"]
-
-
-def _table(report: Mapping[str, Any], unit: str) -> list[str]:
     """A row per camera and one of the means over all views; columns nothing is known of are out."""
-    known = [name for name in _COLUMNS if name == "views" or name in report["mean"]]
+    unit = " m" if scene.has_metric_scale else ""
     total = {"views": report["scored"]["views"], **report["mean"]}
 
     def cell(row: Mapping[str, float], name: str) -> str:
         _, text, factor = _COLUMNS[name]
         return text.format(row[name] * factor, unit=unit) if name in row else "-"
 
-    lines = [f"|---|{'---:|' * len(known)}"]
-    rows = [("camera", [_COLUMNS[name][0] for name in known])] + [
-        (camera, [cell(row, name) for name in known])
-        for camera, row in (*report["cameras"].items(), ("**all**", total))
-    ]
-    texts = [f"| {' | '.join([name.replace('|', '/'), *cells])} |" for name, cells in rows]
-    return [texts[0], *lines, *texts[1:]]
-
-
-def _training_line(report: Mapping[str, Any]) -> list[str]:
-    sample = report.get("training_sample")
-    if not sample or "psnr" not in sample:
-        return []
-    return [
-        f"For comparison, {sample['views']} training views: PSNR {sample['psnr']:.2f} dB, "
-        f"SSIM {sample['ssim']:.3f}.",
-        "",
-    ]
+    templates = Environment(
+        loader=PackageLoader("tools"), trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )  # fmt: skip
+    return templates.get_template("fit_report.md").render(
+        scene=scene,
+        report=report,
+        pictures=pictures,
+        columns=_COLUMNS,
+        known=[name for name in _COLUMNS if name in total],
+        rows=[*report["cameras"].items(), ("**all**", total)],
+        cell=cell,
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -246,9 +226,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-# ---- Scores: how far renders of recorded views are from what was recorded ------------------------
 
 
 class RenderedView(NamedTuple):
@@ -397,18 +374,6 @@ def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> V
     )
 
 
-# ---- Pictures: recorded views beside their renders, where they differ, and the depth -------------
-
-MAX_ROWS = 12
-MAX_OF_A_CAMERA = 3
-CELL_WIDTH = 480  # px of one image
-_GAP, _EDGE = 6, 16
-_HEAD, _TITLE = 70, 34  # px above the first row, and above each row's images
-_BACKGROUND, _INK, _SOFT, _NOTHING = (250, 250, 250), (30, 30, 30), (110, 110, 110), (90, 90, 90)
-_BAR = (200, 10)
-_FLIP_COLORS, _DEPTH_COLORS = cv2.COLORMAP_MAGMA, cv2.COLORMAP_TURBO
-
-
 class _Row(NamedTuple):
     """Images at the size they are drawn; depth_m [H, W], 0 where there is no surface; counts [H, W]
     bool, False where a pixel is left out of the scores."""
@@ -473,23 +438,13 @@ def _row(scene: Scene, source: ViewSource, score: ViewScore) -> _Row:
     else:
         error = np.zeros(counts.shape, np.float32)
     depth = np.where(rendered.has_surface, rendered.median_depth_m, np.float32(0))
-    return _Row(
-        score=score,
-        recorded=_fitted(view.rgb),
-        rendered=_fitted(rendered.rgb),
-        error=_fitted(error),
-        # Depths and masks do not average: between two surfaces there is none.
-        depth_m=_fitted(depth, cv2.INTER_NEAREST),
-        counts=_fitted(counts.astype(np.uint8), cv2.INTER_NEAREST) > 0,
-    )
-
-
-def _fitted(image: np.ndarray, how: int | None = None) -> np.ndarray:
-    """The image at CELL_WIDTH."""
-    height = max(1, round(image.shape[0] * CELL_WIDTH / image.shape[1]))
-    shrinks = image.shape[1] > CELL_WIDTH
-    how = how if how is not None else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(image, (CELL_WIDTH, height), interpolation=how)
+    smooth = cv2.INTER_AREA if view.rgb.shape[1] > CELL_WIDTH else cv2.INTER_LINEAR
+    images = [resized(image, CELL_WIDTH, smooth) for image in (view.rgb, rendered.rgb, error)]
+    # Depths and masks do not average: between two surfaces there is none.
+    masks = [
+        resized(mask, CELL_WIDTH, cv2.INTER_NEAREST) for mask in (depth, counts.astype(np.uint8))
+    ]
+    return _Row(score, *images, depth_m=masks[0], counts=masks[1] > 0)
 
 
 def _depth_range(rows: Sequence[_Row]) -> tuple[float, float]:
@@ -551,9 +506,6 @@ def _figures(score: ViewScore, unit: str) -> str:
     return "     ".join(
         text.format(numbers[name]) for name, text in texts.items() if not np.isnan(numbers[name])
     )
-
-
-# ---- A scene fitted to renders of the procedural street, against the street's exact depth --------
 
 
 @dataclass(frozen=True)
