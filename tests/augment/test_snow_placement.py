@@ -15,13 +15,16 @@ from augment.effects.snow import placement, surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
+    RINGS_M,
     WHEEL_SHARE,
+    CellNumbers,
     PlacementSettings,
     place_snow_support,
+    plan_tiles,
+    views_along,
 )
 from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, is_vehicle
 from augment.effects.snow.surface_kernels import LINK, OPEN
-from augment.effects.snow.tiles import RINGS_M, CellNumbers, plan_tiles, views_along
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import EGO_VEHICLE

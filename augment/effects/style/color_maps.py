@@ -21,7 +21,7 @@ from jaxtyping import Float, Int16
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from augment.effects.style import sh_kernels
+from augment.render import composite_kernels
 from augment.render import sh as sh_layout
 from augment.render.buffers import AUTO, CUDA, REFERENCE, kernels_for
 from augment.render.cuda import runtime
@@ -227,10 +227,10 @@ def _on_cpu(
     folded: Float[Tensor, "C 13"],
 ) -> Float[Tensor, "N K 3"]:
     target = _new_memory(sh.shape) if out is None else out
-    aligned = target.data_ptr() % sh_kernels.ALIGNMENT == 0  # a view may begin anywhere
+    aligned = target.data_ptr() % composite_kernels.ALIGNMENT == 0  # a view may begin anywhere
     written = target if aligned else _new_memory(sh.shape)
     with kernel_threads(BLOCKS):
-        sh_kernels.map_sh(
+        composite_kernels.map_sh(
             sh.detach().contiguous().numpy().reshape(-1),
             written.detach().numpy().reshape(-1),
             sh.shape[1],
@@ -246,14 +246,14 @@ def _on_gpu(
     classes: Tensor | None,
     folded: Float[Tensor, "C 13"],
 ) -> Float[Tensor, "N K 3"]:
-    from augment.effects.style import cuda_sh_kernels
+    from augment.render.cuda import image_kernels
 
     source = runtime.resident(sh)
     target = torch.empty_like(source) if out is None else out
     if target.device != source.device:
         raise ValueError(f"out must lie on {source.device}, as what is mapped; got {target.device}")
     runtime.launch(
-        cuda_sh_kernels.map_sh,
+        image_kernels.map_sh,
         (-(-sh.numel() // (12 * _QUADS)),),
         source,
         target.detach(),
@@ -362,9 +362,9 @@ def _new_memory(shape: tuple[int, ...]) -> Tensor:
     pages: the first touch of memory from torch takes several times as long as the mapping.
     """
     count = math.prod(shape)
-    spare = sh_kernels.ALIGNMENT // 4
+    spare = composite_kernels.ALIGNMENT // 4
     memory = np.empty(count + spare, np.float32)
-    first = -memory.ctypes.data % sh_kernels.ALIGNMENT // 4
+    first = -memory.ctypes.data % composite_kernels.ALIGNMENT // 4
     return torch.from_numpy(memory[first : first + count]).view(tuple(shape))
 
 
