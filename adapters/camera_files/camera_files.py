@@ -32,8 +32,7 @@ class PosedView:
     name: the image's name in the file. fx, fy, cx, cy: pixels. world_from_camera: float64 [4, 4],
     OpenCV axes (x right, y down, z forward). image_path: where the image lies, if it does.
     camera, frame: its camera's name and its frame's number where the file says; both or neither.
-    timestamp_ns: since the scene's first frame; None where the file has no times.
-    """
+    timestamp_ns: since the scene's first frame; None where the file has no times."""
 
     name: str
     width: int
@@ -98,8 +97,7 @@ def look_at_pose(
 ) -> np.ndarray:
     """world_from_camera of an upright camera at `position` that looks at `target` (world +z up).
 
-    Straight up or down, where upright means nothing, the top of the image points to world +y.
-    """
+    Straight up or down, where upright means nothing, the top of the image points to world +y."""
     eye, forward = np.asarray(position, np.float64), np.subtract(target, position, dtype=np.float64)
     length = np.linalg.norm(forward)
     if not (np.isfinite(length) and length > 1e-9):
@@ -180,7 +178,7 @@ class _NerfstudioFile(_Intrinsics):
     frames: Annotated[list[_NerfstudioFrame], Field(min_length=1)]
 
 
-def validate(model: type[Model], content: object, path: Path, kind: str) -> Model:
+def validate(model: type[Model], content: object, path: Path | str, kind: str) -> Model:
     """`content` as the model."""
     try:
         return model.model_validate(content)
@@ -394,11 +392,7 @@ _JSON_NAMES = ("cameras.json", "transforms.json")
 
 
 def read_views(path: Path) -> ViewSet:
-    """Views of a camera file, or of a folder that holds a COLMAP model or a JSON of a known name.
-
-    Raises:
-        AdapterError: no such file, an unknown format, or a damaged one; says what was expected.
-    """
+    """Views of a camera file, or of a folder that holds a COLMAP model or a JSON of a known name."""
     if not path.exists():
         raise AdapterError(
             f"{path}: no such file; expected an INRIA cameras.json, a nerfstudio transforms.json, "

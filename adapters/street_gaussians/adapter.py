@@ -17,26 +17,41 @@ with that release have learnt to live with.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+import os
+import threading
+import zipfile
+import zlib
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from adapters.lidar_scene.scene import build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.split import join_tracks
+from adapters.plain_files import read_pose
+from adapters.raw_drive import BoxSample, DriveOptions, Sweep, objects_that_travel
+from adapters.safe_pickle import check_holds_object, stream_arrays
 from adapters.street_gaussians.data import (
     CAMERA_NAMES,
+    TIMES,
     ModelConfig,
     StreetData,
-    StreetImage,
     TrackedObject,
+    TrackTable,
+    calibrated_cameras,
     frames_of,
     read_data,
+    read_times,
+    read_track_table,
+    track_files,
 )
-from adapters.street_gaussians.labels import labels_of, open_raw
 from adapters.street_gaussians.model import (
     SCHEME,
     ModelOptions,
@@ -46,15 +61,19 @@ from adapters.street_gaussians.model import (
     find_model,
     is_dataset,
     read_checkpoint,
-    read_point_cloud,
+    read_ply_model,
     rotations_of,
 )
+from adapters.training_views.byte_cache import ByteCache
 from adapters.uri import format_uri
 from adapters.world import with_class_of
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.labels import LabelSource
+from augment.files.pickles import PickleError
+from augment.geometry import quat_from_rotmat
+from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Actor, ColorWaves, Scene, Track
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky
 
 
@@ -75,12 +94,12 @@ def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:
     data = read_data(files.data, files.config)
     recorded = frames_of(data)
     chosen = options.frames.select([f.index for f in recorded], where=f"{SCHEME}:{path}")
-    read_weights = read_checkpoint if files.weights.suffix.lower() == ".pth" else read_point_cloud
+    read_weights = read_checkpoint if files.weights.suffix.lower() == ".pth" else read_ply_model
     model = read_weights(files.weights, files.config)
     if model.pose_changes is not None:
         check_changes(model.pose_changes, data, str(model.file))
     changes = camera_changes(model.camera_changes, data, files.config, str(model.file))
-    maps = color_maps(model.color_maps, data, files.config, str(model.file))
+    by_camera, by_image = color_maps(model.color_maps, data, files.config, str(model.file))
     recorded = [frame for frame in recorded if frame.index in chosen.numbers]
     frames = _with_model_cameras(recorded, data, changes, options.width)
     actors, problems = _actors(data, model, changes, files.config, options.rotation_bug)
@@ -98,8 +117,8 @@ def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:
         labels=labels_of(files.data),
         world_origin_m=data.world_origin_m,
         problems=(*data.problems, *chosen.problems, *model.problems, *problems),
-        color_maps=maps.by_camera,
-        image_color_maps={k: v for k, v in maps.by_image.items() if k in moments},
+        color_maps=by_camera,
+        image_color_maps={k: v for k, v in by_image.items() if k in moments},
         recorded_source=format_uri(SCHEME, files.data, {}),
         made_by={
             "method": "Street Gaussians",
@@ -124,7 +143,7 @@ def street_gaussians_labels(path: str, query: dict[str, str]) -> LabelSource | N
 def _actors(
     data: StreetData,
     model: TrainedModel,
-    changes: CameraChanges,
+    changes: np.ndarray,
     config: ModelConfig,
     rotation_bug: bool,
 ) -> tuple[tuple[Actor, ...], Sequence[str]]:
@@ -142,8 +161,7 @@ def _actors(
             data, tracked, part, model.pose_changes, changes, config, rotation_bug=rotation_bug
         )
         problems += found
-        if actor is not None:
-            actors.append(actor)
+        actors += [] if actor is None else [actor]
     known = {tracked.track_id for tracked in data.objects}
     problems += [
         f"{model.file}: obj_{number:03d} has no track among the moving objects of {data.root} and "
@@ -155,18 +173,17 @@ def _actors(
 
 
 def _with_model_cameras(
-    frames: Sequence[Frame], data: StreetData, changes: CameraChanges, width: int
+    frames: Sequence[Frame], data: StreetData, changes: np.ndarray, width: int
 ) -> tuple[Frame, ...]:
     """Frames with the cameras that the model renders in place of those that recorded."""
-    images = {(image.frame, image.name): image for image in data.images}
+    rows = {(image.frame, image.name): row for row, image in enumerate(data.images)}
     shown = []
     for frame in frames:
         cameras = {}
         for name, camera in frame.cameras.items():
-            change = np.ascontiguousarray(changes.of(images[frame.index, name]))
-            camera_from_world = camera.camera_from_world @ torch.from_numpy(change)
+            change = torch.from_numpy(changes[rows[frame.index, name]])
             cameras[name] = dataclasses.replace(
-                _capped(camera, width), camera_from_world=camera_from_world
+                _capped(camera, width), camera_from_world=camera.camera_from_world @ change
             )
         shown.append(dataclasses.replace(frame, cameras=cameras))
     return tuple(shown)
@@ -200,7 +217,7 @@ def make_actor(
     tracked: TrackedObject,
     part: Part,
     pose_changes: PoseChanges | None,
-    camera_changes: CameraChanges,
+    camera_changes: np.ndarray,
     config: ModelConfig,
     *,
     rotation_bug: bool = False,
@@ -219,13 +236,13 @@ def make_actor(
         interpolate_held_out=config.opt_track,
         rotation_bug=rotation_bug,
     )
+    images = [data.images[i] for i in shown]
     ego_from_actor = np.tile(np.eye(4), (len(shown), 1, 1))
     ego_from_actor[:, :3, :3] = rotations_of(poses.quats)
     ego_from_actor[:, :3, 3] = poses.positions
-    world_from_ego = np.stack([data.images[i].world_from_ego for i in shown])
-    world_from_moved = camera_changes.inverses[[camera_changes.row(data.images[i]) for i in shown]]
-    world_from_actor = world_from_moved @ world_from_ego @ ego_from_actor
-    stamps = np.array([data.images[i].timestamp_ns for i in shown])
+    world_from_ego = np.stack([image.world_from_ego for image in images])
+    world_from_actor = np.linalg.inv(camera_changes[shown]) @ world_from_ego @ ego_from_actor
+    stamps = np.array([image.timestamp_ns for image in images])
     knots, first, which = np.unique(stamps, return_index=True, return_inverse=True)
     offsets = world_from_actor[:, :3, 3] - world_from_actor[first[which], :3, 3]
     spread_m = np.linalg.norm(offsets, axis=1).max()
@@ -243,17 +260,16 @@ def make_actor(
     waves = None
     if part.terms is not None:  # all images of a frame have the phase of its number
         span = tracked.end_frame - tracked.start_frame
-        numbers = np.array([data.images[i].frame for i in shown[first]], np.float64)
-        phases = np.zeros(len(first))
-        if span:
-            phases = config.fourier_scale * (numbers - tracked.start_frame) / span
+        steps = np.array([images[i].frame for i in first], np.float64) - tracked.start_frame
+        phases = config.fourier_scale * steps / span if span else np.zeros(len(first))
         waves = ColorWaves(part.terms, torch.from_numpy(knots), torch.from_numpy(phases))
-    poses_of_track = torch.from_numpy(world_from_actor[first])
     actor = Actor(
         track_id=str(tracked.track_id),
         label=tracked.label,
         gaussians=with_class_of(tracked.label, part.gaussians),
-        track=Track(torch.from_numpy(knots), poses_of_track, hold_ns=hold_ns),
+        track=Track(
+            torch.from_numpy(knots), torch.from_numpy(world_from_actor[first]), hold_ns=hold_ns
+        ),
         size_m=tracked.size_m,
         color_waves=waves,
         colors_in_world=True,
@@ -266,8 +282,7 @@ def make_actor(
 _STRAIGHT_RAD = 1e-6  # sin of a smaller angle loses its digits; the straight line is exact there
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
+class Poses(NamedTuple):
     """T poses. positions: float64 [T, 3], metres. quats: float64 [T, 4] unit wxyz."""
 
     positions: np.ndarray
@@ -401,59 +416,32 @@ def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarra
 # ---- What a model learnt for single images or cameras: colour maps and moved cameras -------------
 
 
-@dataclass(frozen=True, eq=False)
-class CameraChanges:
-    """What the background is moved by before an image is taken.
-
-    changes: float64 [n, 4, 4], rigid. rows: of every image's, by frame and camera.
-    """
-
-    changes: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
-    rows: Mapping[tuple[int, int], int] = field(default_factory=dict)
-
-    def row(self, image: StreetImage) -> int:
-        return self.rows.get((image.frame, image.cam), 0)
-
-    def of(self, image: StreetImage) -> np.ndarray:
-        return self.changes[self.row(image)]
-
-    @cached_property
-    def inverses(self) -> np.ndarray:
-        return np.linalg.inv(self.changes)
-
-
 def camera_changes(
     changes: np.ndarray | None, data: StreetData, config: ModelConfig, where: str
-) -> CameraChanges:
-    """The pose correction of every image; without any, cameras stay where they are."""
+) -> np.ndarray:
+    """What the background is moved by before each of data.images is taken, rigid, float64
+    [I, 4, 4]; without a pose correction it stays where it is."""
     if changes is None:
-        return CameraChanges()
-    frames = {frame: row for row, frame in enumerate(data.frames)}
-    by_image = config.pose_correction_mode == "image"
-    rows = {
-        (image.frame, image.cam): image.number if by_image else frames[image.frame]
-        for image in data.images
-    }
-    expected = len(data.frames) * len(config.cameras) if by_image else len(data.frames)
-    _check_count(
-        len(changes), expected, f"{where}, pose_correction", config.pose_correction_mode, data
-    )
-    return CameraChanges(changes, rows)
+        return np.tile(np.eye(4), (len(data.images), 1, 1))
+    mode = config.pose_correction_mode
+    if mode == "image":
+        expected = len(data.frames) * len(config.cameras)
+        rows = [image.number for image in data.images]
+    else:
+        expected = len(data.frames)
+        rows = [data.frames.index(image.frame) for image in data.images]
+    _check_count(len(changes), expected, f"{where}, pose_correction", mode, data)
+    return changes[rows]
 
 
-@dataclass(frozen=True, eq=False)
-class ColorMaps:
-    """As Scene.color_maps and Scene.image_color_maps."""
-
-    by_camera: Mapping[str, Tensor] = field(default_factory=dict)
-    by_image: Mapping[tuple[str, int], Tensor] = field(default_factory=dict)
-
-
-def color_maps(maps: Tensor | None, data: StreetData, config: ModelConfig, where: str) -> ColorMaps:
-    """The colour correction, applied after the sky: of cameras, or of images, whose cameras then
-    have the mean of those that were trained on for other views."""
+def color_maps(
+    maps: Tensor | None, data: StreetData, config: ModelConfig, where: str
+) -> tuple[dict[str, Tensor], dict[tuple[str, int], Tensor]]:
+    """The colour correction, applied after the sky, as Scene.color_maps and Scene.image_color_maps:
+    of cameras, or of images, whose cameras then have the mean of those that were trained on for
+    other views."""
     if maps is None:
-        return ColorMaps()
+        return {}, {}
     mode, where = config.color_correction_mode, f"{where}, color_correction"
     if mode == "sensor":
         cams = sorted({image.cam for image in data.images})
@@ -463,16 +451,14 @@ def color_maps(maps: Tensor | None, data: StreetData, config: ModelConfig, where
                 f"{where}: affine_trans has maps of cameras 0 to {len(maps) - 1}, but the "
                 f"configuration's data.cameras has {list(config.cameras)}"
             )
-        return ColorMaps({CAMERA_NAMES[cam]: maps[cam].clone() for cam in cams})
+        return {CAMERA_NAMES[cam]: maps[cam].clone() for cam in cams}, {}
     _check_count(len(maps), len(data.frames) * len(config.cameras), where, mode, data)
     by_camera = {}
     for name in dict.fromkeys(image.name for image in data.images):
         own = [image for image in data.images if image.name == name]
         trained = [image.number for image in own if not image.is_held_out]
-        chosen = trained or [image.number for image in own]
-        by_camera[name] = maps[chosen].mean(0)
-    by_image = {(i.name, i.timestamp_ns): maps[i.number].clone() for i in data.images}
-    return ColorMaps(by_camera, by_image)
+        by_camera[name] = maps[trained or [image.number for image in own]].mean(0)
+    return by_camera, {(i.name, i.timestamp_ns): maps[i.number].clone() for i in data.images}
 
 
 def _check_count(found: int, expected: int, where: str, mode: str, data: StreetData) -> None:
@@ -482,3 +468,353 @@ def _check_count(found: int, expected: int, where: str, mode: str, data: StreetD
             f"have {expected}. The number follows from data.cameras and data.selected_frames of "
             f"the configuration: give the data and the configs/ that the model was trained with"
         )
+
+
+# ---- LiDAR: pointcloud.npz, a ZIP of pickled dictionaries ----------------------------------------
+#     pointcloud[frame]           float [N, 3], vehicle frame at the frame's time
+#     camera_projection[frame]    int16 [N, 6]: camera, x, y of the first camera that sees the point
+#                                 and of the second; camera -1 for none
+#
+# The file holds the whole drive, compressed, with no way to get at one frame. It is read forward,
+# and where reading stopped is kept: frames asked for in their order cost one pass.
+
+FILE = "pointcloud.npz"
+_POINTS, _PROJECTIONS = "pointcloud.npy", "camera_projection.npy"
+_KEPT_BYTES = 64 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """points: float64 [N, 3], vehicle frame. projections: int16 [N, 6], if the file has any."""
+
+    points: np.ndarray
+    projections: np.ndarray | None
+
+    @property
+    def nbytes(self) -> int:
+        return self.points.nbytes + (0 if self.projections is None else self.projections.nbytes)
+
+
+class _Reader:
+    """One file being read forward, and the frames that were last passed by."""
+
+    def __init__(self, path: Path, state: tuple[int, ...]) -> None:
+        self.path, self.state = path, state
+        self._recent: ByteCache[PointCloud] = ByteCache(_KEPT_BYTES)
+        self._all: set[int] | None = None  # frames of the file, known after a whole pass
+        self._passed: set[int] = set()
+        self._clouds = _clouds(path)
+
+    def read(self, frame: int) -> PointCloud | None:
+        found = self._recent.get(frame)
+        if found is not None or (self._all is not None and frame not in self._all):
+            return found
+        if frame in self._passed:
+            self.rewind()
+        try:
+            for number, cloud in self._clouds:
+                self._passed.add(number)
+                self._recent.put(number, cloud, cloud.nbytes)
+                if number == frame:
+                    return cloud
+        except BaseException:
+            self.rewind()
+            raise
+        self._all = self._passed
+        self.rewind()
+        return None
+
+    def rewind(self) -> None:
+        """Leave the file; the next reading starts at its beginning."""
+        self._clouds.close()
+        self._clouds, self._passed = _clouds(self.path), set()
+
+
+_lock = threading.Lock()
+_readers: list[_Reader] = []  # of the file last read from
+
+
+def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
+    """The returns of a frame; None where there is no file, or no such frame in it."""
+    path = root / FILE
+    if not path.exists():
+        return None
+    stat = path.stat()
+    # A forked process shares its parent's place in an open file: it opens the file itself.
+    state = (stat.st_mtime_ns, stat.st_size, os.getpid())
+    with _lock:
+        if not _readers or (_readers[0].path, _readers[0].state) != (path, state):
+            for reader in _readers:
+                reader.rewind()
+            _readers[:] = [_Reader(path, state)]
+        return _readers[0].read(frame)
+
+
+def iterate_point_clouds(root: Path) -> Iterator[tuple[int, PointCloud]]:
+    """Frame number and returns of every frame, in the file's order; nothing without the file."""
+    if (root / FILE).exists():
+        yield from _clouds(root / FILE)
+
+
+def _clouds(path: Path) -> Generator[tuple[int, PointCloud]]:
+    """Every frame of the file."""
+    try:
+        with zipfile.ZipFile(path) as archive, contextlib.ExitStack() as members:
+            names = archive.namelist()
+            if _POINTS not in names:
+                raise AdapterError(
+                    f"{path} must hold the arrays pointcloud and camera_projection; it holds "
+                    f"{names[:5]}"
+                )
+            points, projections = (
+                _entries(path, name, members.enter_context(archive.open(name)))
+                if name in names
+                else None
+                for name in (_POINTS, _PROJECTIONS)
+            )
+            for frame, xyz in points or ():
+                seen = None if projections is None else next(projections, (None, None))
+                yield frame, _checked_cloud(path, frame, xyz, seen)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise AdapterError(
+            f"{path} is no whole .npz file of dictionaries ({error}); copy it again"
+        ) from error
+    except OSError as error:
+        raise AdapterError(f"{path} cannot be read: {error}") from error
+
+
+def _entries(path: Path, member: str, file: BinaryIO) -> Iterator[tuple[int, np.ndarray]]:
+    try:
+        check_holds_object(file)
+        yield from stream_arrays(file)
+    except PickleError as error:
+        raise AdapterError(
+            f"{path}, {member} was not read: {error}. Only a dictionary of arrays of numbers by "
+            f"frame is accepted"
+        ) from None
+
+
+def _checked_cloud(
+    path: Path, frame: int, xyz: np.ndarray, seen: tuple[int | None, Any] | None
+) -> PointCloud:
+    """seen: frame number and array of the projections, if the file has any."""
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind != "f":
+        raise AdapterError(
+            f"{path}: pointcloud[{frame}] must be floats [N, 3]; got {xyz.dtype} {list(xyz.shape)}"
+        )
+    if seen is None:
+        return PointCloud(xyz.astype(np.float64), None)
+    number, projections = seen
+    if number != frame:
+        raise AdapterError(
+            f"{path}: pointcloud and camera_projection must hold the same frames in the same "
+            f"order; got {frame} and {number}"
+        )
+    if projections.shape != (len(xyz), 6) or projections.dtype.kind not in "iu":
+        raise AdapterError(
+            f"{path}: camera_projection[{frame}] must be whole numbers [{len(xyz)}, 6], a row for "
+            f"each point; got {projections.dtype} {list(projections.shape)}"
+        )
+    return PointCloud(xyz.astype(np.float64), projections.astype(np.int16))
+
+
+# ---- Labels --------------------------------------------------------------------------------------
+
+# Of Waymo's cars, from the ego origin: forward, left, up.
+ROOF_SENSOR_M = np.array([1.43, 0.0, 2.18])
+
+
+@dataclass(frozen=True)
+class StreetGaussiansLabels:
+    """Labels of one dataset directory, read when asked.
+
+    Boxes: all rows of the frame in track/track_info.txt, of whatever class, carried into the world
+    by the car's pose at the frame's time; attributes alpha and, where the file has it, speed
+    (metres per second). Sweeps: columns x y z (metres), timestamp_ns (the frame's: the points are
+    where they were at that moment), and, where the file has projections, camera, u, v: the number
+    of the first camera that sees the point, -1 for none, and the pixel there.
+    A frame without the car's pose has no boxes and no sweep.
+    """
+
+    root: Path
+
+    def boxes(self, frame_index: int) -> Boxes:
+        path, _ = track_files(self.root, use_tracker=False)
+        pose = self._world_from_ego(frame_index)
+        if pose is None or not path.exists():
+            return Boxes.empty()
+        stat = path.stat()
+        table = _table(path, stat.st_mtime_ns, stat.st_size)
+        rows = np.flatnonzero(table.frames == frame_index)
+        world_from_box = pose @ ego_from_boxes(table, rows)
+        attributes = {"alpha": table.alphas[rows]}
+        if table.speeds_mps is not None:
+            attributes["speed"] = table.speeds_mps[rows]
+        return Boxes(
+            track_ids=tuple(str(track_id) for track_id in table.ids[rows].tolist()),
+            labels=tuple(table.labels[row] for row in rows),
+            centers_m=world_from_box[:, :3, 3],
+            sizes_m=table.sizes_m[rows],
+            quats=quat_from_rotmat(torch.from_numpy(world_from_box[:, :3, :3])).numpy(),
+            attributes=attributes,
+        )
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        pose = self._world_from_ego(frame_index)
+        cloud = None if pose is None else read_point_cloud(self.root, frame_index)
+        if cloud is None:
+            return None
+        times = read_times(self.root)["FRAME"]
+        if frame_index not in times:
+            raise AdapterError(f"{self.root / TIMES}: FRAME lacks frame {frame_index:06d}")
+        world = cloud.points @ pose[:3, :3].T + pose[:3, 3]
+        columns: dict[str, np.ndarray] = {axis: world[:, i].copy() for i, axis in enumerate("xyz")}
+        columns["timestamp_ns"] = np.full(len(world), round(times[frame_index] * 1e9), np.int64)
+        if cloud.projections is not None:
+            for i, name in enumerate(("camera", "u", "v")):
+                columns[name] = cloud.projections[:, i].copy()
+        return LidarSweep(columns)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """Waymo's roof sensor in the car's pose of the frame. The files join the returns of five
+        sensors and do not tell them apart: those of the four at the bumpers and sides, which see
+        20 m far, are taken for the roof's, too."""
+        pose = self._world_from_ego(frame_index)
+        if pose is None:
+            return None
+        return np.broadcast_to(pose[:3, :3] @ ROOF_SENSOR_M + pose[:3, 3], (len(sweep), 3))
+
+    def _world_from_ego(self, frame: int) -> np.ndarray | None:
+        path = self.root / "ego_pose" / f"{frame:06d}.txt"
+        return read_pose(path) if path.exists() else None
+
+
+def labels_of(root: Path) -> StreetGaussiansLabels | None:
+    """The labels of a dataset directory; None where there is none."""
+    return StreetGaussiansLabels(root) if (root / "ego_pose").is_dir() else None
+
+
+def ego_from_boxes(table: TrackTable, rows: np.ndarray) -> np.ndarray:
+    """Poses of the rows' boxes in the vehicle's frame, float64 [R, 4, 4]."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    cos, sin = np.cos(table.headings[rows]), np.sin(table.headings[rows])
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+    poses[:, :3, 3] = table.centers_m[rows]
+    return poses
+
+
+@lru_cache(maxsize=2)
+def _table(path: Path, mtime_ns: int, size: int) -> TrackTable:
+    """A track file; mtime_ns and size tell whether it is still the one that was read."""
+    return read_track_table(path)
+
+
+# ---- A drive without a trained model: Gaussians from coloured LiDAR ------------------------------
+# The world is the one that a model trained on it has. Returns are where they were at their frame's
+# time, as the converter has it, and so are the boxes.
+
+# Waymo's uppermost LiDAR looks up by 2.4 degrees; those at the sides see further up, but not far.
+_LIDAR_TOP_DEG = 2.4
+# The recording car in its own frame, whose origin is below its rear axle, on the ground.
+_EGO_LOW_M = np.array([-1.4, -1.15, 0.1])
+_EGO_HIGH_M = np.array([4.2, 1.15, 2.4])
+_STANDING = ("sign",)  # classes that never move
+
+
+def open_raw(root: Path, query: dict[str, str]) -> Scene:
+    """The scene of a dataset directory alone.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits.
+    """
+    options = DriveOptions.from_query("street_gaussians", query)
+    cams = calibrated_cameras(root)
+    if not cams:
+        raise AdapterError(
+            f"{root / 'extrinsics'} holds no calibration 0.txt to 4.txt; copy it from the dataset"
+        )
+    data = read_data(root, ModelConfig(cameras=cams))
+    frames = frames_of(data)
+    chosen = options.select([f.index for f in frames], where=f"street_gaussians:{root}")
+    frames = tuple(frame for frame in frames if frame.index in set(chosen.numbers))
+    used = [frame for frame in frames if frame.index not in chosen.held_out]
+    if not any(frame.image_paths for frame in used):
+        raise AdapterError(
+            f"{root / 'images'} holds no usable image of the frames that are not held out "
+            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
+        )
+    sweeps, sweep_problems = _sweeps(root, used)
+    problems = data.problems + chosen.problems + sweep_problems
+    table = read_track_table(track_files(root, use_tracker=False)[0])
+    tracks = join_tracks(_moving_samples(table, frames))
+    scene = build_lidar_scene(
+        sweeps,
+        tracks,
+        views_of(used),
+        options,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        name=root.absolute().name,
+        source=format_uri("street_gaussians", root, query),
+        frames=frames,
+        labels=StreetGaussiansLabels(root),
+        world_origin_m=data.world_origin_m,
+        problems=problems,
+    )
+    missing = without_points(tracks, scene)
+    faults = scene.problems[len(problems) :]
+    return dataclasses.replace(scene, problems=problems + missing + faults)
+
+
+def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, ...]]:
+    """The usable returns of the frames in the scene's world, without the recording car's own, and a
+    sentence where frames have none."""
+    by_number = {frame.index: frame for frame in used}
+    sweeps = {}
+    for number, cloud in iterate_point_clouds(root):
+        frame = by_number.get(number)
+        if frame is None:
+            continue
+        own = ((cloud.points > _EGO_LOW_M) & (cloud.points < _EGO_HIGH_M)).all(axis=1)
+        points = cloud.points[~own & np.isfinite(cloud.points).all(axis=1)]
+        pose = frame.world_from_ego.numpy()
+        sweeps[number] = Sweep(
+            (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32),
+            np.full(len(points), frame.timestamp_ns, np.int64),
+            np.full(len(points), SemanticClass.UNKNOWN, np.int16),
+        )
+    if not any(len(sweep) for sweep in sweeps.values()):
+        raise AdapterError(
+            f"{root / FILE} holds no returns of frames {used[0].index} to {used[-1].index}, or is "
+            f"missing; a scene cannot be built without them. Make it with the converter's LiDAR "
+            f"step, or give a trained model's folder"
+        )
+    missing = sorted(set(by_number) - set(sweeps))
+    found = [sweeps[number] for number in sorted(sweeps)]
+    if not missing:
+        return found, ()
+    return found, (
+        f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too",
+    )
+
+
+def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSample]:
+    """The boxes of the objects that move within the frames, by frame."""
+    samples: list[BoxSample] = []
+    for frame in frames:
+        rows = np.flatnonzero(table.frames == frame.index)
+        poses = frame.world_from_ego.numpy() @ ego_from_boxes(table, rows)
+        samples += [
+            BoxSample(
+                object_id=str(int(table.ids[row])),
+                sibling_id=None,
+                label=table.labels[row],
+                frame=frame.index,
+                timestamp_ns=frame.timestamp_ns,
+                world_from_box=pose,
+                size_m=table.sizes_m[row],
+            )
+            for row, pose in zip(rows, poses, strict=True)
+            if table.labels[row] not in _STANDING
+        ]
+    moving = objects_that_travel((s.object_id, s.world_from_box[:3, 3]) for s in samples)
+    return [sample for sample in samples if sample.object_id in moving]

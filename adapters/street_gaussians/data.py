@@ -12,16 +12,27 @@ trained. Vehicle frame: x forward, y left, z up. Times are seconds as the datase
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    RootModel,
+    StrictBool,
+    StrictInt,
+    field_validator,
+)
 
+from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_json, read_numbers, read_pose, read_text
 from adapters.world import invert_pose
 from augment.cameras import Camera, Frame
@@ -30,31 +41,55 @@ from augment.files.image_size import read_image_header
 from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
+Number = Annotated[int, Field(ge=0, lt=10**9)]  # of a frame or object
 
 
-@dataclass(frozen=True)
-class ModelConfig:
-    """What of a model's configuration decides how it is read; the defaults are the project's own.
+class ModelConfig(BaseModel):
+    """What of a model's configuration decides how it is read, by its keys there; the defaults are
+    the project's own.
 
     cameras: numbers in CAMERA_NAMES. selected_frames: first and last, both included; None for all.
     split_test, split_train: every how manyeth frame is held out or trained on; -1 where unused.
     """
 
+    model_config = ConfigDict(frozen=True, populate_by_name=True)
+
     source_path: str = ""
-    cameras: tuple[int, ...] = (0, 1, 2)
-    selected_frames: tuple[int, int] | None = None
-    use_tracker: bool = False
-    split_test: int = -1
-    split_train: int = -1
-    fourier_scale: float = 1.0
-    include_sky: bool = False
-    white_background: bool = False
-    opt_track: bool = True
-    use_color_correction: bool = False
-    color_correction_mode: str = "image"
-    color_correction_mlp: bool = False
-    use_pose_correction: bool = False
-    pose_correction_mode: str = "image"
+    cameras: tuple[StrictInt, ...] = Field((0, 1, 2), alias="data.cameras")
+    selected_frames: tuple[StrictInt, StrictInt] | None = Field(None, alias="data.selected_frames")
+    use_tracker: StrictBool = Field(False, alias="data.use_tracker")
+    split_test: StrictInt = Field(-1, alias="data.split_test")
+    split_train: StrictInt = Field(-1, alias="data.split_train")
+    white_background: StrictBool = Field(False, alias="data.white_background")
+    fourier_scale: float = Field(
+        1.0, strict=True, allow_inf_nan=False, alias="model.gaussian.fourier_scale"
+    )
+    include_sky: StrictBool = Field(False, alias="model.nsg.include_sky")
+    opt_track: StrictBool = Field(True, alias="model.nsg.opt_track")
+    use_color_correction: StrictBool = Field(False, alias="model.use_color_correction")
+    color_correction_mode: Literal["image", "sensor"] = Field(
+        "image", alias="model.color_correction.mode"
+    )
+    color_correction_mlp: StrictBool = Field(False, alias="model.color_correction.use_mlp")
+    use_pose_correction: StrictBool = Field(False, alias="model.use_pose_correction")
+    pose_correction_mode: Literal["image", "frame"] = Field(
+        "image", alias="model.pose_correction.mode"
+    )
+
+    @field_validator("cameras")
+    @classmethod
+    def _are_known(cls, cameras: tuple[int, ...]) -> tuple[int, ...]:
+        known = range(len(CAMERA_NAMES))
+        if not cameras or len(set(cameras)) != len(cameras) or not set(cameras) <= set(known):
+            raise ValueError(f"must be different camera numbers from 0 to {known[-1]}")
+        return cameras
+
+    @field_validator("selected_frames")
+    @classmethod
+    def _are_in_order(cls, pair: tuple[int, int] | None) -> tuple[int, int] | None:
+        if pair is not None and not 0 <= pair[0] <= pair[1]:
+            raise ValueError("must be [first, last] or null")
+        return pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +184,26 @@ class StreetData:
 
 
 # ---- Cameras, poses and times --------------------------------------------------------------------
+
 TIMES = "timestamps.json"
-_NUMBER = re.compile(r"[0-9]{1,9}")
 _FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
 _MAX_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
+_Seconds = dict[Number, Annotated[float, Field(strict=True, ge=0, lt=9e9, allow_inf_nan=False)]]
+
+
+class _Times(BaseModel):
+    FRAME: Annotated[_Seconds, Field(min_length=1)]
+    FRONT: _Seconds = {}
+    FRONT_LEFT: _Seconds = {}
+    FRONT_RIGHT: _Seconds = {}
+    SIDE_LEFT: _Seconds = {}
+    SIDE_RIGHT: _Seconds = {}
+
+
+def read_times(root: Path) -> dict[str, dict[int, float]]:
+    """Seconds by FRAME or camera name, then frame number."""
+    path = root / TIMES
+    return validate(_Times, read_json(path), path, "table of seconds by frame").model_dump()
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +221,6 @@ class EgoPath:
     camera_times_s: Mapping[str, Mapping[int, float]]
     problems: tuple[str, ...]
 
-    @property
-    def centre_m(self) -> np.ndarray:
-        """The mean position, float64 [3]: the origin of the models' worlds."""
-        return self.world_from_ego[:, :3, 3].mean(axis=0)
-
 
 def calibrated_cameras(root: Path) -> tuple[int, ...]:
     """The numbers of the cameras that have extrinsics."""
@@ -189,9 +235,8 @@ def read_lens(root: Path, cam: int) -> Lens:
         raise AdapterError(
             f"{path} must begin with fx fy cx cy in pixels, fx and fy > 0; got {values.tolist()}"
         )
-    fx, fy, cx, cy = values[:4].tolist()
     ego_from_camera = read_pose(root / "extrinsics" / f"{cam}.txt")
-    return Lens(path, fx, fy, cx, cy, invert_pose(ego_from_camera))
+    return Lens(path, *values[:4].tolist(), invert_pose(ego_from_camera))
 
 
 def read_ego_path(root: Path) -> EgoPath:
@@ -205,13 +250,12 @@ def read_ego_path(root: Path) -> EgoPath:
     found = {int(m[1]): p for p in folder.iterdir() if (m := _FRAME_POSE.fullmatch(p.name))}
     if not found:
         raise AdapterError(f"{folder} holds no pose NNNNNN.txt; copy the folder from the dataset")
-    times = read_times(root / TIMES)
-    timed = times["FRAME"]
-    untimed = sorted(set(found) - set(timed))
-    if untimed:
+    times = read_times(root)
+    timed = dict(sorted(times["FRAME"].items()))
+    if untimed := sorted(set(found) - set(timed)):
         raise AdapterError(
-            f"{root / TIMES}: FRAME lacks frame {untimed[0]:06d}, of which there is {folder}/"
-            f"{untimed[0]:06d}.txt; both must be of one conversion"
+            f"{root / TIMES}: FRAME lacks frame {untimed[0]:06d}, of which there is "
+            f"{found[untimed[0]]}; both must be of one conversion"
         )
     numbers = range(min(timed), max(timed) + 1)
     if len(numbers) - len(timed) > _MAX_GAPS:
@@ -220,8 +264,7 @@ def read_ego_path(root: Path) -> EgoPath:
             f"{numbers[0]} to {numbers[-1]}"
         )
     known = np.array([number in found for number in numbers])
-    timed_numbers = np.array(sorted(timed))
-    times_s = np.interp(numbers, timed_numbers, [timed[n] for n in timed_numbers.tolist()])
+    times_s = np.interp(numbers, list(timed), list(timed.values()))
     if not (np.diff(times_s) > 0).all():
         raise AdapterError(f"{root / TIMES}: the seconds of FRAME must increase with the frames")
     poses = _fill(times_s, known, np.stack([read_pose(found[n]) for n in sorted(found)]))
@@ -230,33 +273,9 @@ def read_ego_path(root: Path) -> EgoPath:
         problems = (
             f"{folder} lacks the poses of {len(missing)} of {len(numbers)} frames, such as "
             f"{missing[0]:06d}: these frames are left out, and the middle of the drive, on which "
-            f"the world of trained models is centred, is had with guesses from the frames beside "
-            f"them",
+            f"the world of trained models is centred, is guessed from the frames beside them",
         )
     return EgoPath(numbers, times_s, poses, known, times, problems)
-
-
-def read_times(path: Path) -> dict[str, dict[int, float]]:
-    """Seconds by FRAME or camera name, then frame number."""
-    content = read_json(path)
-    times: dict[str, dict[int, float]] = {}
-    for name, entries in content.items():
-        if name != "FRAME" and name not in CAMERA_NAMES:
-            continue
-        if not isinstance(entries, dict):
-            raise AdapterError(f"{path}: {name} must hold seconds by frame; got {entries!r:.80}")
-        times[name] = {}
-        for key, value in entries.items():
-            is_time = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (is_time and 0 <= value < 9e9 and _NUMBER.fullmatch(key)):
-                raise AdapterError(
-                    f"{path}: {name} must hold seconds by frame, such as "
-                    f'"000000": 1550083467.3; got {key!r}: {value!r:.80}'
-                )
-            times[name][int(key)] = float(value)
-    if not times.get("FRAME"):
-        raise AdapterError(f"{path} must hold FRAME, seconds by frame; it holds {list(content)}")
-    return times
 
 
 def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -271,11 +290,11 @@ def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarr
             continue
         after = int(np.clip(np.searchsorted(known_s, times_s[i]), 1, len(poses) - 1))
         a, b = poses[after - 1], poses[after]
-        part = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
-        filled[i] = a + part * (b - a)
+        share = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
+        filled[i] = a + share * (b - a)
         quats = quat_from_rotmat(torch.from_numpy(np.stack([a[:3, :3], b[:3, :3]])))
-        part = torch.tensor(min(max(part, 0.0), 1.0), dtype=torch.float64)
-        filled[i, :3, :3] = rotmat_from_quat(slerp(quats[0], quats[1], part)).numpy()
+        share = torch.tensor(min(max(share, 0.0), 1.0), dtype=torch.float64)
+        filled[i, :3, :3] = rotmat_from_quat(slerp(quats[0], quats[1], share)).numpy()
     return filled
 
 
@@ -285,21 +304,19 @@ def read_camera_moments(
     """Seconds and dataset_from_ego by frame and camera, and a sentence on missing ones."""
     moments: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     missing: list[Path] = []
-    for frame in frames:
-        if not path.is_known[path.numbers.index(frame)]:
+    known = [frame for frame in frames if path.is_known[path.numbers.index(frame)]]
+    for frame, cam in ((frame, cam) for frame in known for cam in cams):
+        file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
+        if not file.exists():
+            missing.append(file)
             continue
-        for cam in cams:
-            file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
-            if not file.exists():
-                missing.append(file)
-                continue
-            seconds = path.camera_times_s.get(CAMERA_NAMES[cam], {}).get(frame, math.nan)
-            if math.isnan(seconds):
-                raise AdapterError(
-                    f"{root / TIMES}: {CAMERA_NAMES[cam]} lacks frame {frame:06d}, of which there "
-                    f"is {file}; both must be of one conversion"
-                )
-            moments[frame, cam] = seconds, read_pose(file)
+        seconds = path.camera_times_s[CAMERA_NAMES[cam]].get(frame)
+        if seconds is None:
+            raise AdapterError(
+                f"{root / TIMES}: {CAMERA_NAMES[cam]} lacks frame {frame:06d}, of which there "
+                f"is {file}; both must be of one conversion"
+            )
+        moments[frame, cam] = seconds, read_pose(file)
     if not moments:
         raise AdapterError(
             f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
@@ -326,27 +343,33 @@ def find_images(
 
     Where a camera has no image, its size is Waymo's.
     """
-    listed = _listed(root / "images")
+    folder = root / "images"
+    listed: dict[tuple[int, int], Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if match := _NAME.fullmatch(path.name):
+            other = listed.setdefault((int(match[1]), int(match[2])), path)
+            if other != path:
+                raise AdapterError(f"{other} and {path} are one image; delete one of them")
     paths: dict[tuple[int, int], Path] = {}
     sizes: dict[int, tuple[int, int]] = {}
     problems: list[str] = []
     without_images = []
     for cam, lens in lenses.items():
-        seen = {
-            key: _size(listed[key]) for key in sorted(listed) if key[0] in frames and key[1] == cam
-        }
+        name = CAMERA_NAMES[cam]
+        keys = [key for key in sorted(listed) if key[0] in frames and key[1] == cam]
+        seen = {key: _image_size(listed[key]) for key in keys}
         counts = Counter(size for size in seen.values() if size is not None)
-        waymo_size = _SIDE_SIZE if CAMERA_NAMES[cam].startswith("SIDE") else _FULL_SIZE
+        waymo_size = _SIDE_SIZE if name.startswith("SIDE") else _FULL_SIZE
         sizes[cam] = width, height = counts.most_common(1)[0][0] if counts else waymo_size
         if not counts:
-            without_images.append(f"{width}x{height} for {CAMERA_NAMES[cam]}")
+            without_images.append(f"{width}x{height} for {name}")
         for key, size in seen.items():
             if size is None:
                 problems.append(f"{listed[key]} is no image, or a damaged one; left out")
             elif size != sizes[cam]:
                 problems.append(
-                    f"{listed[key]} is {size[0]}x{size[1]} pixels, most images of "
-                    f"{CAMERA_NAMES[cam]} are {width}x{height}; left out"
+                    f"{listed[key]} is {size[0]}x{size[1]} pixels, most images of {name} are "
+                    f"{width}x{height}; left out"
                 )
             else:
                 paths[key] = listed[key]
@@ -354,32 +377,18 @@ def find_images(
             whose = "as its images are" if counts else "assumed for want of images"
             raise AdapterError(
                 f"{lens.path}: cx, cy (its third and fourth number) must lie in the "
-                f"{width}x{height} pixels of {CAMERA_NAMES[cam]}, {whose}; got {lens.cx:g}, "
-                f"{lens.cy:g}. If the images were resized, scale fx fy cx cy with them"
+                f"{width}x{height} pixels of {name}, {whose}; got {lens.cx:g}, {lens.cy:g}. If the "
+                f"images were resized, scale fx fy cx cy with them"
             )
     if without_images:
         problems.append(
-            f"{root / 'images'} holds no usable image NNNNNN_C.png or .jpg of "
-            f"{len(without_images)} cameras: their size is taken to be Waymo's, "
-            f"{', '.join(without_images)}"
+            f"{folder} holds no usable image NNNNNN_C.png or .jpg of {len(without_images)} "
+            f"cameras: their size is taken to be Waymo's, {', '.join(without_images)}"
         )
     return paths, sizes, problems
 
 
-def _listed(folder: Path) -> dict[tuple[int, int], Path]:
-    found: dict[tuple[int, int], Path] = {}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = _NAME.fullmatch(path.name)
-        if match is None:
-            continue
-        key = int(match[1]), int(match[2])
-        if key in found:
-            raise AdapterError(f"{found[key]} and {path} are one image; delete one of them")
-        found[key] = path
-    return found
-
-
-def _size(path: Path) -> tuple[int, int] | None:
+def _image_size(path: Path) -> tuple[int, int] | None:
     """Width and height, or None for what is no image."""
     try:
         header = read_image_header(path)
@@ -394,14 +403,27 @@ def _size(path: Path) -> tuple[int, int] | None:
 # column of its frame; objects that hardly move are then taken out.
 
 NOT_TRACKED = ("sign", "misc")  # classes
-_COLUMNS = (
-    "frame_id track_id object_class alpha box_height box_width box_length "
-    "box_center_x box_center_y box_center_z box_heading"
-)
-_WORDS = len(_COLUMNS.split())  # of a row; a further one is the speed
 _SPREAD_M = 0.5  # standard deviation along an axis of the world above which an object moves
 _TRAVEL_M = 2.0  # or distance between its first place and its last
 _HOLD_S = 0.1  # an object is drawn so long before its first frame and after its last
+_Metres = Annotated[FiniteFloat, Field(gt=0)]
+
+
+class _TrackRow(BaseModel):
+    """The columns of a track file, in their order."""
+
+    frame_id: Number
+    track_id: Number
+    object_class: str
+    alpha: FiniteFloat
+    box_height: _Metres
+    box_width: _Metres
+    box_length: _Metres
+    box_center_x: FiniteFloat
+    box_center_y: FiniteFloat
+    box_center_z: FiniteFloat
+    box_heading: FiniteFloat
+    speed: FiniteFloat | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,92 +460,57 @@ def track_files(root: Path, *, use_tracker: bool) -> tuple[Path, Path]:
 def read_track_table(path: Path) -> TrackTable:
     """A track file, of which the first line names the columns and is not read."""
     texts = read_text(path).splitlines()
-    rows, widths = [], []
+    names = list(_TrackRow.model_fields)
+    rows: dict[int, _TrackRow] = {}
     first_lines: dict[tuple[int, int], int] = {}
     for line, text in enumerate(texts[1:], start=2):
-        if words := text.split():
-            rows.append((line, *_row(path, line, words)))
-            widths.append(min(len(words), _WORDS + 1))
-            _, frame, track_id, *_ = rows[-1]
-            before = first_lines.setdefault((frame, track_id), line)
-            if before != line:
-                raise AdapterError(
-                    f"{path}, line {line}: object {track_id} is already in frame {frame} by line "
-                    f"{before}; delete one of them"
-                )
-    if odd := [row[0] for row, width in zip(rows, widths, strict=True) if width != widths[0]]:
+        if not (words := dict(zip(names, text.split(), strict=False))):
+            continue
+        row = rows[line] = validate(_TrackRow, words, f"{path}, line {line}", "row of a track file")
+        before = first_lines.setdefault((row.frame_id, row.track_id), line)
+        if before != line:
+            raise AdapterError(
+                f"{path}, line {line}: object {row.track_id} is already in frame {row.frame_id} by "
+                f"line {before}; delete one of them"
+            )
+    has_speed = bool(rows) and next(iter(rows.values())).speed is not None
+    if odd := [line for line, row in rows.items() if (row.speed is not None) != has_speed]:
         raise AdapterError(
-            f"{path}, line {odd[0]}: all rows must hold a speed in column {_WORDS + 1}, or none; "
+            f"{path}, line {odd[0]}: all rows must hold a speed in column {len(names)}, or none; "
             f"it differs from the first row"
         )
-    has_speed = bool(rows) and widths[0] > _WORDS
-    numbers = np.array([row[4] for row in rows], np.float64).reshape(len(rows), 8 + has_speed)
     header = texts[0].split() if texts else []
     problems = ()
-    if len(header) >= _WORDS and header[0].isdigit():
+    if len(header) >= len(names) - 1 and header[0].isdigit():
         problems = (
             f"{path}: line 1, which is not read, should name the columns; it holds an object",
         )
+
+    def columns(*names: str, dtype: type = np.float64) -> np.ndarray:
+        values = [[getattr(row, name) for name in names] for row in rows.values()]
+        return np.array(values, dtype).reshape(len(rows), len(names))
+
     return TrackTable(
         path=path,
-        lines=np.array([row[0] for row in rows], np.int64),
-        frames=np.array([row[1] for row in rows], np.int64),
-        ids=np.array([row[2] for row in rows], np.int64),
-        labels=tuple(row[3] for row in rows),
-        alphas=numbers[:, 0],
-        sizes_m=numbers[:, 3:0:-1].copy(),
-        centers_m=numbers[:, 4:7],
-        headings=numbers[:, 7],
-        speeds_mps=numbers[:, 8] if has_speed else None,
+        lines=np.array(list(rows), np.int64),
+        frames=columns("frame_id", dtype=np.int64)[:, 0],
+        ids=columns("track_id", dtype=np.int64)[:, 0],
+        labels=tuple(row.object_class for row in rows.values()),
+        alphas=columns("alpha")[:, 0],
+        sizes_m=columns("box_length", "box_width", "box_height"),
+        centers_m=columns("box_center_x", "box_center_y", "box_center_z"),
+        headings=columns("box_heading")[:, 0],
+        speeds_mps=columns("speed")[:, 0] if has_speed else None,
         problems=problems,
     )
 
 
-def _row(path: Path, line: int, words: Sequence[str]) -> tuple[int, int, str, list[float]]:
-    """Frame, object, class and the numbers after it."""
-    where = f"{path}, line {line}"
-    if len(words) < _WORDS:
-        raise AdapterError(
-            f"{where}: a row must hold the {_WORDS} columns {_COLUMNS}; it holds {len(words)}"
-        )
-    frame, track_id = words[0], words[1]
-    if not (_NUMBER.fullmatch(frame) and _NUMBER.fullmatch(track_id)):
-        raise AdapterError(
-            f"{where}: frame_id and track_id must be whole numbers >= 0; got {frame!r}, "
-            f"{track_id!r}"
-        )
-    values = []
-    names = [*_COLUMNS.split()[3:], "speed"]
-    for name, word in zip(names, words[3 : _WORDS + 1], strict=False):
-        try:
-            value = float(word)
-        except ValueError:
-            value = np.nan
-        needs_size = name in ("box_height", "box_width", "box_length")
-        if not np.isfinite(value) or (needs_size and value <= 0):
-            kind = "a number of metres > 0" if needs_size else "a finite number"
-            raise AdapterError(f"{where}: {name} must be {kind}; got {word!r}")
-        values.append(value)
-    return int(frame), int(track_id), words[2], values
-
-
-Visibility = Mapping[tuple[int, int], frozenset[int]]
+class Visibility(RootModel[dict[Number, dict[Number, frozenset[StrictInt]]]]):
+    """The cameras that see an object, by object and frame."""
 
 
 def read_visibility(path: Path) -> Visibility:
-    """The cameras that see an object, by object and frame."""
-    visible: dict[tuple[int, int], frozenset[int]] = {}
-    for track_id, frames in read_json(path).items():
-        entries = frames.items() if isinstance(frames, dict) else [("?", frames)]
-        for frame, cams in entries:
-            is_list = isinstance(cams, list) and all(type(cam) is int for cam in cams)
-            if not (is_list and _NUMBER.fullmatch(track_id) and _NUMBER.fullmatch(frame)):
-                raise AdapterError(
-                    f"{path}: object {track_id!r}, frame {frame!r} must be whole numbers with a "
-                    f"list of camera numbers; got {cams!r:.80}"
-                )
-            visible[int(track_id), int(frame)] = frozenset(cams)
-    return visible
+    return validate(Visibility, read_json(path), path, "list of camera numbers by object and frame")
 
 
 def seen_rows(
@@ -531,17 +518,17 @@ def seen_rows(
 ) -> np.ndarray:
     """Indices of the rows of tracked classes that one of the cameras sees, int64 [R]."""
     kept = []
-    used = frozenset(cams)
     for row, label in enumerate(table.labels):
         if label in NOT_TRACKED:
             continue
         track_id, frame = int(table.ids[row]), int(table.frames[row])
-        if (track_id, frame) not in visible:
+        seen_by = visible.root.get(track_id, {}).get(frame)
+        if seen_by is None:
             raise AdapterError(
                 f"{table.path}, line {table.lines[row]}: {visible_path} does not say which cameras "
                 f"see object {track_id} in frame {frame}; both must be of one conversion"
             )
-        if visible[track_id, frame] & used:
+        if not seen_by.isdisjoint(cams):
             kept.append(row)
     return np.array(kept, np.int64)
 
@@ -553,38 +540,38 @@ def place_rows(
 
     rows: those that were seen. frames: consecutive. world_from_ego: float64 [F, 4, 4].
     """
-    steps = table.frames[rows] - frames[0]
-    inside = (steps >= 0) & (steps < len(frames))
-    rows, steps = rows[inside], steps[inside]
-    columns = np.bincount(steps, minlength=len(frames)).max() if len(rows) else 0
-    placed = np.full((len(frames), columns), -1, np.int64)
-    used = np.zeros(len(frames), np.int64)
-    for row, step in zip(rows, steps, strict=True):
-        placed[step, used[step]] = row
-        used[step] += 1
-    placed = np.where(_moves(table, placed, world_from_ego), placed, -1)
-    most = int((placed >= 0).sum(1).max()) if columns else 0
-    if most < columns:  # every frame's rows in its first columns, in the same order
-        moving, placed = placed, np.full((len(frames), most), -1, np.int64)
-        for step, row in enumerate(moving):
-            kept = row[row >= 0]
-            placed[step, : len(kept)] = kept
-    return placed if placed.shape[1] else np.full((len(frames), 1), -1, np.int64)
+    by_frame = [rows[table.frames[rows] == frame] for frame in frames]
+    placed = _table_of(by_frame)
+    if not placed.shape[1]:
+        return np.full((len(frames), 1), -1, np.int64)
+    is_moving = np.isin(table.ids[placed], _moving_ids(table, placed, world_from_ego))
+    moving = np.where((placed >= 0) & is_moving, placed, -1)
+    compact = _table_of([row[row >= 0] for row in moving])
+    if not compact.shape[1]:
+        return np.full((len(frames), 1), -1, np.int64)
+    # Training compacts only where that leaves fewer columns.
+    return compact if compact.shape[1] < moving.shape[1] else moving
 
 
-def _moves(table: TrackTable, placed: np.ndarray, world_from_ego: np.ndarray) -> np.ndarray:
-    """Whether the object in each place moves, bool [F, M]."""
+def _table_of(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows of unequal length as int64 [F, M], filled up with -1."""
+    table = np.full((len(rows), max(map(len, rows))), -1, np.int64)
+    for step, row in enumerate(rows):
+        table[step, : len(row)] = row
+    return table
+
+
+def _moving_ids(table: TrackTable, placed: np.ndarray, world_from_ego: np.ndarray) -> list[int]:
+    """The objects that move."""
     steps, columns = np.nonzero(placed >= 0)  # by frame, then column
-    rows = placed[steps, columns]
-    poses = world_from_ego[steps]
+    rows, poses = placed[steps, columns], world_from_ego[steps]
     world = np.einsum("nij,nj->ni", poses[:, :3, :3], table.centers_m[rows]) + poses[:, :3, 3]
-    moving = np.zeros(placed.shape, bool)
+    moving = []
     for track_id in np.unique(table.ids[rows]):
-        own = table.ids[rows] == track_id
-        places = world[own]
-        spread = places.std(axis=0).max()
+        places = world[table.ids[rows] == track_id]
         travel = np.linalg.norm(places[-1] - places[0])
-        moving[steps[own], columns[own]] = spread > _SPREAD_M or travel > _TRAVEL_M
+        if places.std(axis=0).max() > _SPREAD_M or travel > _TRAVEL_M:
+            moving.append(track_id)
     return moving
 
 
@@ -648,20 +635,27 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
     """
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a drive in Street Gaussians' layout")
-    cams = _cameras(root, config)
+    cams = sorted(config.cameras)
+    if absent := sorted(set(cams) - set(calibrated_cameras(root))):
+        raise AdapterError(
+            f"{root / 'extrinsics' / f'{absent[0]}.txt'} does not exist, but camera {absent[0]} "
+            f"({CAMERA_NAMES[absent[0]]}) is used; copy it from the dataset"
+        )
     path = read_ego_path(root)
-    frames, problems = _selected(root, path, config)
-    origin = path.centre_m
+    frames, problems = _select_frames(root, path.numbers, config)
+    poses = path.world_from_ego.copy()
+    origin = poses[:, :3, 3].mean(axis=0)
+    poses[:, :3, 3] -= origin
     rows = slice(frames[0] - path.numbers[0], frames[-1] + 1 - path.numbers[0])
-    world_from_ego = _centred(path.world_from_ego[rows], origin)
+    times, world_from_ego = path.times_s[rows], poses[rows]
     images, image_problems = _images(root, path, frames, cams, config, origin)
 
     track_path, visible_path = track_files(root, use_tracker=config.use_tracker)
     table = read_track_table(track_path)
     seen = seen_rows(table, read_visibility(visible_path), visible_path, cams)
     tracklets = tracklets_of(table, place_rows(table, seen, frames, world_from_ego))
-    times = path.times_s[rows]
     moments = [*times, *(image.timestamp_s for image in images)]
+    drawn_s = min(moments), max(moments)
     return StreetData(
         root=root,
         world_origin_m=origin,
@@ -669,9 +663,7 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
         frame_times_s=times,
         world_from_ego=world_from_ego,
         images=images,
-        objects=tracked_objects(
-            table, seen, tracklets.ids, frames, times, (min(moments), max(moments))
-        ),
+        objects=tracked_objects(table, seen, tracklets.ids, frames, times, drawn_s),
         tracklets=tracklets,
         problems=(*path.problems, *problems, *image_problems, *table.problems),
     )
@@ -723,28 +715,9 @@ def held_out_steps(count: int, config: ModelConfig) -> frozenset[int]:
     return frozenset()
 
 
-def _cameras(root: Path, config: ModelConfig) -> list[int]:
-    cams = sorted(set(config.cameras))
-    if not cams or not set(cams) <= set(range(len(CAMERA_NAMES))):
-        raise AdapterError(
-            f"{root}: the configuration's data.cameras must be some of 0 to "
-            f"{len(CAMERA_NAMES) - 1} ({', '.join(CAMERA_NAMES)}); got {list(config.cameras)}"
-        )
-    absent = sorted(set(cams) - set(calibrated_cameras(root)))
-    if absent:
-        raise AdapterError(
-            f"{root / 'extrinsics' / f'{absent[0]}.txt'} does not exist, but camera {absent[0]} "
-            f"({CAMERA_NAMES[absent[0]]}) is used; copy it from the dataset"
-        )
-    return cams
-
-
-def _selected(root: Path, path: EgoPath, config: ModelConfig) -> tuple[range, tuple[str, ...]]:
+def _select_frames(root: Path, there: range, config: ModelConfig) -> tuple[range, tuple[str, ...]]:
     """The selected frames' numbers, and a sentence where the dataset has fewer."""
-    there = path.numbers
-    if config.selected_frames is None:
-        return there, ()
-    first, last = config.selected_frames
+    first, last = config.selected_frames or (there[0], there[-1])
     frames = range(max(first, there[0]), min(last, there[-1]) + 1)
     if not frames:
         raise AdapterError(
@@ -757,12 +730,6 @@ def _selected(root: Path, path: EgoPath, config: ModelConfig) -> tuple[range, tu
         f"{root} has frames {there[0]} to {there[-1]} of the {first} to {last} that the "
         f"configuration selects",
     )
-
-
-def _centred(poses: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    out = poses.copy()
-    out[..., :3, 3] -= origin
-    return out
 
 
 def _images(
@@ -782,17 +749,17 @@ def _images(
         if (frame, cam) not in moments:
             continue
         timestamp_s, world_from_ego = moments[frame, cam]
-        width, height = sizes[cam]
+        world_from_ego[:3, 3] -= origin
         images.append(
             StreetImage(
                 frame=frame,
                 cam=cam,
                 path=paths.get((frame, cam)),
                 timestamp_s=timestamp_s,
-                world_from_ego=_centred(world_from_ego, origin),
+                world_from_ego=world_from_ego,
                 lens=lenses[cam],
-                width=width,
-                height=height,
+                width=sizes[cam][0],
+                height=sizes[cam][1],
                 is_held_out=frames.index(frame) in held_out,
                 number=number,
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_yaml
 from adapters.raw_drive import DriveOptions
-from adapters.street_gaussians.data import CAMERA_NAMES, ModelConfig
+from adapters.street_gaussians.data import ModelConfig
 from adapters.uri import check_query, choice_of, whole_number_of
 from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
@@ -70,22 +70,6 @@ class ModelOptions:
 # ---- The configuration that a model was trained with: configs/config_{iteration:06d}.yaml --------
 
 _NAME = re.compile(r"config_(\d+)\.yaml")
-_CONFIG_KEYS = {
-    "source_path": "source_path",
-    "use_tracker": "data.use_tracker",
-    "split_test": "data.split_test",
-    "split_train": "data.split_train",
-    "white_background": "data.white_background",
-    "fourier_scale": "model.gaussian.fourier_scale",
-    "include_sky": "model.nsg.include_sky",
-    "opt_track": "model.nsg.opt_track",
-    "use_color_correction": "model.use_color_correction",
-    "color_correction_mode": "model.color_correction.mode",
-    "color_correction_mlp": "model.color_correction.use_mlp",
-    "use_pose_correction": "model.use_pose_correction",
-    "pose_correction_mode": "model.pose_correction.mode",
-}
-_MODES = {"color_correction_mode": ("image", "sensor"), "pose_correction_mode": ("image", "frame")}
 
 
 def newest_config(model: Path) -> Path:
@@ -104,46 +88,19 @@ def newest_config(model: Path) -> Path:
 def read_config(path: Path) -> ModelConfig:
     """What of a configuration decides how its model is read; keys that it lacks or has as null
     have the project's defaults."""
-    tree, values, numbers = read_yaml(path), {}, range(len(CAMERA_NAMES))
-
-    def wrong(key: str, expected: str, found: Any) -> AdapterError:
-        return AdapterError(f"{path}: {key} must be {expected}; got {str(found)[:80]!r}")
-
-    def value_of(key: str) -> Any:
+    tree, given = read_yaml(path), {}
+    for field_name, entry in ModelConfig.model_fields.items():
+        key = entry.alias or field_name
         found: Any = tree
         for name in key.split("."):
             if found is not None and not isinstance(found, Mapping):
-                raise wrong(key, "a key inside a section", found)
+                raise AdapterError(
+                    f"{path}: {key} must be a key inside a section; got {str(found)[:80]!r}"
+                )
             found = None if found is None else found.get(name)
-        return found
-
-    for name, key in _CONFIG_KEYS.items():
-        found, kind = value_of(key), type(getattr(ModelConfig, name))
-        if found is None:
-            continue
-        if kind is float and type(found) is int:
-            found = float(found)
-        if type(found) is not kind:
-            raise wrong(key, f"a value of type {kind.__name__}", found)
-        if kind is float and not math.isfinite(found):
-            raise wrong(key, "a finite number", found)
-        if found not in _MODES.get(name, (found,)):
-            raise wrong(key, " or ".join(_MODES[name]), found)
-        values[name] = found
-    if (cameras := value_of("data.cameras")) is not None:
-        is_list = isinstance(cameras, list) and all(
-            type(n) is int and n in numbers for n in cameras
-        )
-        if not is_list or not cameras or len(set(cameras)) != len(cameras):
-            expected = f"different camera numbers from 0 to {numbers[-1]}, such as [0, 1, 2]"
-            raise wrong("data.cameras", expected, cameras)
-        values["cameras"] = tuple(cameras)
-    if (pair := value_of("data.selected_frames")) is not None:
-        is_pair = isinstance(pair, list) and [type(n) for n in pair] == [int, int]
-        if not is_pair or not 0 <= pair[0] <= pair[1]:
-            raise wrong("data.selected_frames", "[first, last] or null", pair)
-        values["selected_frames"] = tuple(pair)
-    return ModelConfig(**values)
+        if found is not None:
+            given[key] = found
+    return validate(ModelConfig, given, path, "configuration of a Street Gaussians training")
 
 
 # ---- Where the files of a trained model are ------------------------------------------------------
@@ -171,23 +128,21 @@ def is_dataset(path: Path) -> bool:
 
 def find_model(path: Path, options: ModelOptions) -> ModelFiles:
     """The files of a model, given its folder or its weights."""
-    folder, weights, iteration = _weights(path, options)
+    folder, weights, iteration = _find_weights(path, options)
     config_file = newest_config(folder)
     config = read_config(config_file)
-    data = options.data
-    if data is not None and not data.is_dir():
+    data = options.data or Path(config.source_path)
+    if options.data is not None and not data.is_dir():
         raise AdapterError(f"data={data}: no such folder; expected the model's dataset")
-    if data is None:
-        data = Path(config.source_path)
-        if not config.source_path or not data.is_dir():
-            raise AdapterError(
-                f"{config_file}: source_path {config.source_path!r} is not here; the model needs "
-                f"poses, tracks and cameras of its dataset. Give its folder as data=DIR"
-            )
+    if options.data is None and not (config.source_path and data.is_dir()):
+        raise AdapterError(
+            f"{config_file}: source_path {config.source_path!r} is not here; the model needs "
+            f"poses, tracks and cameras of its dataset. Give its folder as data=DIR"
+        )
     return ModelFiles(folder, weights, iteration, config_file, config, data)
 
 
-def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
+def _find_weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
     """The model's folder, its weights and their iteration, where their name says it."""
     if path.is_file():
         if options.iteration is not None or options.weights is not None:
@@ -195,13 +150,16 @@ def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]
                 f"{path} is one file, so iteration= and weights= say nothing; give the model's "
                 f"folder or leave them out"
             )
-        if path.suffix.lower() not in (".pth", ".ply"):
-            raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
-        is_pth = path.suffix.lower() == ".pth"
-        match = _PTH.fullmatch(path.name) if is_pth else _PLY.fullmatch(path.parent.name)
+        match path.suffix.lower():
+            case ".pth":
+                named = _PTH.fullmatch(path.name)
+            case ".ply":
+                named = _PLY.fullmatch(path.parent.name)
+            case _:
+                raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
         folders = path.absolute().parents[:3]
         folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
-        return folder, path, int(match[1]) if match else None
+        return folder, path, int(named[1]) if named else None
     saved = _saved(path)
     if not saved:
         raise AdapterError(
@@ -254,7 +212,7 @@ class Parameters:
     def of(self, name: str, switch: str) -> Mapping[str, Any] | None:
         """The table `params` of an entry. switch: what of the configuration says if it is used."""
         self.seen.add(name)
-        key = _CONFIG_KEYS[switch]
+        key = ModelConfig.model_fields[switch].alias
         if not getattr(self.config, switch):
             if self._content.get(name):
                 self.problems.append(
@@ -352,8 +310,7 @@ def read_sky(parameters: Parameters) -> Tensor | None:
     own = torch.empty(faces.shape)
     for face in range(6):
         taken(faces[face], own[face])
-    lowest, highest = own.numpy().min(), own.numpy().max()
-    if not np.isfinite([lowest, highest]).all():
+    if not np.isfinite([own.numpy().min(), own.numpy().max()]).all():
         raise AdapterError(f"{where}: sky_cube_map holds NaN or infinite numbers")
     return own.clamp_(0, 1)
 
@@ -364,17 +321,15 @@ def read_color_maps(parameters: Parameters) -> Tensor | None:
     params = parameters.of(name, "use_color_correction")
     if params is None:
         return None
-    if parameters.config.color_correction_mlp or any(
-        str(k).startswith("affine_trans.") for k in params
-    ):
+    is_network = any(str(key).startswith("affine_trans.") for key in params)
+    if parameters.config.color_correction_mlp or is_network:
         parameters.problems.append(
             f"{parameters.path}, {name}: colour correction by a network is not supported and left "
             f"out; images have the scene's own colours"
         )
         return None
-    return torch.from_numpy(
-        parameters.numbers(params, name, "affine_trans", (None, 3, 4)).astype(np.float32)
-    )
+    maps = parameters.numbers(params, name, "affine_trans", (None, 3, 4))
+    return torch.from_numpy(maps.astype(np.float32))
 
 
 def read_camera_changes(parameters: Parameters) -> np.ndarray | None:
@@ -441,9 +396,17 @@ def finish_part(
 
     None for an actor of which nothing usable remains; of a background that is an error.
     """
-    _activate(arrays)
-    if terms is not None:
-        _mark_bad_terms(arrays["means"], terms)
+    arrays["scales"].exp_()
+    arrays["opacities"].sigmoid_()
+    means, quats = arrays["means"].numpy(), arrays["quats"].numpy()
+    for start in range(0, len(quats), _ROWS):
+        rows = slice(start, start + _ROWS)
+        # In float64, where lengths of any float32 neither overflow nor vanish.
+        lengths = np.sqrt(np.einsum("ni,ni->n", quats[rows], quats[rows], dtype=np.float64))
+        lengths[lengths == 0] = 1  # such a quaternion is left out later
+        quats[rows] /= lengths[:, None]
+        if terms is not None:  # colours that are not numbers at some time cannot be drawn
+            means[rows][~np.isfinite(terms[rows].numpy()).all((1, 2))] = np.nan
     gaussians = Gaussians(**arrays)
     if len(gaussians) and is_drawable(gaussians):
         return Part(gaussians, terms), ()
@@ -454,27 +417,6 @@ def finish_part(
             raise AdapterError(str(error)) from None
         return None, (f"{error} It is left out",)
     return Part(kept, None if terms is None else terms[drawable_rows(gaussians)]), problems
-
-
-def _activate(arrays: Mapping[str, Tensor]) -> None:
-    arrays["scales"].exp_()
-    arrays["opacities"].sigmoid_()
-    quats = arrays["quats"].numpy()
-    for start in range(0, len(quats), _ROWS):
-        piece = quats[start : start + _ROWS]
-        # In float64, where lengths of any float32 neither overflow nor vanish.
-        lengths = np.sqrt(np.einsum("ni,ni->n", piece, piece, dtype=np.float64))
-        lengths[lengths == 0] = 1  # such a quaternion is left out later
-        piece /= lengths[:, None]
-
-
-def _mark_bad_terms(means: Tensor, terms: Tensor) -> None:
-    """A splat whose colours are not numbers at some time is none that can be drawn."""
-    for start in range(0, len(terms), _ROWS):
-        piece = slice(start, start + _ROWS)
-        bad = ~np.isfinite(terms[piece].numpy()).all((1, 2))
-        if bad.any():
-            means[piece][torch.from_numpy(bad)] = torch.nan
 
 
 # ---- A whole model -------------------------------------------------------------------------------
@@ -586,10 +528,8 @@ def _split(source: Tensor, first: Tensor, further: Tensor | None) -> None:
             release(piece)
 
 
-# ---- The Gaussians of a trained model, read from point_cloud/iteration_N/point_cloud.ply ---------
-# One element for each part, vertex_background and vertex_obj_003. It has no sky, no colour
-# correction
-# and not what training added to poses.
+# ---- point_cloud/iteration_N/point_cloud.ply: an element for each part, such as vertex_obj_003 ---
+# It has no sky, no colour correction and not what training added to poses.
 
 _PREFIX = "vertex_"
 _FIXED = (
@@ -598,7 +538,7 @@ _FIXED = (
 _NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(0|[1-9]\d{0,6})")
 
 
-def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
+def read_ply_model(path: Path, config: ModelConfig) -> TrainedModel:
     """Read a .ply in pieces."""
     try:
         header = read_ply_header(path)
@@ -613,17 +553,15 @@ def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
                 f"one such as vertex_obj_003 for each actor; found "
                 f"{', '.join(names[:12]) or 'none'}{hint}"
             )
-        lost = {
+        trained = {
             "the actors' learnt poses": config.opt_track,
             "the sky": config.include_sky,
             "the colour correction": config.use_color_correction,
             "the pose correction": config.use_pose_correction,
         }
-        text = f"{path}: a .ply holds Gaussians only"
-        if any(lost.values()):
-            names = ", ".join(name for name, was_trained in lost.items() if was_trained)
-            text += f"; left out: {names}. They are in trained_model/iteration_N.pth"
-        problems = [text]
+        problems = [f"{path}: a .ply holds Gaussians only"]
+        if lost := ", ".join(name for name, was_trained in trained.items() if was_trained):
+            problems[0] += f"; left out: {lost}. They are in trained_model/iteration_N.pth"
         others = [e.name for e in header.elements if not _is_part(e)]
         if others:
             problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
@@ -702,8 +640,10 @@ def _scatter(
 ) -> None:
     """Copy the columns of some rows to their places; no activation yet."""
     values = {name: array.numpy()[where] for name, array in arrays.items()}
-    rest = values["sh"].shape[1] - 1
-    count = 1 if terms is None else 1 + terms.shape[1]
+    colours = values["sh"][:, :1]
+    if terms is not None:
+        colours = np.concatenate([colours, terms.numpy()[where]], 1)
+    rest = values["sh"][:, 1:]
     with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinite
         for axis, name in enumerate("xyz"):
             values["means"][:, axis] = rows[name]
@@ -711,10 +651,9 @@ def _scatter(
         for axis in range(4):
             values["quats"][:, axis] = rows[f"rot_{axis}"]
         values["opacities"][:] = rows["opacity"]
-        for channel in range(3):
-            values["sh"][:, 0, channel] = rows[f"f_dc_{channel * count}"]
-            for term in range(1, count):
-                assert terms is not None
-                terms.numpy()[where][:, term - 1, channel] = rows[f"f_dc_{channel * count + term}"]
-            for band in range(rest):
-                values["sh"][:, 1 + band, channel] = rows[f"f_rest_{channel * rest + band}"]
+        for prefix, numbers in (("f_dc", colours), ("f_rest", rest)):
+            count = numbers.shape[1]  # a channel's values after the other's
+            for index in range(3 * count):
+                numbers[:, index % count, index // count] = rows[f"{prefix}_{index}"]
+    if terms is not None:
+        values["sh"][:, :1], terms.numpy()[where] = colours[:, :1], colours[:, 1:]

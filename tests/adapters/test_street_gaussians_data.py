@@ -14,8 +14,8 @@ import pytest
 import torch
 from street_gaussians_files import NAMES, ROAD_RGB, Facts, write_dataset
 
+from adapters.street_gaussians.adapter import StreetGaussiansLabels, labels_of, open_raw
 from adapters.street_gaussians.data import ModelConfig, frames_of, held_out_steps, read_data
-from adapters.street_gaussians.labels import StreetGaussiansLabels, labels_of, open_raw
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
@@ -211,9 +211,9 @@ def test_cameras_that_are_not_used_need_no_calibration(own_street):
         ("ego_pose/000001.txt", "nan " * 16, r"000001\.txt holds NaN"),
         ("ego_pose/000001_0.txt", "1 " * 16, r"000001_0\.txt must be a rotation"),
         ("timestamps.json", "[]", r"timestamps\.json must hold an object"),
-        ("timestamps.json", "{}", r"timestamps\.json must hold FRAME"),
-        ("timestamps.json", '{"FRAME": {"000000": "x"}}', r"FRAME must hold seconds by frame"),
-        ("timestamps.json", '{"FRAME": {"000000": NaN}}', r"FRAME must hold seconds by frame"),
+        ("timestamps.json", "{}", r"timestamps\.json: .*FRAME: Field required"),
+        ("timestamps.json", '{"FRAME": {"000000": "x"}}', "FRAME.000000: .*valid number"),
+        ("timestamps.json", '{"FRAME": {"000000": NaN}}', "FRAME.000000: .*finite number"),
         ("timestamps.json", '{"FRAME": {"000000": 1.0}}', r"FRAME lacks frame 000001"),
     ],
 )
@@ -292,8 +292,6 @@ def test_a_selection_beyond_the_dataset(street):
     assert data.frames == (2, 3) and any("2 to 90" in said for said in data.problems)
     with pytest.raises(AdapterError, match=r"selected_frames are 50 to 90; .* has 0 to 3"):
         read_data(street.root, ModelConfig(cameras=(0,), selected_frames=(50, 90)))
-    with pytest.raises(AdapterError, match=r"data\.cameras must be some of 0 to 4"):
-        read_data(street.root, ModelConfig(cameras=(0, 5)))
 
 
 def test_boxes_are_all_rows_of_the_frame_in_the_datasets_world(street):

@@ -29,7 +29,7 @@ from adapters.street_gaussians.model import (
     newest_config,
     read_checkpoint,
     read_config,
-    read_point_cloud,
+    read_ply_model,
 )
 from augment.errors import AdapterError
 
@@ -95,7 +95,7 @@ def test_a_point_cloud_is_read_as_it_was_trained(tmp_path: Path, byte_order, deg
     )
     path = tmp_path / "point_cloud.ply"
     path.write_bytes(ply_bytes(raw.parts, byte_order))
-    model = read_point_cloud(path, PLAIN)
+    model = read_ply_model(path, PLAIN)
     check_part(model.background, raw.background)
     check_part(model.actors[7], raw.actors[7])
     assert len(model.problems) == 1 and "the actors' learnt poses" in model.problems[0]
@@ -113,7 +113,7 @@ def test_many_gaussians_are_taken_in_pieces(tmp_path: Path) -> None:
     rows = plyfile.PlyData.read(path)["vertex_obj_001"]
     np.testing.assert_array_equal(rows["f_dc_6"], raw.actors[1].dc[:, 1, 1])
     np.testing.assert_array_equal(rows["f_rest_4"], raw.actors[1].rest[:, 1, 1])
-    cloud = read_point_cloud(path, PLAIN)
+    cloud = read_ply_model(path, PLAIN)
     check_part(cloud.background, raw.background)
     check_part(cloud.actors[1], raw.actors[1])
 
@@ -126,9 +126,7 @@ def test_tables_beside_the_gaussians(tmp_path: Path) -> None:
         moves=rng.normal(size=(4, 3)),
         turns=np.array([[2.0, 0, 0, 2.0], [0.5, 0, 0, 0], [1, 0, 0, 0], [-3, 0, 0, 0]]),
     )
-    config = dataclasses.replace(
-        PLAIN, include_sky=True, use_color_correction=True, use_pose_correction=True
-    )
+    config = ModelConfig(include_sky=True, use_color_correction=True, use_pose_correction=True)
     model = opened(tmp_path, raw, config)
     assert list(model.problems) == []
     np.testing.assert_allclose(model.sky, raw.sky.astype(np.float32).clip(0, 1))
@@ -145,7 +143,7 @@ def test_tables_beside_the_gaussians(tmp_path: Path) -> None:
 
 
 def test_poses_that_were_not_trained_are_left_alone(tmp_path: Path) -> None:
-    fixed = dataclasses.replace(PLAIN, opt_track=False)
+    fixed = ModelConfig(opt_track=False)
     bare = opened(tmp_path, raw_model(opt_trans=None, extra={"actor_pose": {}}), fixed)
     assert bare.pose_changes is None and list(bare.problems) == []
     unused = opened(tmp_path, raw_model(), fixed)
@@ -159,7 +157,7 @@ def test_networks_are_left_out_with_a_sentence(tmp_path: Path) -> None:
         "params": {"sky_cube_map": torch.zeros(6, 4, 4, 1), "sky_codebook": torch.zeros(32, 12)}
     }
     content["color_correction"] = {"params": {"affine_trans.0.weight": torch.zeros(64, 6)}}
-    config = dataclasses.replace(PLAIN, include_sky=True, use_color_correction=True)
+    config = ModelConfig(include_sky=True, use_color_correction=True)
     model = read_checkpoint(saved(tmp_path, content), config)
     assert model.sky is None and model.color_maps is None
     assert "a codebook and a network is not supported" in model.problems[0]
@@ -209,7 +207,7 @@ def test_actors_without_gaussians_are_left_out(tmp_path: Path) -> None:
 
 def _cloud(folder: Path, raw: RawModel) -> TrainedModel:
     (folder / "a.ply").write_bytes(ply_bytes(raw.parts))
-    return read_point_cloud(folder / "a.ply", PLAIN)
+    return read_ply_model(folder / "a.ply", PLAIN)
 
 
 def without(content: dict, *keys: str) -> dict:
@@ -303,7 +301,7 @@ def test_wrong_checkpoints(tmp_path: Path, change, words: str) -> None:
 )
 def test_wrong_tables(tmp_path: Path, config: dict, change: dict, words: str) -> None:
     with pytest.raises(AdapterError, match=words):
-        opened(tmp_path, raw_model(**change), dataclasses.replace(PLAIN, **config))
+        opened(tmp_path, raw_model(**change), ModelConfig(**config))
 
 
 class Touch:
@@ -334,7 +332,7 @@ def test_damaged_files(tmp_path: Path) -> None:
     cloud = tmp_path / "a.ply"
     cloud.write_bytes(ply_bytes(raw_model().parts)[:-100])
     with pytest.raises(AdapterError, match=r"announces 30 rows of 'vertex_obj_012'"):
-        read_point_cloud(cloud, PLAIN)
+        read_ply_model(cloud, PLAIN)
 
 
 @pytest.mark.parametrize(
@@ -354,14 +352,14 @@ def test_wrong_point_clouds(tmp_path: Path, old: bytes, new: bytes, words: str) 
     path = tmp_path / "a.ply"
     path.write_bytes(data.replace(old, new, 1))
     with pytest.raises(AdapterError, match=words):
-        read_point_cloud(path, PLAIN)
+        read_ply_model(path, PLAIN)
 
 
 def test_other_elements_are_named(tmp_path: Path) -> None:
     parts = raw_model().parts
     parts["sky"] = random_part(9, 5)
     (tmp_path / "a.ply").write_bytes(ply_bytes(parts) + b"surplus")
-    model = read_point_cloud(tmp_path / "a.ply", PLAIN)
+    model = read_ply_model(tmp_path / "a.ply", PLAIN)
     assert any("also holds vertex_sky" in problem for problem in model.problems)
     assert any("7 bytes follow" in problem for problem in model.problems)
 
@@ -396,15 +394,15 @@ def test_the_newest_configuration_is_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"data.cameras": [0, 7]}, "data.cameras must be different camera numbers"),
-        ({"data.cameras": []}, "data.cameras"),
-        ({"data.cameras": "FRONT"}, "data.cameras"),
-        ({"data.selected_frames": [9, 3]}, "data.selected_frames must be"),
-        ({"data.selected_frames": [9]}, "data.selected_frames must be"),
-        ({"data.split_test": "four"}, "data.split_test must be a value of type int; got 'four'"),
-        ({"model.gaussian.fourier_scale": math.nan}, "fourier_scale must be a finite"),
-        ({"model.nsg.opt_track": 1}, "opt_track must be a value of type bool"),
-        ({"model.color_correction.mode": "frame"}, "must be image or sensor"),
+        ({"data.cameras": [0, 7]}, "data.cameras: .*must be different camera numbers"),
+        ({"data.cameras": []}, "data.cameras: .*must be different camera numbers"),
+        ({"data.cameras": "FRONT"}, "data.cameras: Input should be a valid tuple"),
+        ({"data.selected_frames": [9, 3]}, r"data.selected_frames: .*must be \[first, last\]"),
+        ({"data.selected_frames": [9]}, "data.selected_frames.1: Field required"),
+        ({"data.split_test": "four"}, "data.split_test: Input should be a valid int.*got four"),
+        ({"model.gaussian.fourier_scale": math.nan}, "fourier_scale: .*finite number"),
+        ({"model.nsg.opt_track": 1}, "opt_track: Input should be a valid boolean"),
+        ({"model.color_correction.mode": "frame"}, "should be 'image' or 'sensor'"),
         ({"model.nsg": 3}, "model.nsg.* must be a key inside a section"),
     ],
 )

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from street_gaussians_files import write_members, write_point_clouds
 
 from adapters.safe_pickle import stream_arrays
-from adapters.street_gaussians.labels import iterate_point_clouds, read_point_cloud
+from adapters.street_gaussians.adapter import iterate_point_clouds, read_point_cloud
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError
 
@@ -48,7 +48,7 @@ def test_frames_come_back_in_whatever_order_they_are_asked_for(tmp_path, order):
 
 
 def test_frames_that_are_no_longer_kept_are_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("adapters.street_gaussians.labels._KEPT_BYTES", 0)
+    monkeypatch.setattr("adapters.street_gaussians.adapter._KEPT_BYTES", 0)
     points, projections = clouds()
     write_point_clouds(tmp_path, points, projections)
     for frame in (3, 1, 1, 4, 0):

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from street_gaussians_models import random_part
 
 from adapters.street_gaussians.adapter import (
-    CameraChanges,
     camera_changes,
     check_changes,
     color_maps,
@@ -203,11 +202,12 @@ def part_of(terms: int, degree: int = 0) -> Part:
 
 
 PLAIN = ModelConfig(fourier_scale=2.0)
+STILL = camera_changes(None, street(), PLAIN, "model")
 
 
 def test_an_actor_is_where_and_when_its_images_are() -> None:
     data, changes = street(), some_changes()
-    actor, problems = make_actor(data, data.objects[0], part_of(5), changes, CameraChanges(), PLAIN)
+    actor, problems = make_actor(data, data.objects[0], part_of(5), changes, STILL, PLAIN)
     assert actor is not None and problems == ()
     assert (actor.track_id, actor.label, actor.size_m) == ("5", "vehicle", (4.0, 2.0, 1.5))
     for found in data.images:
@@ -234,27 +234,24 @@ def test_the_background_is_moved_and_actors_stay() -> None:
     moves[:, :3, 3] = 0.2 * rng.normal(size=(len(moves), 3))
     config = ModelConfig(cameras=CAMS, use_pose_correction=True)
     changes = camera_changes(moves, data, config, "model")
-    plain, _ = make_actor(data, data.objects[0], part_of(1), None, CameraChanges(), PLAIN)
+    plain, _ = make_actor(data, data.objects[0], part_of(1), None, STILL, PLAIN)
     moved, _ = make_actor(data, data.objects[0], part_of(1), None, changes, PLAIN)
     assert plain.color_waves is None
+    np.testing.assert_array_equal(changes, moves)
     for found in data.images[2:10]:
         change = moves[found.number]
-        np.testing.assert_array_equal(changes.of(found), change)
         there = moved.track.pose_at(found.timestamp_ns).numpy()
         here = plain.track.pose_at(found.timestamp_ns).numpy()
         np.testing.assert_allclose(change @ there, here, atol=1e-12)
     by_frame = camera_changes(
-        moves[:FRAMES], data, dataclasses.replace(config, pose_correction_mode="frame"), "model"
+        moves[:FRAMES], data, config.model_copy(update={"pose_correction_mode": "frame"}), "model"
     )
-    for found in data.images:
-        np.testing.assert_array_equal(by_frame.of(found), moves[found.frame - 10])
+    np.testing.assert_array_equal(by_frame, moves[[i.frame - 10 for i in data.images]])
 
 
 def test_an_object_of_one_frame_has_one_pose_and_colour() -> None:
     data = street()
-    actor, problems = make_actor(
-        data, data.objects[1], part_of(3), some_changes(), CameraChanges(), PLAIN
-    )
+    actor, problems = make_actor(data, data.objects[1], part_of(3), some_changes(), STILL, PLAIN)
     assert len(problems) == 1 and "tracked in one frame only" in problems[0]
     assert actor.color_waves.phases.tolist() == [0.0] * len(actor.track.timestamps_ns)
     shown = [i for i in data.images if actor.track.pose_at(i.timestamp_ns) is not None]
@@ -264,7 +261,7 @@ def test_an_object_of_one_frame_has_one_pose_and_colour() -> None:
 def test_an_object_between_images_is_left_out() -> None:
     data = street()
     tracked = dataclasses.replace(data.objects[0], start_s=START_S + 0.02, end_s=START_S + 0.03)
-    actor, problems = make_actor(data, tracked, part_of(1), None, CameraChanges(), PLAIN)
+    actor, problems = make_actor(data, tracked, part_of(1), None, STILL, PLAIN)
     assert actor is None and "in none of the images' moments" in problems[0]
 
 
@@ -273,9 +270,7 @@ def test_images_of_one_moment_are_said() -> None:
     first, second = data.images[2], data.images[3]
     twin = dataclasses.replace(second, timestamp_s=first.timestamp_s)
     data = dataclasses.replace(data, images=(*data.images[:3], twin, *data.images[4:]))
-    actor, problems = make_actor(
-        data, data.objects[0], part_of(1, degree=1), None, CameraChanges(), PLAIN
-    )
+    actor, problems = make_actor(data, data.objects[0], part_of(1, degree=1), None, STILL, PLAIN)
     assert any("apart in images of one moment" in problem for problem in problems)
     assert actor.colors_in_world
     assert bool((actor.track.timestamps_ns.diff() > 0).all())
@@ -298,17 +293,17 @@ def test_colour_maps_of_images_and_cameras() -> None:
     data = street(held_out=(2, 4))
     maps = torch.randn(12, 3, 4, generator=torch.Generator().manual_seed(0))
     config = ModelConfig(cameras=CAMS, use_color_correction=True)
-    found = color_maps(maps, data, config, "model")
+    by_camera, by_image = color_maps(maps, data, config, "model")
     for number, step_cam in enumerate((s, c) for s in range(FRAMES) for c in CAMS):
         seen = next(i for i in data.images if (i.frame - 10, i.cam) == step_cam)
-        assert torch.equal(found.by_image[seen.name, seen.timestamp_ns], maps[number])
+        assert torch.equal(by_image[seen.name, seen.timestamp_ns], maps[number])
     right = maps[[1, 3, 7, 11]].mean(0)  # trained on: frames 0, 1, 3, 5
-    torch.testing.assert_close(found.by_camera["FRONT_RIGHT"], right)
-    sensor = dataclasses.replace(config, color_correction_mode="sensor", cameras=(0, 1, 2))
-    found = color_maps(maps[:3], data, sensor, "model")
-    assert torch.equal(found.by_camera["FRONT_RIGHT"], maps[2]) and not found.by_image
+    torch.testing.assert_close(by_camera["FRONT_RIGHT"], right)
+    sensor = config.model_copy(update={"color_correction_mode": "sensor", "cameras": (0, 1, 2)})
+    by_camera, by_image = color_maps(maps[:3], data, sensor, "model")
+    assert torch.equal(by_camera["FRONT_RIGHT"], maps[2]) and not by_image
     with pytest.raises(AdapterError, match=r"maps of cameras 0 to 1.*cameras has"):
-        color_maps(maps[:2], data, dataclasses.replace(sensor, cameras=CAMS), "model")
+        color_maps(maps[:2], data, sensor.model_copy(update={"cameras": CAMS}), "model")
 
 
 @pytest.mark.parametrize("mode", ["image", "frame"])
