@@ -141,18 +141,14 @@ def split_by_scene(
     *,
     exact: bool = False,
 ) -> dict[str, Splittable]:
-    """The parts of a dataset, or of a manifest's table, by name; each scene is in one of them.
-
-    All variants, frames and cameras of a scene stay together. Which part a scene belongs to follows
+    """The parts of a dataset, or of a manifest's table, by name; each scene is in one of them. All
+    variants, frames and cameras of a scene stay together. Which part a scene belongs to follows
     from its name and the seed: it does not change when other scenes are added or filtered out, when
     a part is renamed, or between machines. The price is that fractions hold on average only: of ten
-    scenes, 0.2 is often none or four.
-
-    fractions: of the scenes, in order; they add up to 1. exact: deal the scenes that there are
-    such that each part's number is off by less than one; a scene's part then depends on the others.
-
-    Raises:
-        ValueError: fractions that are negative or do not add up to 1.
+    scenes, 0.2 is often none or four. fractions: of the scenes, in order; they add up to 1. exact:
+    deal the scenes that there are such that each part's number is off by less than one; a scene's
+    part then depends on the others. Raises ValueError: fractions that are negative or do not add up
+    to 1.
     """
     shares = list(fractions.values())
     if not shares or min(shares) < 0 or not math.isclose(sum(shares), 1, abs_tol=1e-9):
@@ -284,16 +280,13 @@ class PairedDataset(Dataset):
 
 
 class MixedDataset(Dataset):
-    """The clean images, a part of them exchanged for weathered ones of the same moment.
-
-    As long as `clean`. fraction: the probability of an exchange, where there is a weathered image;
-    which of several is drawn too, each as likely. What an index yields depends on the seed, the
-    epoch and the index only: not on the worker, nor on what was asked before. Both datasets need
-    the same `image_type` and `transform`, or their samples do not stack.
-
-    Raises:
-        ValueError: a fraction outside 0 to 1, two clean images of one moment, or one dataset's
-            samples have what the other's lack (masks of water and snow excepted).
+    """The clean images, a part of them exchanged for weathered ones of the same moment. As long as
+    `clean`. fraction: the probability of an exchange, where there is a weathered image; which of
+    several is drawn too, each as likely. What an index yields depends on the seed, the epoch and
+    the index only: not on the worker, nor on what was asked before. Both datasets need the same
+    `image_type` and `transform`, or their samples do not stack. Raises ValueError: a fraction
+    outside 0 to 1, two clean images of one moment, or one dataset's samples have what the other's
+    lack (masks of water and snow excepted).
     """
 
     def __init__(

@@ -181,20 +181,14 @@ _MATRICES = ("K", "world_from_camera", "world_from_ego")
 
 
 def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A batch of samples, for `DataLoader(collate_fn=collate_frames)`.
-
-    Images and buffers of one size are stacked to [N, ...]; of unlike sizes they stay a list, as do
-    masks of water and snow where a sample has none. camera: K [N, 3, 3], world_from_camera and
-    world_from_ego [N, 4, 4] and int64 [N] tensors, name a list. weather: float64 [N] per number,
-    NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry a
-    sample.
-
-    Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3], frame
-    [N, T]. Pairs become a dictionary of two batches.
-
-    Raises:
-        ValueError: some samples have an image or buffer that others lack, masks excepted: datasets
-            of unlike outputs or `load` are mixed.
+    """A batch of samples, for `DataLoader(collate_fn=collate_frames)`. Images and buffers of one
+    size are stacked to [N, ...]; of unlike sizes they stay a list, as do masks of water and snow
+    where a sample has none. camera: K [N, 3, 3], world_from_camera and world_from_ego [N, 4, 4] and
+    int64 [N] tensors, name a list. weather: float64 [N] per number, NaN where a sample lacks it.
+    Everything else, boxes above all, is a list with one entry a sample. Clips gain the same
+    dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3], frame [N, T]. Pairs become a
+    dictionary of two batches. Raises ValueError: some samples have an image or buffer that others
+    lack, masks excepted: datasets of unlike outputs or `load` are mixed.
     """
     first = samples[0]
     if "weathered" in first and "clean" in first:

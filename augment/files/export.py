@@ -26,7 +26,8 @@ from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
 from augment.render.sh import rotate_sh
-from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass
+from augment.scene import SH_COUNTS, Gaussians, Scene
+from augment.semantics import SemanticClass
 
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 

@@ -32,20 +32,21 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.ground_heights import Ground, GroundSource
 from augment.jobs.atomic import replaced_file, replaced_folder
 from augment.scene import (
     SH_COUNTS,
     Actor,
     ColorWaves,
     Gaussians,
+    Ground,
+    GroundSource,
     Scene,
-    SemanticClass,
     Track,
     check_gaussians,
     drawable_rows,
     is_drawable,
 )
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
@@ -754,15 +755,11 @@ def is_scene_file(path: Path) -> bool:
 
 def save_scene(scene: Scene, folder: str | Path) -> None:
     """Write a scene folder, as a whole or not at all; what `load_scene_parts` gives back is equal
-    to the bit, the labels excepted, which stay with the recording.
-
-    A scene folder that is there already is replaced in one step; other files in it are kept.
-
-    Raises:
-        SceneError: the scene has something the files cannot hold (a sky of another class, Gaussians
-            that are not float32).
-        OutputError: the folder holds something else than a scene, or the system refused (disk full,
-            no permission ...); what was there before is then as it was.
+    to the bit, the labels excepted, which stay with the recording. A scene folder that is there
+    already is replaced in one step; other files in it are kept. Raises SceneError: the scene has
+    something the files cannot hold (a sky of another class, Gaussians that are not float32).
+    OutputError: the folder holds something else than a scene, or the system refused (disk full, no
+    permission ...); what was there before is then as it was.
     """
     folder = Path(folder)
     document = scene_document(scene)
@@ -780,17 +777,14 @@ def save_scene(scene: Scene, folder: str | Path) -> None:
 
 def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> None:
     """Write a scene into one file named *.climategs, as a whole or not at all; what was there is
-    replaced. What `load_scene_parts` gives back is equal to the bit, the labels excepted.
-
-    half: quaternions, opacities, colours, their waves and the sky as float16, for about half the
-    size (55 % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at
-    degree 0 (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024;
-    99.9 % of a street's pixels by less than 0.1/255. That it was done is in made_by for good.
-
-    Raises:
-        SceneError: the scene has something the file cannot hold: as for save_scene, text beyond
-            100 MB, or, with half, numbers beyond 65504.
-        OutputError: another name, or the system refused; what was there before is as it was.
+    replaced. What `load_scene_parts` gives back is equal to the bit, the labels excepted. half:
+    quaternions, opacities, colours, their waves and the sky as float16, for about half the size (55
+    % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at degree 0
+    (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024; 99.9 % of
+    a street's pixels by less than 0.1/255. That it was done is in made_by for good. Raises
+    SceneError: the scene has something the file cannot hold: as for save_scene, text beyond 100 MB,
+    or, with half, numbers beyond 65504. OutputError: another name, or the system refused; what was
+    there before is as it was.
     """
     path = Path(path)
     if not is_scene_file(path):

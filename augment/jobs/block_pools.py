@@ -1,4 +1,4 @@
-"""Workers that do one task each at a time: the interface, and the simplest of them."""
+"""Workers that do one task each at a time: in this process, in several, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any, Protocol, runtime_checkable
 
@@ -21,10 +21,14 @@ import augment
 from augment.errors import ClimateGSError
 from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
 from augment.jobs.processes import (
+    READY,
     ChildProcess,
+    Ended,
     available_cores,
     failed_start,
+    inbox_of,
     limit_threads,
+    receive,
     sender,
 )
 from augment.jobs.store import open_store
@@ -59,20 +63,16 @@ class WorkerPool(Protocol):
     work is done in this process, in several threads.
     """
 
-    @property
-    def slots(self) -> int: ...
+    slots: int
 
     def give(self, slot: int, task: Task) -> None:
         """Start a task in a worker that has none."""
-        ...
 
     def wait(self, timeout_s: float) -> list[Event]:
         """What has happened, at least one thing unless the time ran out first."""
-        ...
 
     def close(self) -> None:
         """End all workers: each finishes the images it has at hand, and what they hold is free."""
-        ...
 
 
 class SerialPool:
@@ -99,7 +99,11 @@ class SerialPool:
 # One that dies is replaced; all end when this process does.
 
 STOP_S = 60.0  # how long a worker may take to finish the images it has at hand
-_READY = "ready"
+
+
+class _Worker(ChildProcess):
+    slot = 0
+    has_task = False
 
 
 class ProcessPool:
@@ -111,80 +115,56 @@ class ProcessPool:
         self.slots = slots
         self._setup, self._tick = setup, tick
         self._threads = max(1, available_cores() // slots)
-        self._workers: list[_Worker | None] = [None] * slots
+        self._workers: dict[int, _Worker] = {}  # by slot
         self._has_started = False  # any of them
 
     def give(self, slot: int, task: Task) -> None:
-        worker = self._workers[slot]
+        worker = self._workers.get(slot)
         if worker is None:
             # No daemon: on trial it has processes of its own. It ends when the connection does.
             arguments = (self._setup, self._threads)
             worker = _Worker(_main, *arguments, threads=self._threads, daemon=False)
             self._workers[slot] = worker
+            worker.slot = slot
         worker.has_task = True
         worker.send(task)
 
     def wait(self, timeout_s: float) -> list[Event]:
         deadline = time.monotonic() + timeout_s
-        events: list[Event] = []
-        while not events:
+        while True:
             left = deadline - time.monotonic()
-            started = {w.connection: slot for slot, w in enumerate(self._workers) if w is not None}
-            ready = wait(list(started), max(0.0, left))
-            if not ready and left <= 0:
-                break
-            for connection in ready:
-                event = self._read(started[connection])  # pyright: ignore[reportArgumentType]
-                if event is not None:
-                    events.append(event)
-        return events
+            messages = list(receive(self._workers.values(), max(0.0, left)))
+            self._has_started |= any(worker.is_ready for worker in self._workers.values())
+            events = [event for w, message in messages if (event := self._event_of(w, message))]
+            if events or left <= 0:
+                return events
 
     def close(self) -> None:
-        workers = [worker for worker in self._workers if worker is not None]
-        self._workers = [None] * self.slots
+        workers, self._workers = list(self._workers.values()), {}
         try:
             for worker in workers:
                 worker.send(None)
             deadline = time.monotonic() + STOP_S
-            for worker in workers:
-                worker.drain(deadline)
+            for worker in workers:  # what one still sends is taken in, or it would block on it
+                source = worker.connection
+                with contextlib.suppress(EOFError, OSError):
+                    while (left := deadline - time.monotonic()) > 0 and source.poll(left):
+                        source.recv()
         finally:
             for worker in workers:
                 worker.kill()
 
-    def _read(self, slot: int) -> Event | None:
-        worker = self._workers[slot]
-        assert worker is not None
-        try:
-            message = worker.connection.recv()
-        except (EOFError, OSError):
-            return self._reap_worker(slot, worker)
-        if message == _READY:
-            worker.is_ready = self._has_started = True
-        elif isinstance(message, Outcome):
-            self._tick(slot, message)
-        else:
-            worker.has_task = False
-            return Finished(slot, message)
-        return None
-
-    def _reap_worker(self, slot: int, worker: _Worker) -> Event | None:
-        """What becomes of the task of a worker that died; of one that had none nothing is lost."""
-        ending = worker.reap()
-        self._workers[slot] = None
-        if not worker.is_ready and not self._has_started:
-            raise failed_start(ending)
-        return Lost(slot, ending) if worker.has_task else None
-
-
-class _Worker(ChildProcess):
-    has_task = False
-
-    def drain(self, deadline: float) -> None:
-        """Take in what the worker still sends until it ends, or it would block on sending it."""
-        with contextlib.suppress(EOFError, OSError):
-            while (left := deadline - time.monotonic()) > 0 and self.connection.poll(left):
-                self.connection.recv()
+    def _event_of(self, worker: _Worker, message: Any) -> Event | None:
+        if isinstance(message, Ended):
+            del self._workers[worker.slot]
+            if not self._has_started:
+                raise failed_start(message.how)
+            return Lost(worker.slot, message.how) if worker.has_task else None
+        if isinstance(message, Outcome):
+            self._tick(worker.slot, message)
+            return None
+        worker.has_task = False
+        return Finished(worker.slot, message)
 
 
 def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
@@ -193,10 +173,9 @@ def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
     # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     worker = BlockWorker(setup, send)
-    inbox: SimpleQueue[Task | None] = SimpleQueue()
     working = threading.Event()
-    threading.Thread(target=_listen, args=(connection, inbox, working), daemon=True).start()
-    send(_READY)
+    inbox = inbox_of(connection, lambda: _thread.interrupt_main() if working.is_set() else None)
+    send(READY)
     with contextlib.suppress(KeyboardInterrupt):  # asked to stop in the midst of a block
         while (task := inbox.get()) is not None:
             working.set()
@@ -205,18 +184,6 @@ def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
             finally:
                 working.clear()
             send(result)
-
-
-def _listen(connection: Connection, inbox: SimpleQueue, working: threading.Event) -> None:
-    """Receive beside the work, so that a stop or the parent's end is noticed at once."""
-    while True:
-        try:
-            task = connection.recv()
-        except (EOFError, OSError):
-            os._exit(1)  # the parent has gone: what is finished is on the disk
-        inbox.put(task)
-        if task is None and working.is_set():
-            _thread.interrupt_main()
 
 
 # ---- A pool of actors on a Ray cluster, each with a scene of its own -----------------------------
@@ -308,14 +275,11 @@ def last_line(error: Exception) -> str:
 class RayPool:
     """`slots` actors of one CPU each, as many as the cluster has CPUs if None. Where the backend is
     `cuda` they have a GPU each and its share of the CPUs, and None is as many as there are GPUs.
-
     They run on the cluster that this process is connected to, else on the one that RAY_ADDRESS
     names, else on one that is started here and ends with the pool. One that dies is replaced. Where
-    the cluster has no room for all of them, those that run do the work of the others.
-
-    Raises:
-        ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
-            start, or no machine of the cluster has a GPU.
+    the cluster has no room for all of them, those that run do the work of the others. Raises
+    ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
+    start, or no machine of the cluster has a GPU.
     """
 
     def __init__(self, setup: WorkSetup, tick: Tick, slots: int | None) -> None:

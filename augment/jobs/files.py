@@ -54,12 +54,10 @@ from augment.labels import Boxes, LabelSource
 from augment.scene import Scene
 from recipes.schema import Output, Recipe
 
-# ------------------------------------------------------------------------------------------------
-# What an image shows of its frame's boxes, and what its weather does to them: a table a kind
-# A row per box and image. The numbers are measured where the image is rendered, travel in the
-# line of
-# its progress log, and go to the variant's files (`labels/boxes_2d.parquet` ...) when the job ends.
-# Files that are missing, damaged or of another kind raise OutputError.
+# ---- A frame's boxes in an image, and what the weather does to them: a table a kind --------------
+# A row per box and image. The numbers are measured where the image is rendered, travel in the line
+# of its progress log, and go to the variant's files (`labels/boxes_2d.parquet` ...) when the job
+# ends. Files that are missing, damaged or of another kind raise OutputError.
 
 Item = tuple[int, str]  # frame number and camera name
 
@@ -320,18 +318,15 @@ def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
     return np.prod([np.where(np.isnan(factor), 1.0, factor) for factor in factors], axis=0)
 
 
-# ---- files ---------------------------------------------------------------------------------------
-
 # ---- What a job renders: a scene as it is known without its Gaussians, and the images wanted -----
 
 
 @dataclass(frozen=True, eq=False)
 class SceneIndex:
-    """A scene without its Gaussians: small enough to keep while workers hold the whole of it.
-    frames: those of the job, the scene's own or a camera path's. labelled: numbers of the frames
-    whose boxes and LiDAR pass through: all of the scene's own; of a camera path, those that share
-    number and timestamp with a frame of the scene. instances: of the objects in all the scene's own
-    frames.
+    """A scene without its Gaussians, which a job keeps while workers hold the whole of it. frames:
+    the scene's own or a camera path's. labelled: numbers of the frames whose boxes and LiDAR pass
+    through; of a camera path, those that share number and timestamp with a frame of the scene.
+    instances: of the objects in all the scene's own frames.
     """
 
     name: str
@@ -545,15 +540,18 @@ def _in_dataset(world_from_x: torch.Tensor, world_origin_m: np.ndarray) -> torch
     return moved
 
 
-# ---- Camera paths as text: the frames of a novel trajectory, exact to the last bit ---------------
-# The text carries a path to worker processes, and its hash is the path's identity in the manifest.
+# ---- The identity of a camera path in the manifest -----------------------------------------------
 
-RECORDED = "recorded"  # the identity of a scene's own frames
+RECORDED = "recorded"  # a scene's own frames
 _CAMERA_NUMBERS = ("name", "timestamp_ns", "width", "height", "fx", "fy", "cx", "cy")
 
 
-def frames_to_json(frames: Sequence[Frame]) -> str:
-    """Frames and their cameras; numbers keep all their digits. Image paths are left out."""
+def trajectory_id(camera_path: Sequence[Frame] | None) -> str:
+    """`recorded`, or `path-` and 16 hex digits of the SHA-256 of the path as JSON, exact to the
+    last bit.
+    """
+    if camera_path is None:
+        return RECORDED
     listed = [
         {
             "index": frame.index,
@@ -567,39 +565,10 @@ def frames_to_json(frames: Sequence[Frame]) -> str:
                 for camera in frame.cameras.values()
             ],
         }
-        for frame in frames
+        for frame in camera_path
     ]
-    return json.dumps({"frames": listed}, indent=1)
-
-
-def frames_from_json(text: str) -> tuple[Frame, ...]:
-    """The frames that `frames_to_json` wrote. Poses are camera_from_world in the scene's world.
-    Raises ValueError: the text is not such a path; says what is missing.
-    """
-    try:
-        return tuple(
-            Frame(
-                index=int(entry["index"]),
-                timestamp_ns=int(entry["timestamp_ns"]),
-                world_from_ego=torch.tensor(entry["world_from_ego"], dtype=torch.float64),
-                cameras={c["name"]: _camera(c) for c in entry["cameras"]},
-            )
-            for entry in json.loads(text)["frames"]
-        )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"not a camera path: {error!r} is missing or of another type") from error
-
-
-def trajectory_id(camera_path: Sequence[Frame] | None) -> str:
-    """`recorded`, or `path-` and 16 hex digits of the path's SHA-256."""
-    if camera_path is None:
-        return RECORDED
-    return "path-" + hashlib.sha256(frames_to_json(camera_path).encode()).hexdigest()[:16]
-
-
-def _camera(record: dict[str, Any]) -> Camera:
-    pose = torch.tensor(record["camera_from_world"], dtype=torch.float64)
-    return Camera(**{name: record[name] for name in _CAMERA_NUMBERS}, camera_from_world=pose)
+    text = json.dumps({"frames": listed}, indent=1)
+    return "path-" + hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 # ---- Arrays to image files and back --------------------------------------------------------------
@@ -673,7 +642,7 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 def decode_png(data: bytes, dtype: type) -> np.ndarray:
     """[H, W] of `dtype`. Raises ValueError for anything but a complete PNG of that kind."""
-    # libpng hands over what it has of a cut file, so the end mark is looked for.
+    # libpng returns what it has of a truncated file, so the end mark is looked for.
     if not (data.startswith(_PNG_START) and data.endswith(_PNG_END)):
         raise ValueError(f"not a complete PNG file ({len(data)} bytes)")
     image = _decode(data, cv2.IMREAD_UNCHANGED)
@@ -731,9 +700,16 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     """
     output, weather = recipe.output, recipe.weather
     has_flood, has_snow = weather.flood is not None, weather.snow is not None
-    _check_fact("water level", view.flood is not None, "a flood", has_flood)
-    _check_fact("snow depth", view.snowy is not None, "snow", has_snow)
-    _check_fact("smog density", view.smoggy is not None, "smog", weather.smog is not None)
+    for fact, found, effect, expected in (
+        ("water level", view.flood, "a flood", has_flood),
+        ("snow depth", view.snowy, "snow", has_snow),
+        ("smog density", view.smoggy, "smog", weather.smog is not None),
+    ):
+        if (found is not None) != expected:
+            raise ValueError(
+                f"the renderer returned {'no' if expected else 'a'} {fact} for a recipe "
+                f"{'with' if expected else 'without'} {effect}"
+            )
     requested = {
         "rgb": True,
         "depth_m": output.depth != "none",
@@ -756,12 +732,14 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
             )
 
 
-def _check_fact(fact: str, is_given: bool, effect: str, is_wanted: bool) -> None:
-    if is_given != is_wanted:
-        raise ValueError(
-            f"the renderer returned {'a' if is_given else 'no'} {fact} for a recipe "
-            f"{'with' if is_wanted else 'without'} {effect}"
-        )
+# By kind of path: the field of a view, and what makes a file of it.
+_BUFFERS: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
+    "depth": ("depth_m", encode_depth),
+    "semantic": ("semantic", partial(encode_ids, dtype=np.uint8)),
+    "instance": ("instance", partial(encode_ids, dtype=np.uint16)),
+    "water": ("water", encode_mask),
+    "snow": ("snow", encode_mask),
+}
 
 
 def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> Written:
@@ -771,21 +749,9 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
     """
     started = time.perf_counter()
     files: dict[str, bytes] = {}
-    if paths.depth is not None:
-        assert view.depth_m is not None
-        files[paths.depth] = encode_depth(view.depth_m)
-    if paths.semantic is not None:
-        assert view.semantic is not None
-        files[paths.semantic] = encode_ids(view.semantic, np.uint8)
-    if paths.instance is not None:
-        assert view.instance is not None
-        files[paths.instance] = encode_ids(view.instance, np.uint16)
-    if paths.water is not None:
-        assert view.water is not None
-        files[paths.water] = encode_mask(view.water)
-    if paths.snow is not None:
-        assert view.snow is not None
-        files[paths.snow] = encode_mask(view.snow)
+    for kind, (buffer, encode) in _BUFFERS.items():
+        if (path := getattr(paths, kind)) is not None:
+            files[path] = encode(getattr(view, buffer))
     files[paths.image] = encode_image(view.rgb, recipe.output)
     checksum = hashlib.sha256(files[paths.image]).hexdigest()
     encoded = time.perf_counter()
@@ -795,9 +761,8 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
 
 
 class WritePump:
-    """Runs writes on threads beside the renderer, with few waiting: memory stays bounded. OpenCV's
-    encoders and file writes release the GIL, so they overlap with rendering. The first exception of
-    a task stops the pump: `submit` and `close` raise it.
+    """Runs writes on threads beside the renderer, with few waiting, so that memory stays bounded.
+    The first exception of a task stops the pump: `submit` and `close` raise it.
     """
 
     def __init__(self, threads: int = 2, waiting: int = 4) -> None:
@@ -809,10 +774,8 @@ class WritePump:
 
     @staticmethod
     def beside(backend: str, cores: int) -> WritePump:
-        """For pictures that `backend` draws in a process that has so many cores. A CPU backend
-        draws on the same cores, so two threads do. A GPU leaves all cores free, and draws faster
-        than one of them can encode. Two pictures more than threads wait, so that none is idle while
-        one is handed over.
+        """For a process of so many cores: a CPU backend draws on the same cores, so two threads do;
+        a GPU leaves them free, and draws faster than one of them can encode.
         """
         return WritePump(cores, cores + 2) if renders_on_gpu(backend) else WritePump()
 
@@ -872,9 +835,9 @@ def label_view(
     view: View,
     recipe: Recipe,
 ) -> tuple[View, BoxWeather]:
-    """One of a frame's images with the frame's boxes: in the instance image those that have no
-    actor, too; and what is measured of them, where labels are written. camera: at the written
-    resolution. view: one that `check_view` has passed.
+    """A checked view with its frame's boxes: those without an actor are added to its instance
+    image; and what is measured of them, where labels are written. camera: at the written
+    resolution.
     """
     measured: BoxWeather = {}
     if recipe.output.labels:

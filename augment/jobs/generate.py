@@ -64,8 +64,6 @@ from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe
 
-# ---- Hands a job's tasks to a pool of workers and takes in what becomes of them ------------------
-
 # ---- Which block a worker gets next: one of the scene it has open, as long as there are any ------
 
 
@@ -130,7 +128,14 @@ class Tally:
     skipped: int = 0
     failed: int = 0
     failures: list[str] = field(default_factory=list)
-    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    seconds: Counter[str] = field(default_factory=Counter)
+
+    def add(self, done: BlockDone) -> None:
+        self.written += done.written
+        self.skipped += done.skipped
+        self.failed += done.failed
+        self.failures += done.failures
+        self.seconds.update(done.seconds or {})
 
 
 class Scheduler:
@@ -149,15 +154,12 @@ class Scheduler:
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
         self._on_image, self._idle = on_image, idle
         self._pool = make_pool(self._tick)
-        self._open: list[str | None] = [None] * self._pool.slots  # the scene of every slot
-
-    @property
-    def slots(self) -> int:
-        """How many workers there are at most."""
-        return self._pool.slots
-
-    def close(self) -> None:
-        self._pool.close()
+        self.slots, self.close = self._pool.slots, self._pool.close
+        self._open: list[str | None] = [None] * self.slots  # the scene of every slot
+        self._busy: dict[int, BlockTask] = {}  # by slot
+        self._trials: list[Block] = []  # whose worker died: tried once more, alone
+        self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
+        self._later: list[tuple[float, Block]] = []  # another process is at them
 
     def do_first(
         self,
@@ -168,10 +170,9 @@ class Scheduler:
     ) -> None:
         """What comes before the blocks; `each` gets a task's result, or a text that says why there
         is none. A task whose worker dies is tried once more, while no other worker is busy.
-
         one_by_one: no two at a time, so that none is in the way of another's frame times.
         """
-        slots = 1 if one_by_one else self._pool.slots
+        slots = 1 if one_by_one else self.slots
         waiting, alone = deque(tasks), deque[_First]()
         busy: dict[int, _First] = {}
         tried_alone: set[_First] = set()
@@ -200,44 +201,30 @@ class Scheduler:
                     each(task, event.result)
 
     def render(
-        self, blocks: Sequence[Block], names: dict[str, str | None], fail: FailBlock
+        self, blocks: Sequence[Block], names: Mapping[str, str | None], fail: FailBlock
     ) -> None:
         """Render and publish the blocks. names: by scene, what it is called if not by itself. fail:
         records all images of a block as failed. A block whose worker dies is tried once more while
         no other worker is busy, each of its images in a process of its own.
         """
-        run = _Rendering(self, BlockQueue(blocks), names, fail)
-        while run.dispatch():
+        self._queue, self._names, self._fail = BlockQueue(blocks), names, fail
+        while self._dispatch():
             for event in self._pool.wait(WAIT_S):
-                run.collect(event)
+                self._collect(event)
             self._idle()
 
     def _tick(self, slot: int, outcome: Outcome) -> None:
         partial = self._partial[slot]
         partial[0] += 1
         partial[1] += outcome.status == FAILED
-        self.report()
+        self._report()
 
-    def report(self) -> None:
+    def _report(self) -> None:
         tally, partial = self.tally, list(self._partial.values())
         done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial)
         self._on_image(done, tally.failed + sum(p[1] for p in partial))
 
-
-class _Rendering:
-    """The blocks of one run, and who is at which."""
-
-    def __init__(
-        self, scheduler: Scheduler, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
-    ) -> None:
-        self._scheduler, self._pool = scheduler, scheduler._pool
-        self._queue, self._names, self._fail = queue, names, fail
-        self._busy: dict[int, BlockTask] = {}
-        self._trials: list[Block] = []
-        self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
-        self._later: list[tuple[float, Block]] = []  # another process is at them
-
-    def dispatch(self) -> bool:
+    def _dispatch(self) -> bool:
         """Give work to idle workers; False when there is none left, in hand or waiting."""
         now = time.monotonic()
         for when, block in list(self._later):
@@ -248,66 +235,57 @@ class _Rendering:
             self._give(0, self._trials.pop(0), is_trial=True)
         if self._trials or any(task.is_trial for task in self._busy.values()):
             return True
-        for slot in range(self._pool.slots):
-            if slot in self._busy:
-                continue
-            open_scenes = self._scheduler._open
-            others = [open_scenes[s] for s in self._busy]
-            block = self._queue.take(open_scenes[slot], [name for name in others if name])
-            if block is not None:
-                self._give(slot, block)
+        for slot in range(self.slots):
+            if slot not in self._busy:
+                others = [name for s in self._busy if (name := self._open[s])]
+                block = self._queue.take(self._open[slot], others)
+                if block is not None:
+                    self._give(slot, block)
         if not self._busy and self._later:
             time.sleep(min(WAIT_S, max(0.0, self._later[0][0] - now)))
         return bool(self._busy or self._later or len(self._queue))
 
     def _give(self, slot: int, block: Block, *, is_trial: bool = False) -> None:
         task = BlockTask(block, self._names.get(block.scene), is_trial)
-        self._busy[slot] = task
-        self._scheduler._open[slot] = block.scene
+        self._busy[slot], self._open[slot] = task, block.scene
         self._pool.give(slot, task)
 
-    def collect(self, event: Event) -> None:
+    def _collect(self, event: Event) -> None:
         task = self._busy.pop(event.slot)
-        self._scheduler._partial.pop(event.slot, None)
+        self._partial.pop(event.slot, None)
         block = task.block
         if isinstance(event, Lost):
-            self._scheduler._open[event.slot] = None
+            self._open[event.slot] = None
         if _wants_memory(event) and not task.is_trial:
             _log.warning("%s is tried once more, alone: %s", block.key, _why(event))
             self._trials.append(block)
         elif isinstance(event, Lost):
-            self._give_up(block, _lost_twice(event))
             self._lost_alone[block.scene] += 1
-            if self._lost_alone[block.scene] == MAX_LOST:
-                for other in self._queue.take_all(block.scene):
-                    self._give_up(other, _lost_twice(event))
+            is_hopeless = self._lost_alone[block.scene] == MAX_LOST
+            others = self._queue.take_all(block.scene) if is_hopeless else []
+            self._give_up(
+                [block, *others],
+                f"the worker {event.how} while at this block of images, and again when it was "
+                f"tried alone; if memory ran out, use fewer workers or a machine with more",
+            )
         elif isinstance(event.result, TaskFailed):
             _raise_if_output(event.result)
             others = self._queue.take_all(block.scene) if event.result.of_scene else []
-            for failed in (block, *others):
-                self._give_up(failed, event.result.text)
+            self._give_up([block, *others], event.result.text)
         else:
             assert isinstance(event.result, BlockDone)
             if event.result.is_elsewhere:
                 self._later.append((time.monotonic() + ELSEWHERE_S, block))
             else:
-                self._done(block, event.result)
-        self._scheduler.report()
+                self.tally.add(event.result)
+        self._report()
 
-    def _done(self, block: Block, done: BlockDone) -> None:
-        tally = self._scheduler.tally
-        tally.written += done.written
-        tally.skipped += done.skipped
-        tally.failed += done.failed
-        tally.failures += done.failures
-        for kind, seconds in (done.seconds or {}).items():
-            tally.seconds[kind] += seconds
-
-    def _give_up(self, block: Block, message: str) -> None:
-        self._fail(block, message)
-        tally = self._scheduler.tally
-        tally.failed += block.images
-        tally.failures.append(f"{block.scene}/{block.variant}, {block.images} images: {message}")
+    def _give_up(self, blocks: Sequence[Block], message: str) -> None:
+        for block in blocks:
+            self._fail(block, message)
+            self.tally.failed += block.images
+            name = f"{block.scene}/{block.variant}, {block.images} images"
+            self.tally.failures.append(f"{name}: {message}")
 
 
 def _wants_memory(event: Event) -> bool:
@@ -323,19 +301,10 @@ def _why(event: Event) -> str:
     return event.result.text if isinstance(event.result, TaskFailed) else ""
 
 
-def _lost_twice(event: Lost) -> str:
-    return (
-        f"the worker {event.how} while at this block of images, and again when it was tried alone; "
-        f"if memory ran out, use fewer workers or a machine with more"
-    )
-
-
 def _raise_if_output(failed: TaskFailed) -> None:
     if failed.is_output:  # nothing can be written any more
         raise OutputError(failed.text)
 
-
-# ---- generate ------------------------------------------------------------------------------------
 
 # ---- What the qualities of a job's recipes choose in its scenes, before there is a plan ----------
 # A choice is kept in the output: the scenes in which everything was chosen are not opened again.
@@ -580,19 +549,14 @@ def run_generate(
     prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
     on_image: Callable[[int, int], None] = lambda done, failed: None,
 ) -> GenerateResult:
-    """Render and publish what of the job is not finished yet.
-
-    progress: bars on stderr. prepare: called before the first image is rendered, if any has to be,
-    with one recipe of each name; to compile kernels once and not in every worker, say. on_image: is
-    told how many images are done and how many of them failed, from several threads.
-
-    A KeyboardInterrupt lets workers finish the images they have at hand, merges what is published
-    into the manifest, and is raised again.
-
-    Raises:
-        OutputError: the output cannot be written, or holds images of another kind under the same
-            names; none of its images was written then. ClimateGSError: no scene can be used.
-        RecipeError: a recipe cannot be used.
+    """Render and publish what of the job is not finished yet. progress: bars on stderr. prepare:
+    called before the first image is rendered, if any has to be, with one recipe of each name; to
+    compile kernels once and not in every worker, say. on_image: is told how many images are done
+    and how many of them failed, from several threads. A KeyboardInterrupt lets workers finish the
+    images they have at hand, merges what is published into the manifest, and is raised again.
+    Raises OutputError: the output cannot be written, or holds images of another kind under the same
+    names; none of its images was written then. ClimateGSError: no scene can be used. RecipeError: a
+    recipe cannot be used.
     """
     return _Generation(_with_backend(job), progress, prepare, on_image).go()
 

@@ -15,10 +15,10 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -47,15 +47,10 @@ from augment.jobs.tables import read_lidar
 from augment.labels import LabelSource, StoresLidar
 from recipes.schema import Output
 
-# ------------------------------------------------------------------------------------------------
-# One file or link of a dataset's copy: put in place whole, and never through what is there
-# A file is linked (one inode with the original) or copied, under a temporary name where another one
-# has the place; then the name is moved. So the original of a link that was there is never written.
-
 # ---- The files of a dataset, as a copy of it in another place has to have them -------------------
-# A dataset's own entries (`samples`, `camera` ...) may be links to other disks: what they lead to
-# belongs to it. Links below them must stay within the dataset, and stay links in the copy; others
-# would make the copy reach files that nobody meant.
+# A dataset's own entries (`samples`, `camera` ...) may be links to other disks. Links below them
+# must stay within the dataset, and stay links in the copy; others would lead it to files that
+# nobody meant.
 
 
 @dataclass(frozen=True)
@@ -126,8 +121,7 @@ class SourceTree:
         return self.entries is None or name in self.entries
 
 
-@dataclass(frozen=True)
-class SourceFile:
+class SourceFile(NamedTuple):
     """relative: to the dataset's root. path: where its bytes are. facts: as os.lstat of that."""
 
     relative: str
@@ -135,20 +129,18 @@ class SourceFile:
     facts: os.stat_result
 
 
-@dataclass(frozen=True)
-class SourceFolder:
-    """What is directly in one folder. relative: to the root, "" for itself. links: relative path
-    and what the link says, which leads to another part of the dataset.
+class SourceFolder(NamedTuple):
+    """What is directly in one folder, by paths relative to the root, "" for itself. folders: with
+    their real paths. links: with what the link says, which leads to another part of the dataset.
     """
 
     relative: str
-    files: tuple[SourceFile, ...]
-    folders: tuple[str, ...]
-    links: tuple[tuple[str, str], ...]
+    files: list[SourceFile]
+    folders: list[tuple[str, str]]
+    links: list[tuple[str, str]]
 
 
-@dataclass(frozen=True)
-class Survey:
+class Survey(NamedTuple):
     """How much a dataset is. images: camera images among the files."""
 
     files: int
@@ -158,12 +150,9 @@ class Survey:
 
 def survey(tree: SourceTree) -> Survey:
     """Look at all that belongs to a dataset, reading no file."""
-    files = size = images = 0
-    for folder in walk(tree):
-        files += len(folder.files)
-        size += sum(file.facts.st_size for file in folder.files)
-        images += sum(1 for file in folder.files if tree.is_image(file.relative))
-    return Survey(files, size, images)
+    files = [file for folder in walk(tree) for file in folder.files]
+    size = sum(file.facts.st_size for file in files)
+    return Survey(len(files), size, sum(tree.is_image(file.relative) for file in files))
 
 
 def walk(tree: SourceTree) -> Iterator[SourceFolder]:
@@ -172,9 +161,9 @@ def walk(tree: SourceTree) -> Iterator[SourceFolder]:
     waiting = [("", os.path.realpath(tree.root))]
     while waiting:
         relative, path = waiting.pop()
-        folder, inner = _read_folder(tree, relative, path, {} if relative else elsewhere)
+        folder = _read_folder(tree, relative, path, {} if relative else elsewhere)
         yield folder
-        waiting += reversed(inner)
+        waiting += reversed(folder.folders)
 
 
 def is_within(path: str, folder: str) -> bool:
@@ -184,24 +173,24 @@ def is_within(path: str, folder: str) -> bool:
 
 def _read_folder(
     tree: SourceTree, relative: str, path: str, elsewhere: dict[str, str]
-) -> tuple[SourceFolder, list[tuple[str, str]]]:
-    """The folder, and the relative and real paths of those in it. elsewhere: by name."""
-    files, inner, links = [], [], []
+) -> SourceFolder:
+    """elsewhere: the real paths of entries that are links to other places, by name."""
+    found = SourceFolder(relative, [], [], [])
     try:
-        with os.scandir(path) as entries:
-            found = sorted(entries, key=lambda entry: entry.name)
-        for entry in found:
+        with os.scandir(path) as scan:
+            entries = sorted(scan, key=lambda entry: entry.name)
+        for entry in entries:
             if not relative and tree.entries is not None and entry.name not in tree.entries:
                 continue
             within = f"{relative}/{entry.name}" if relative else entry.name
             real = elsewhere.get(entry.name, entry.path)
             facts = os.lstat(real) if entry.name in elsewhere else entry.stat(follow_symlinks=False)
             if stat.S_ISREG(facts.st_mode):
-                files.append(SourceFile(within, real, facts))
+                found.files.append(SourceFile(within, real, facts))
             elif stat.S_ISDIR(facts.st_mode):
-                inner.append((within, real))
+                found.folders.append((within, real))
             elif stat.S_ISLNK(facts.st_mode):
-                links.append((within, _link_text(tree, within, real)))
+                found.links.append((within, _link_text(tree, within, real)))
             else:
                 raise AdapterError(
                     f"{entry.path} is neither a file nor a folder nor a link; a dataset's copy "
@@ -209,8 +198,7 @@ def _read_folder(
                 )
     except OSError as error:
         raise AdapterError(f"{error.filename or path} cannot be read: {error.strerror}") from error
-    folders = tuple(within for within, _ in inner)
-    return SourceFolder(relative, tuple(files), folders, tuple(links)), inner
+    return found
 
 
 def _link_text(tree: SourceTree, within: str, path: str) -> str:
@@ -361,23 +349,21 @@ def _entries(content: Any, keys: tuple[str, ...]) -> dict[str, dict[str, str]]:
 
 @dataclass(frozen=True)
 class WeatheredSweep:
-    """One of the dataset's files of a frame's returns, and the weathered sweep that is to be in it.
-    scene: whose sweep it is. path: of our sweep. name: the same, relative to the output folder.
-    content: makes the file's bytes; None where only another scene's labels could.
+    """A weathered sweep for one of the dataset's files of a frame's returns. scene: whose sweep it
+    is. path: of our sweep. name: the same, relative to the output folder. content: makes the
+    file's bytes; None where only another scene's labels could.
     """
 
     scene: str
     path: Path
     name: str
-    content: Callable[[], bytes] | None
+    content: Callable[[], bytes] | None = None
 
     @staticmethod
-    def of_row(
-        out_dir: Path, row: Mapping[str, Any], content: Callable[[], bytes] | None = None
-    ) -> WeatheredSweep:
+    def of_row(out_dir: Path, row: Mapping[str, Any]) -> WeatheredSweep:
         """The sweep of a manifest's row."""
         name = row["lidar_path"]
-        return WeatheredSweep(row["scene"], resolve_inside(out_dir, name), name, content)
+        return WeatheredSweep(row["scene"], resolve_inside(out_dir, name), name)
 
 
 def weathered_sweeps(
@@ -397,8 +383,9 @@ def weathered_sweeps(
             continue
         assert isinstance(labels, StoresLidar)
         for file, place in zip(files, places, strict=True):
-            content = _content(labels, frame, file, resolve_inside(out_dir, row["lidar_path"]))
-            found[str(place)] = WeatheredSweep.of_row(out_dir, row, content)
+            sweep = WeatheredSweep.of_row(out_dir, row)
+            content = partial(_content, labels, frame, file, sweep.path)
+            found[str(place)] = replace(sweep, content=content)
     if not unplaced:
         return found, []
     return found, [
@@ -412,8 +399,8 @@ def is_weathered(row: Mapping[str, Any]) -> bool:
     return row["lidar"] == "weather" and row["lidar_path"] is not None
 
 
-def _content(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> Callable[[], bytes]:
-    return lambda: labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
+def _content(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
+    return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
 
 
 # ---- Weathered images in the form of a dataset's recorded ones: file format, size, channels ------
@@ -421,8 +408,7 @@ def _content(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> Callab
 FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
 
 
-@dataclass(frozen=True)
-class ImageForm:
+class ImageForm(NamedTuple):
     """format: png or jpg. width, height: pixels. is_grey: one channel (told of PNG only)."""
 
     format: str
@@ -433,9 +419,8 @@ class ImageForm:
 
 @dataclass(frozen=True)
 class Weathered:
-    """A finished image of ours and where the dataset has the recorded one. scene: whose image it
-    is. path: of our file. name: the same, relative to the output folder. form: what our file is.
-    checksum: its SHA-256. jpeg_quality: for writing it anew.
+    """A finished image. scene: whose image it is. path: of the file. name: the same, relative to
+    the output folder. checksum: its SHA-256. jpeg_quality: for writing it anew.
     """
 
     scene: str
@@ -545,16 +530,14 @@ Links = Literal["hard", "copy"]
 
 @dataclass
 class Mirrored:
-    """What a copy of a dataset is made of. Sizes in bytes.
-
-    linked, copied: files of the source. replaced: weathered images that stand for recorded ones;
-    of these, new are files of their own, the others are one with the rendered ones. resized: the
-    sizes rendered and recorded of those that differ. unusable: recorded images that are neither
-    PNG nor JPEG, which stay. sweeps: LiDAR sweeps of the source; weathered: files of returns, and
-    of labels of returns, that stand for its own. outdated: files of such that another scene has
-    rendered anew, where the source's own stand. missing: recorded images that the source has no
-    longer. others: files in the copy that the source does not have. changed: how many files and
-    links this call has put in place.
+    """What a copy of a dataset is made of. Sizes in bytes. linked, copied: files of the source.
+    replaced: weathered images in place of recorded ones; new: those that are files of their own
+    and no links to the rendered ones. resized: rendered and recorded sizes of those that differ.
+    unusable: recorded images that are neither PNG nor JPEG, which stay. sweeps: of the source;
+    weathered: files of returns, and of their labels, in place of its own. outdated: such that
+    another scene has rendered anew, where the source's own stand. missing: recorded images that the
+    source has no longer. others: files that the source does not have. changed: files and links
+    that this call has put in place.
     """
 
     folder: Path
@@ -597,16 +580,12 @@ def mirror_dataset(
     links: Links = "hard",
     progress: bool = True,
 ) -> Mirrored:
-    """Build the copy of a dataset in a folder, or bring it up to date.
-
-    images: by place in the dataset, all that shall stand in the copy. scenes: facts of those that
-    the images are of, in JSON's types, for the record. extent: `survey(tree)`. sweeps: as images.
-    links: hard, or copy for a copy that shares nothing with source and images. Needs the lock of
-    the output folder.
-
-    Raises:
-        AdapterError: a file of the source cannot be read, or a link leads out of it.
-        OutputError: the system refused, or a link is in the way. No file is left half-written.
+    """Build the copy of a dataset in a folder, or bring it up to date; needs the lock of the output
+    folder. images, sweeps: by place in the dataset, all that shall stand in the copy. scenes: facts
+    of those that the images are of, in JSON's types, for the record. extent: `survey(tree)`. links:
+    hard, or copy for a copy that shares nothing with source and images. Raises AdapterError: a file
+    of the source cannot be read, or a link leads out of it. OutputError: the system refused, or a
+    link is in the way; no file is left half-written.
     """
     check_disjoint(tree, folder)
     run = _Mirroring(tree, folder, images, sweeps or {}, links)
@@ -616,25 +595,24 @@ def mirror_dataset(
     return run.done
 
 
+@dataclass(eq=False)
 class _Mirroring:
     """One call of mirror_dataset."""
 
-    def __init__(
-        self,
-        tree: SourceTree,
-        folder: Path,
-        images: Mapping[str, Weathered],
-        sweeps: Mapping[str, WeatheredSweep],
-        links: Links,
-    ) -> None:
-        self.tree, self.folder, self.images, self.sweeps = tree, folder, images, sweeps
-        self.may_link, self.links = links == "hard", links
-        self.root = str(folder / tree.root.name)
-        self.record, self.begun_record = record_names(tree, folder)
-        self.done = Mirrored(folder / tree.root.name)
-        self.changed_folders: set[str] = set()
-        self.fitted: list[str] = []
-        self.is_begun = False
+    tree: SourceTree
+    folder: Path
+    images: Mapping[str, Weathered]
+    sweeps: Mapping[str, WeatheredSweep]
+    links: Links
+    changed_folders: set[str] = field(default_factory=set)
+    fitted: list[str] = field(default_factory=list)
+    is_begun: bool = False
+
+    def __post_init__(self) -> None:
+        self.may_link = self.links == "hard"
+        self.record, self.begun_record = record_names(self.tree, self.folder)
+        self.done = Mirrored(self.folder / self.tree.root.name)
+        self.root = str(self.done.folder)
 
     def go(self, bar: tqdm) -> None:
         for folder in (self.folder.parent, self.folder, self.root):
@@ -664,13 +642,13 @@ class _Mirroring:
 
     def _fill(self, folder: SourceFolder) -> None:
         path = self._target(folder.relative)
-        names = [file.relative for file in folder.files] + [name for name, _ in folder.links]
-        expected = {os.path.basename(name) for name in [*names, *folder.folders]}
+        entries = [*folder.files, *folder.folders, *folder.links]
+        expected = {os.path.basename(entry[0]) for entry in entries}
         others = others_in(path, expected)
         if not folder.relative:  # other drives, which the copy has from other scenes
             others = [name for name in others if not os.path.lexists(self.tree.root / name)]
         self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
-        for inner in folder.folders:
+        for inner, _ in folder.folders:
             self._own(self._target(inner))
         for file in folder.files:
             self.done.images += self.tree.is_image(file.relative)
@@ -711,14 +689,10 @@ class _Mirroring:
         elif self._place(str(image.path), rendered, target) == COPIED:
             self.done.new += 1
             self.done.new_size += rendered.st_size
-        self.done.replaced[file.relative] = {
-            "scene": image.scene,
-            "image": image.name,
-            "sha256": image.checksum,
-        }
-        sizes = (image.form.width, image.form.height), (recorded.width, recorded.height)
-        if sizes[0] != sizes[1]:
-            self.done.resized.append(sizes)
+        facts = (image.scene, image.name, image.checksum)
+        self.done.replaced[file.relative] = dict(zip(_IMAGE, facts, strict=True))
+        if image.form[1:3] != recorded[1:3]:
+            self.done.resized.append((image.form[1:3], recorded[1:3]))
         return True
 
     def _put_sweep(self, file: SourceFile, sweep: WeatheredSweep) -> bool:

@@ -13,18 +13,20 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import reduction, resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import torch
 
+from augment.cameras import Frame
 from augment.errors import BackendUnavailable, ClimateGSError, OutputError
 from augment.jobs.atomic import make_folder, output_error, refusals_of, temporary_beside
 from augment.jobs.layout import STATE_FOLDER
@@ -113,8 +115,13 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+READY = "ready"  # the first message of a child that can work
+
+
 class ChildProcess:
     """A process that is started afresh (`spawn`), at the other end of a connection."""
+
+    is_ready = False
 
     def __init__(
         self, target: Callable[..., None], *arguments: Any, threads: int, daemon: bool
@@ -126,7 +133,6 @@ class ChildProcess:
         with thread_limits(threads), interrupts_blocked():
             self._process.start()
         child.close()
-        self.is_ready = False
 
     def send(self, message: Any) -> None:
         """One that has just died shows itself when its connection is read."""
@@ -144,8 +150,51 @@ class ChildProcess:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.join()
-        self.connection.close()
+        self.reap()
+
+
+@dataclass(frozen=True)
+class Ended:
+    """In place of a child's message: how it ended, after "the worker ..."."""
+
+    how: str
+
+
+_Child = TypeVar("_Child", bound=ChildProcess)
+
+
+def receive(children: Collection[_Child], timeout_s: float | None) -> Iterator[tuple[_Child, Any]]:
+    """The next message of each child that has sent one, or Ended; READY is noted and left out."""
+    ready = wait([child.connection for child in children], timeout_s)
+    for child in [child for child in children if child.connection in ready]:
+        try:
+            message = child.connection.recv()
+        except (EOFError, OSError):
+            message = Ended(child.reap())
+        if message == READY:
+            child.is_ready = True
+        else:
+            yield child, message
+
+
+def inbox_of(connection: Connection, on_stop: Callable[[], object]) -> SimpleQueue:
+    """In a child: what the parent sends, received in a thread beside the work, so that a stop
+    (None) or the parent's end is noticed at once; the parent's end is the child's.
+    """
+    inbox = SimpleQueue()
+
+    def listen() -> None:
+        while True:
+            try:
+                message = connection.recv()
+            except (EOFError, OSError):
+                os._exit(1)  # what is finished is on the disk
+            inbox.put(message)
+            if message is None:
+                on_stop()
+
+    threading.Thread(target=listen, daemon=True).start()
+    return inbox
 
 
 def failed_start(ending: str) -> ClimateGSError:
@@ -325,14 +374,14 @@ ALIGNMENT = 64  # bytes: a cache line, and any vector register
 
 @dataclass(frozen=True)
 class SharedScene:
-    """A scene whose tensors lie in a file. Valid until `remove`."""
+    """A scene and frames to render of it, whose tensors lie in a file. Valid until `remove`."""
 
     path: str
     skeleton: bytes
 
-    def open(self) -> Scene:
-        """The scene, its tensors mapped from the file; writes to them stay in this process. The
-        skeleton is a pickle that comes from the parent through the pipe, never from a file.
+    def open(self) -> tuple[Scene, Sequence[Frame]]:
+        """Their tensors are mapped from the file; writes to them stay in this process. The skeleton
+        is a pickle that comes from the parent through the pipe, never from a file.
         """
         load = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue]
         return load(self.skeleton)
@@ -342,8 +391,8 @@ class SharedScene:
         Path(self.path).unlink(missing_ok=True)
 
 
-def share_scene(scene: Scene, folder: Path) -> SharedScene:
-    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away once
+def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedScene:
+    """Lay the tensors into a temporary file of `folder`, which a later job clears away once
     it holds the folder. Raises OutputError: the file cannot be written. ValueError: a part of the
     scene, such as its label source, cannot be sent to another process.
     """
@@ -353,7 +402,7 @@ def share_scene(scene: Scene, folder: Path) -> SharedScene:
         with path.open("xb") as file:
             skeleton = io.BytesIO()
             try:
-                _ScenePickler(skeleton, file, str(path)).dump(scene)
+                _ScenePickler(skeleton, file, str(path)).dump((scene, frames))
             except (AttributeError, TypeError, pickle.PicklingError) as error:
                 raise ValueError(
                     f"scene {scene.name!r} cannot be sent to worker processes: {error}; its label "

@@ -21,7 +21,7 @@ from tqdm import tqdm
 import augment
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs.claims import Claim, try_claim
+from augment.jobs.claims import try_claim
 from augment.jobs.files import trajectory_id
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.prepare import snow_to_lay, style_to_apply
@@ -36,9 +36,9 @@ from recipes.schema import BY_PATH, Recipe, Value, free_knobs, with_settings
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A rendered view. picture: uint8 [H, W, 3], display-encoded. depth: float32 [H, W], metres,
-    0 = none; None where the recipe writes none. Both at the size of the reference, however small
-    they were rendered. seconds: of rendering alone, without the enlarging.
+    """A rendered view, at the size of the reference however small it was rendered. picture: uint8
+    [H, W, 3], display-encoded. depth: float32 [H, W], metres, 0 = none; None where the recipe
+    writes none. seconds: of rendering alone, without the enlarging.
     """
 
     picture: np.ndarray
@@ -57,19 +57,12 @@ def render_trial(
     clock: Callable[[], float] = time.perf_counter,
 ) -> Trial:
     """The view of `camera` (before recipe.render.scale) under the recipe, in 8 bits as in files.
-
-    size: width and height of the reference, pixels; None for the camera's own, which is that of
-    render.scale 1. renderer: `augment.views.render_view` if None. clock: in seconds.
-
-    The first picture of a scene in some snow or style also takes what finding the places of the one
-    and the colours of the other does.
-
-    Raises:
-        SceneError: the scene cannot be rendered so. RecipeError: the recipe is not resolved.
+    size: width and height of the reference, pixels; None for the camera's own. The first picture of
+    a scene in some snow or style also takes the time of placing the snow and fitting the colours.
+    Raises SceneError: the scene cannot be rendered so. RecipeError: the recipe is not resolved.
     """
-    render = renderer or default_renderer()
     started = clock()
-    view = render(scene, camera, recipe, backend=backend)
+    view = (renderer or default_renderer())(scene, camera, recipe, backend=backend)
     seconds = clock() - started
     width, height = size or (camera.width, camera.height)
     depth = view.depth_m
@@ -90,11 +83,6 @@ def upsampled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(picture, (width, height), interpolation=how)
 
 
-# ---- Which images of a scene its settings are chosen by ------------------------------------------
-
-COUNT = 3
-
-
 class View(NamedTuple):
     """An image that is rendered to find out what settings cost. frame: its number."""
 
@@ -103,14 +91,11 @@ class View(NamedTuple):
     camera: Camera
 
 
-def calibration_views(frames: Sequence[Frame], count: int = COUNT) -> tuple[View, ...]:
+def calibration_views(frames: Sequence[Frame], count: int = 3) -> tuple[View, ...]:
     """Images spread over the frames and over each frame's cameras; at most `count`, at least one.
     frames: all that the scene or the camera path has, never a selection, so that what is rendered
-    beside an image does not change it. Raises ValueError: no frame has a camera, or count is below
-    1.
+    beside an image does not change it.
     """
-    if count < 1:
-        raise ValueError(f"count must be >= 1; got {count}")
     pictured = sorted((f for f in frames if f.cameras), key=lambda frame: frame.index)
     if not pictured:
         raise ValueError(f"none of the {len(frames)} frames has a camera")
@@ -131,11 +116,11 @@ DOUBT = 1.25  # how far beyond the bound an estimate must be to stand for the wh
 
 
 class Bench:
-    """Tries settings of a recipe on a scene. recipe: its knobs at reference. scene, cameras: where
-    snow can lie and what a style maps is found for these cameras, the scene's own if None. clock:
-    in seconds. each: is told before every picture. Errors of single knobs are estimated from
-    windows of the picture where that is much larger: FLIP takes longer than rendering. `flip` and,
-    near the bound, `exceeds` look at all of it.
+    """Tries settings of a recipe on a scene. recipe: its knobs at reference. cameras: those that
+    snow is placed and style maps are fitted for; the scene's own if None. each: called before every
+    picture. Errors of single knobs are estimated from windows of the picture where that is much
+    larger: FLIP takes longer than rendering. `flip` and, near the bound, `exceeds` look at all of
+    it.
     """
 
     def __init__(
@@ -154,13 +139,9 @@ class Bench:
         # An object of its own, which takes along what is found of settings that are not chosen.
         self._scene, self._cameras = copy.copy(scene), cameras
         self._renderer, self._clock, self._each = renderer, clock, each
-        self._truth: list[np.ndarray] = []
         self._estimates: dict[tuple, float] = {}
         self._errors: dict[tuple, tuple[float, ...]] = {}
         self._ms: dict[tuple, float] = {}
-
-    def start(self) -> None:
-        """Render the reference."""
         self._truth = [self._picture(view, {}) for view in self._views]
 
     def estimate(self, settings: Mapping[str, Value], enough: float = 1.0) -> float:
@@ -168,9 +149,8 @@ class Bench:
         key = _key(settings)
         if key not in self._estimates:
             worst = 0.0
-            for number, view in enumerate(self._views):
-                picture = self._picture(view, settings)
-                worst = max(worst, _windows_flip(picture, self._truth[number]))
+            for view, truth in zip(self._views, self._truth, strict=True):
+                worst = max(worst, _windows_flip(self._picture(view, settings), truth))
                 if worst > enough:
                     break
             self._estimates[key] = worst
@@ -179,8 +159,8 @@ class Bench:
     def exceeds(self, settings: Mapping[str, Value], bound: float) -> bool:
         """Whether the error in some view is beyond the bound."""
         errors = []
-        for number, view in enumerate(self._views):
-            picture, truth = self._picture(view, settings), self._truth[number]
+        for view, truth in zip(self._views, self._truth, strict=True):
+            picture = self._picture(view, settings)
             if _windows_flip(picture, truth) > DOUBT * bound:
                 return True
             errors.append(_flip(picture, truth))
@@ -194,8 +174,7 @@ class Bench:
         key = _key(settings)
         if key not in self._errors:
             pairs = zip(self._views, self._truth, strict=True)
-            errors = (_flip(self._picture(view, settings), truth) for view, truth in pairs)
-            self._errors[key] = tuple(errors)
+            self._errors[key] = tuple(_flip(self._picture(v, settings), t) for v, t in pairs)
         return self._errors[key]
 
     def ms(self, settings: Mapping[str, Value]) -> float:
@@ -236,7 +215,7 @@ class Bench:
         )
 
     def _prepare(self, recipe: Recipe) -> None:
-        """Find for a camera path what pictures would else find for the scene's own cameras."""
+        """Find for a camera path what pictures would otherwise find for the scene's own cameras."""
         if self._cameras is None or self._renderer is not None:
             return
         snow, style = snow_to_lay(recipe), style_to_apply(recipe)
@@ -281,12 +260,10 @@ def _starts(length: int) -> list[int]:
 
 
 # ---- From what the values of each knob cost and save to a setting of all of them -----------------
-# `options` are the values that a choice is made from, by the knobs' paths: from the fastest to the
-# most accurate, which is the reference. What is not measured yet is asked for when it is needed.
 
 Settings = dict[str, Value]
+# The values to choose from by the knobs' paths: from the fastest to the reference.
 Options = Mapping[str, Sequence[Value]]
-
 MIN_SAVED = 0.02  # of the reference's time: less is noise of a few pictures
 
 
@@ -300,12 +277,35 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Budgeted:
-    """ms: the frame time of the settings together. is_met: whether it is within the budget."""
+class Measured:
+    """One knob at one value, all others at reference. flip: mean FLIP against reference in the
+    worst view, as estimated. ms: of a frame; None where the choice does not depend on it.
+    """
+
+    path: str
+    value: Value
+    flip: float
+    ms: float | None
+
+
+@dataclass(frozen=True)
+class Report:
+    """settings: what was chosen, of the knobs that the recipe leaves free. is_met: whether they
+    keep what the recipe asks for; an error can always be kept, a budget cannot. flip: mean FLIP
+    against reference in the worst of the views. views: frame numbers and cameras. The same for the
+    same scene, recipe and backend on every machine, where the recipe gives max_flip. Not so ms, the
+    settings' frame time, and reference_ms, which only a recipe with budget_ms has; and seconds,
+    what choosing took.
+    """
 
     settings: Settings
-    ms: float
-    is_met: bool
+    is_met: bool = True
+    flip: float = 0.0
+    views: tuple[tuple[int, str], ...] = ()
+    measured: tuple[Measured, ...] = ()
+    ms: float | None = None
+    reference_ms: float | None = None
+    seconds: float = 0.0
 
 
 def reference_settings(options: Options) -> Settings:
@@ -318,15 +318,11 @@ def within_flip(
     own_flip: Callable[[str, Value], float],
     exceeds: Callable[[Settings], bool],
 ) -> Settings:
-    """Fast settings whose pictures together are within the bound.
-
-    Knob after knob, in the order of `options`, takes the fastest value with which all that are
-    chosen so far stay within the bound, the rest at reference. So the first ones, which should be
-    those that save most, have most of the room.
-
-    own_flip: error of one knob at one value, all others at reference; of a value that is beyond the
-    bound any number beyond it will do. exceeds: whether settings together are beyond the bound; not
-    asked of the reference, whose error is 0.
+    """Fast settings whose pictures together are within the bound. Knob after knob, in the order of
+    `options`, takes the fastest value with which all that are chosen so far stay within the bound,
+    the rest at reference. own_flip: error of one knob at one value, all others at reference; of a
+    value beyond the bound any number beyond it. exceeds: whether settings together are beyond the
+    bound; not asked of the reference.
     """
     settings = reference_settings(options)
     for path, values in options.items():
@@ -343,12 +339,11 @@ def within_budget(
     budget_ms: float,
     costs: Mapping[str, Sequence[Cost]],
     ms_of: Callable[[Settings], float],
-) -> Budgeted:
-    """Accurate settings whose frames together take no longer than the budget. From reference on,
-    the knob goes a step on that saves the most time for the error that it adds, by what each costs
-    alone, and the time of all together is measured again, until it is within the budget or no step
-    is left that saves anything. costs: of every value of every knob, its reference included. ms_of:
-    time of settings together.
+) -> Report:
+    """Accurate settings whose frames take no longer than the budget. From reference on, the knob
+    goes a step on that saves the most time for the error that it adds, by what each costs alone,
+    and the time of all together is measured again, until it is within the budget or no step is left
+    that saves anything. costs: of every value of every knob, its reference included.
     """
     ladders = {path: useful(costs[path]) for path in options}
     places = dict.fromkeys(options, 0)
@@ -359,7 +354,7 @@ def within_budget(
             return _given_back(ladders, places, budget_ms, ms, ms_of)
         left = [path for path, ladder in ladders.items() if places[path] < len(ladder) - 1]
         if not left:
-            return Budgeted(settings, ms, is_met=False)
+            return Report(settings, is_met=False, ms=ms)
         best = max(left, key=lambda path: _worth(ladders[path][places[path] :]))
         places[best] += 1
 
@@ -370,7 +365,7 @@ def _given_back(
     budget_ms: float,
     ms: float,
     ms_of: Callable[[Settings], float],
-) -> Budgeted:
+) -> Report:
     """Settings within a budget, each knob as close to reference as the others leave time for."""
 
     def settings() -> Settings:
@@ -387,7 +382,7 @@ def _given_back(
                 places[path] += 1
                 break
             ms = tried_ms
-    return Budgeted(settings(), ms, is_met=True)
+    return Report(settings(), ms=ms)
 
 
 def useful(costs: Sequence[Cost]) -> list[Cost]:
@@ -420,38 +415,6 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One knob at one value, all others at reference. flip: mean FLIP against reference in the
-    worst view, as estimated. ms: of a frame; None where the choice does not depend on it.
-    """
-
-    path: str
-    value: Value
-    flip: float
-    ms: float | None
-
-
-@dataclass(frozen=True)
-class Report:
-    """settings: what was chosen, of the knobs that the recipe leaves free. is_met: whether they
-    keep what the recipe asks for; an error can always be kept, a budget cannot. flip: mean FLIP
-    against reference in the worst of the views. views: frame numbers and cameras. The same for the
-    same scene, recipe and backend on every machine, where the recipe gives max_flip. Not so the
-    rest: ms, the settings' frame time; reference_ms; seconds, what choosing took. Only a recipe
-    with budget_ms has the first two.
-    """
-
-    settings: Settings
-    is_met: bool = True
-    flip: float = 0.0
-    views: tuple[tuple[int, str], ...] = ()
-    measured: tuple[Measured, ...] = ()
-    ms: float | None = None
-    reference_ms: float | None = None
-    seconds: float = 0.0
-
-
-@dataclass(frozen=True)
 class Resolved:
     """recipe: with its settings in numbers. report: None where nothing had to be chosen."""
 
@@ -470,17 +433,13 @@ def resolve_quality(
     clock: Callable[[], float] = time.perf_counter,
     progress: bool = False,
 ) -> Resolved:
-    """The recipe with the settings that its max_flip or budget_ms chooses in this scene.
-
-    views: what is rendered to find out, `calibration_views` of the scene's frames if None. cameras:
-    all of a camera path, where one is to be rendered; None for the scene's. renderer:
-    `augment.views.render_view` if None. clock: in seconds. progress: a bar on stderr.
-
-    With max_flip the choice is the same every time; with budget_ms it is this machine's. A budget
-    that cannot be kept is logged as a warning, and the fastest settings are taken.
-
-    Raises:
-        SceneError: the scene cannot be rendered under the recipe.
+    """The recipe with the settings that its max_flip or budget_ms chooses in this scene. With
+    max_flip the choice is the same every time; with budget_ms it is this machine's. A budget that
+    cannot be kept is logged as a warning, and the fastest settings are taken. views: what is
+    rendered to find out, `calibration_views` of the scene's frames if None. cameras: all of a
+    camera path, where one is to be rendered; None for the scene's. renderer:
+    `augment.views.render_view` if None. clock: in seconds. progress: a bar on stderr. Raises
+    SceneError: the scene cannot be rendered under the recipe.
     """
     if not recipe.quality.is_open:
         return Resolved(recipe)
@@ -554,10 +513,8 @@ def _started(
 ) -> Bench:
     """A bench with the reference rendered; takes what the scene cannot have out of `options`."""
     while True:
-        bench = bench_of(resolved_recipe(recipe, reference_settings(options)))
         try:
-            bench.start()
-            return bench
+            return bench_of(resolved_recipe(recipe, reference_settings(options)))
         except SceneError:
             if len(options.get(_CELL, ())) < 2:
                 raise
@@ -594,13 +551,7 @@ def _for_budget(bench: Bench, options: Options, budget_ms: float) -> Report:
         return bench.ms({p: value for p, value in settings.items() if value != reference[p]})
 
     found = within_budget(options, budget_ms, costs, ms_of)
-    return Report(
-        found.settings,
-        found.is_met,
-        measured=tuple(measured),
-        ms=found.ms,
-        reference_ms=reference_ms,
-    )
+    return replace(found, measured=tuple(measured), reference_ms=reference_ms)
 
 
 def _options(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
@@ -677,15 +628,9 @@ def resolve_quality_for(
     progress: bool = False,
 ) -> Recipe:
     """The recipe with the settings that the output has for it in this scene, or that are chosen
-    now; the same recipe where its quality has nothing to choose.
-
-    camera_path: frames that are rendered in place of the scene's own. anew: as in
-    `resolve_quality_once`.
-    keep: whether a new choice is kept in the output. The others: as in `resolve_quality`.
-
-    Raises:
-        SceneError: the scene cannot be rendered under the recipe. OutputError: as
-        resolve_quality_once.
+    now; the same recipe where its quality has nothing to choose. camera_path: frames that are
+    rendered in place of the scene's own. anew: as in `resolve_quality_once`. keep: whether a new
+    choice is kept in the output. The others and errors: as of `resolve_quality`.
     """
     if not recipe.quality.is_open:
         return recipe
@@ -708,8 +653,7 @@ def resolve_quality_for(
 
     if keep:
         return resolve_quality_once(store, question, choose, anew=anew)
-    found = None if anew else recorded(store, question)
-    return found or choose().recipe
+    return recorded(store, question) or choose().recipe
 
 
 def recorded(store: Store, question: Question) -> Recipe | None:
@@ -748,8 +692,12 @@ def resolve_quality_once(
     found = None if anew else recorded(store, question)
     if found is not None:
         return found
-    with _claimed(store, question) as claim:
-        found = None if anew else recorded(store, question)  # another may have chosen meanwhile
+    wait_s = 0.05
+    while (claim := try_claim(store, f"quality.{question.digest}")) is None:  # another one chooses
+        time.sleep(wait_s)
+        wait_s = min(2 * wait_s, _MAX_WAIT_S)
+    with claim:
+        found = None if anew else recorded(store, question)
         if found is None:
             resolved = choose()
             assert resolved.report is not None, "the recipe had nothing to choose"
@@ -764,17 +712,6 @@ def _check_values(settings: dict[str, Any]) -> None:
         knob = BY_PATH.get(path)
         if knob is None or not any(value == v and type(value) is type(v) for v in knob.values):
             raise ValueError(f"{path} = {value!r} is none of the values to choose from")
-
-
-def _claimed(store: Store, question: Question) -> Claim:
-    """The claim to choose, however long another process holds it: as long as it takes to find where
-    snow can lie. That of one that has died can be had.
-    """
-    wait_s = 0.05
-    while (claim := try_claim(store, f"quality.{question.digest}")) is None:
-        time.sleep(wait_s)
-        wait_s = min(2 * wait_s, _MAX_WAIT_S)
-    return claim
 
 
 def _to_json(question: Question, report: Report) -> bytes:

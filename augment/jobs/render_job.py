@@ -44,7 +44,6 @@ from augment.jobs.files import (
     SceneIndex,
     calibration_bytes,
     frame_entry,
-    frames_to_json,
     read_entries,
     select_frames,
     trajectory_id,
@@ -586,17 +585,15 @@ SceneLoader = Callable[[str], Scene]
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """What to render, and where to.
-
-    recipes: resolved recipes, one a variant; their `name` and `variant` number make the folder.
-    Where a style names files without a digest, the job fills it in; where a quality has still to
-    choose its settings, they are chosen once and kept in the output, for every later run.
-    frames: the dataset's frame numbers, or None for all. cameras: names, or None for all.
-    camera_path: frames to render in place of the scene's own, poses in the scene's world; labels
-    and LiDAR pass through where a frame of the scene has the same number and timestamp.
-    workers: 1 renders in this process. overwrite: replace the variants' folders, finished or not,
-    and choose their settings anew.
-    beds_dir: where it is kept where snow can lie, for later jobs; in the output folder if None.
+    """What to render, and where to. recipes: resolved recipes, one a variant; their `name` and
+    `variant` number make the folder. Where a style names files without a digest, the job fills it
+    in; where a quality has still to choose its settings, they are chosen once and kept in the
+    output, for every later run. frames: the dataset's frame numbers, or None for all. cameras:
+    names, or None for all. camera_path: frames to render in place of the scene's own, poses in the
+    scene's world; labels and LiDAR pass through where a frame of the scene has the same number and
+    timestamp. workers: 1 renders in this process. overwrite: replace the variants' folders,
+    finished or not, and choose their settings anew. beds_dir: where it is kept where snow can lie,
+    for later jobs; in the output folder if None.
     """
 
     scene_uri: str
@@ -743,12 +740,10 @@ class _Run:
         if chunks:
             self._begin(chunks)
             chunks = self._leave_unlabelled(chunks)
-        path = self.job.camera_path
         setup = Setup(
             out_dir=str(self.out_dir),
             recipes=self.recipes,
             backend=self.backend,
-            camera_path=None if path is None else frames_to_json(path),
             labelled=self.index.labelled,
             instances=self.index.instances,
             beds=self.beds,
@@ -758,11 +753,13 @@ class _Run:
         if not chunks:
             return
         if self.job.workers == 1:
-            spent = run_serially(self.scene, setup, chunks, self.renderer, self._deliver)
+            spent = run_serially(
+                self.scene, self.index.frames, setup, chunks, self.renderer, self._deliver
+            )
             self.timings.update(spent)
             return
         started = time.perf_counter()
-        shared = share_scene(self.scene, self.out_dir / STATE_FOLDER)
+        shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
         self.scene = None  # this process needs no more of it than the index
         self.timings["share"] += time.perf_counter() - started
         try:

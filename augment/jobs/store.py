@@ -50,9 +50,8 @@ class StoredFile:
 
 @runtime_checkable
 class Store(Protocol):
-    """Files below one folder. All methods raise OutputError, and may be called by any thread.
-
-    A store can be pickled and used after a fork: each process opens its own connections. (A child
+    """Files below one folder. All methods raise OutputError, and may be called by any thread. A
+    store can be pickled and used after a fork: each process opens its own connections. (A child
     that os.fork made and that used S3 must end by os._exit, as those of multiprocessing do: at a
     normal exit, pyarrow waits for threads that did not follow it.)
     """
@@ -93,14 +92,11 @@ class Store(Protocol):
 
 
 def open_store(uri: str | Path) -> Store:
-    """The store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like.
-
-    Nothing is read or made yet: a folder appears with its first file, a bucket must exist.
-    S3 takes `endpoint_override`, `scheme`, `region`, `force_virtual_addressing` and
-    `tls_ca_file_path` in the URI, and credentials from the environment.
-
-    Raises:
-        OutputError: no such kind of store, or options that it does not know.
+    """The store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like. Nothing
+    is read or made yet: a folder appears with its first file, a bucket must exist. S3 takes
+    `endpoint_override`, `scheme`, `region`, `force_virtual_addressing` and `tls_ca_file_path` in
+    the URI, and credentials from the environment. Raises OutputError: no such kind of store, or
+    options that it does not know.
     """
 
     if isinstance(uri, Path) or "://" not in uri:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import pickle
 import threading
 import time
@@ -17,15 +16,14 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing import reduction
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from augment.boxes import Instances
-from augment.cameras import Camera
+from augment.cameras import Camera, Frame
 from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.files import (
@@ -33,7 +31,6 @@ from augment.jobs.files import (
     View,
     WritePump,
     check_view,
-    frames_from_json,
     label_view,
     uses_boxes,
     write_view,
@@ -42,15 +39,19 @@ from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
 from augment.jobs.prepare import StoredBed, StoredMaps
 from augment.jobs.processes import (
+    READY,
     ChildProcess,
+    Ended,
     InheritedLock,
     OutputLock,
     SharedScene,
     available_cores,
     failed_start,
     gpu_is_lost,
+    inbox_of,
     limit_threads,
     quick_turns,
+    receive,
     renders_on_gpu,
     sender,
 )
@@ -193,16 +194,14 @@ class Pending(Protocol):
 
 @dataclass(frozen=True)
 class Setup:
-    """What rendering needs besides the scene; small, and picklable. camera_path: JSON of
-    `trajectory`, or None for the scene's frames. labelled: numbers of the frames whose labels and
-    LiDAR pass through. instances: of the scene's objects. beds: where the recipes' snow can lie;
-    the scene to render remembers them. maps: those of the recipes' styles.
+    """What rendering needs besides scene and frames; small, and picklable. labelled: numbers of the
+    frames whose labels and LiDAR pass through. instances: of the scene's objects. beds: where the
+    recipes' snow can lie; the scene to render remembers them. maps: those of the recipes' styles.
     """
 
     out_dir: str
     recipes: tuple[Recipe, ...]
     backend: str
-    camera_path: str | None
     labelled: frozenset[int]
     instances: Instances
     beds: tuple[StoredBed, ...] = ()
@@ -283,14 +282,12 @@ class FrameRunner:
     def __init__(
         self,
         scene: Scene,
+        frames: Sequence[Frame],
         setup: Setup,
         renderer: Renderer | None,
         deliver: Callable[[Outcome], None],
         pump: WritePump,
     ) -> None:
-        frames = scene.frames
-        if setup.camera_path is not None:
-            frames = frames_from_json(setup.camera_path)
         self._cameras = {f.index: f.cameras for f in frames}
         self._scene, self._setup = scene, setup
         self._renderer = renderer or job_renderer(setup.backend)
@@ -483,10 +480,9 @@ def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
 
 # ---- Two ways to run a job's chunks: in this process, or in several worker processes -------------
 # The parent hands workers its open scene (`SharedScene`); it alone decides what runs where, and
-# writes the progress logs. A worker sends _READY, an Outcome for each image, and, once it is told
+# writes the progress logs. A worker sends READY, an Outcome for each image, and, once it is told
 # to stop, its seconds by kind of work.
 
-_READY = "ready"  # the scene is there
 STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
 CHUNKS_AHEAD = 2  # one being rendered and one waiting, so that no worker idles
 Deliver = Callable[[Outcome], None]
@@ -510,25 +506,23 @@ def worker_main(
 ) -> None:
     """Serve chunks until told to stop. `lock` is only held: the folder stays ours until we end."""
     limit_threads(threads)
-    inbox: SimpleQueue[Chunk | None] = SimpleQueue()
     stopped = threading.Event()
-    threading.Thread(target=_listen, args=(connection, inbox, stopped), daemon=True).start()
+    inbox = inbox_of(connection, stopped.set)
     send = sender(connection)
     try:
-        scene = shared.open()
+        scene, frames = shared.open()
         for bed in setup.beds:
             bed.take_over(scene)
     except Exception as error:
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return
-    send(_READY)
-    if renders_on_gpu(setup.backend):
-        pump = WritePump.beside(setup.backend, threads)
-    else:  # one thread and little waiting: the memory of a view counts once per worker
-        pump = WritePump(threads=1, waiting=2)
-    runner = FrameRunner(scene, setup, renderer, send, pump)
+    send(READY)
+    on_gpu = renders_on_gpu(setup.backend)
+    # On a CPU one thread and little waiting: the memory of a view counts once per worker.
+    pump = WritePump.beside(setup.backend, threads) if on_gpu else WritePump(threads=1, waiting=2)
+    runner = FrameRunner(scene, frames, setup, renderer, send, pump)
     try:
-        with quick_turns(renders_on_gpu(setup.backend)):
+        with quick_turns(on_gpu):
             try:
                 while True:
                     if inbox.empty():  # the next chunk may depend on what becomes of the last view
@@ -547,24 +541,17 @@ def worker_main(
         send(Failure(False, describe(error, "in a worker process")))
 
 
-def _listen(connection: Connection, inbox: SimpleQueue, stopped: threading.Event) -> None:
-    """Receive beside the rendering, so that a stop or the parent's end is noticed at once."""
-    while True:
-        try:
-            chunk = connection.recv()
-        except (EOFError, OSError):
-            os._exit(1)  # the parent has gone: nobody is left to report to
-        if chunk is None:
-            stopped.set()
-        inbox.put(chunk)
-
-
 def run_serially(
-    scene: Scene, setup: Setup, chunks: Sequence[Chunk], renderer: Renderer | None, deliver: Deliver
+    scene: Scene,
+    frames: Sequence[Frame],
+    setup: Setup,
+    chunks: Sequence[Chunk],
+    renderer: Renderer | None,
+    deliver: Deliver,
 ) -> dict[str, float]:
     """Render in this thread, encode and write in others; seconds by kind of work."""
     pump = WritePump.beside(setup.backend, available_cores())
-    runner = FrameRunner(scene, setup, renderer, deliver, pump)
+    runner = FrameRunner(scene, frames, setup, renderer, deliver, pump)
     with quick_turns(renders_on_gpu(setup.backend)):
         try:
             for chunk in chunks:
@@ -585,14 +572,10 @@ def run_in_processes(
     lock: OutputLock,
 ) -> dict[str, float]:
     """Render in `workers` processes; `deliver` is called in this thread. Returns seconds by kind of
-    work, without those of workers that died.
-
-    What a dead worker had in hand is tried once more, each image alone; if its process dies again
-    the image is recorded as failed.
-
-    Raises:
-        ValueError: the renderer cannot be sent to another process.
-        OutputError: a worker could not write. ClimateGSError: a worker could not start.
+    work, without those of workers that died. What a dead worker had in hand is tried once more,
+    each image alone; if its process dies again the image is recorded as failed. Raises ValueError:
+    the renderer cannot be sent to another process. OutputError: a worker could not write.
+    ClimateGSError: a worker could not start.
     """
     try:
         reduction.ForkingPickler.dumps(renderer)
@@ -616,7 +599,7 @@ def run_in_processes(
 class _Worker(ChildProcess):
     """A worker process as its parent sees it. on_trial: at one image whose worker died before."""
 
-    is_stopping = on_trial = False
+    on_trial = False
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -632,14 +615,10 @@ class _Worker(ChildProcess):
             if (chunk.variant, chunk.frame) == (outcome.variant, outcome.frame):
                 rest = tuple(name for name in chunk.cameras if name != outcome.camera)
                 if len(rest) < len(chunk.cameras):
-                    kept = [Chunk(chunk.variant, chunk.frame, rest)] if rest else []
+                    kept = [replace(chunk, cameras=rest)] if rest else []
                     self.in_hand[position : position + 1] = kept
                     self.on_trial = self.on_trial and bool(kept)
                     return
-
-    def stop(self) -> None:
-        self.is_stopping = True
-        self.send(None)
 
 
 @dataclass
@@ -650,14 +629,14 @@ class _Pool:
     retries: deque[Chunk] = field(default_factory=deque)
     workers: list[_Worker] = field(default_factory=list)
     seconds: Counter[str] = field(default_factory=Counter)
+    is_stopping: bool = False
 
     def run(self, count: int) -> None:
         try:
-            for _ in range(count):
-                self.workers.append(self.start())
+            self.workers += [self.start() for _ in range(count)]
             while self._feed():
-                for worker in self._readable(None):
-                    self._read(worker)
+                for worker, message in receive(self.workers, None):
+                    self._take(worker, message)
         finally:
             self._stop()
 
@@ -671,18 +650,11 @@ class _Pool:
                 worker.give(self.retries.popleft())
         return any(worker.in_hand for worker in self.workers)
 
-    def _readable(self, timeout_s: float | None) -> list[_Worker]:
-        ready = wait([worker.connection for worker in self.workers], timeout_s)
-        return [worker for worker in self.workers if worker.connection in ready]
-
-    def _read(self, worker: _Worker) -> None:
-        try:
-            message = worker.connection.recv()
-        except (EOFError, OSError):
-            self._reap_worker(worker)
-            return
-        if message == _READY:
-            worker.is_ready = True
+    def _take(self, worker: _Worker, message: Any) -> None:
+        if isinstance(message, Ended):
+            self.workers.remove(worker)
+            if not self.is_stopping:
+                self._replace(worker, message.how)
         elif isinstance(message, Failure):
             raise (OutputError if message.is_output else ClimateGSError)(message.text)
         elif isinstance(message, dict):
@@ -691,12 +663,8 @@ class _Pool:
             worker.take(message)
             self.deliver(message)
 
-    def _reap_worker(self, worker: _Worker) -> None:
-        """Take a worker that ended out of the pool, and decide about what it had in hand."""
-        ending = worker.reap()
-        self.workers.remove(worker)
-        if worker.is_stopping:
-            return
+    def _replace(self, worker: _Worker, ending: str) -> None:
+        """Decide about what a worker that died had in hand."""
         if not worker.is_ready:
             raise failed_start(ending)
         _log.warning("a worker process %s; its images are tried once more", ending)
@@ -709,21 +677,20 @@ class _Pool:
                     )
                     self.deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
                 else:
-                    self.retries.append(Chunk(chunk.variant, chunk.frame, (name,)))
+                    self.retries.append(replace(chunk, cameras=(name,)))
         if self.waiting or self.retries:
             self.workers.append(self.start())
 
     def _stop(self) -> None:
         """Let every worker finish the image it is at, and take it in; kill what does not end."""
-        deadline = time.monotonic() + STOP_S
+        self.is_stopping, deadline = True, time.monotonic() + STOP_S
         try:
             for worker in self.workers:
-                worker.stop()
+                worker.send(None)
             while self.workers and time.monotonic() < deadline:
-                for worker in self._readable(1.0):
+                for worker, message in receive(self.workers, 1.0):
                     with contextlib.suppress(ClimateGSError):  # the first is on its way
-                        self._read(worker)
+                        self._take(worker, message)
         finally:
             for worker in self.workers:
                 worker.kill()
-            self.workers = []

@@ -121,23 +121,16 @@ def consistency_of(a: DepthView, warped: np.ndarray, counts: np.ndarray) -> Cons
 
 def warp_view(a: DepthView, b: DepthView) -> tuple[np.ndarray, np.ndarray]:
     """B's picture as A would see it, float64 [H, W, 3], and where it counts, bool [H, W]; 0 where
-    it does not.
-
-    Raises:
-        ValueError: a camera is orthographic.
+    it does not. Raises ValueError: a camera is orthographic.
     """
     warp = find_warp(a, b)
     return warp.sample(b.picture), warp.counts
 
 
 def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) -> Warp:
-    """Which pixels of A count, and where they lie in B.
-
-    points_m: float64 [H, W, 3], where A's surfaces are in the world when B is taken, NaN where that
-    is not known (such pixels do not count); by default where they are when A is taken.
-
-    Raises:
-        ValueError: a camera is orthographic.
+    """Which pixels of A count, and where they lie in B. points_m: float64 [H, W, 3], where A's
+    surfaces are in the world when B is taken, NaN where that is not known (such pixels do not
+    count); by default where they are when A is taken. Raises ValueError: a camera is orthographic.
     """
     points = world_points(a) if points_m is None else points_m
     column, row, depth_m = _places(points, b.camera)
@@ -161,10 +154,7 @@ def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) ->
 
 def world_points(view: DepthView) -> np.ndarray:
     """The surface that each pixel shows, float64 [H, W, 3], world; the camera's centre where depth
-    is not finite.
-
-    Raises:
-        ValueError: the camera is orthographic.
+    is not finite. Raises ValueError: the camera is orthographic.
     """
     rays = view.camera.ray_directions(torch.float64).numpy()
     depth = np.where(np.isfinite(view.depth_m), view.depth_m, 0.0)[..., None]
@@ -201,10 +191,9 @@ MAX_GAP_NS = 600_000_000  # some datasets label twice a second
 
 @dataclass(frozen=True, eq=False)
 class PosedBox:
-    """A box at one time. world_from_box: float64 [4, 4]. size_m: float64 [3].
-
-    known: false where the pose is that of the label nearest in time. restless: whether the box
-    moves between that label and the next one; false where the pose is known.
+    """A box at one time. world_from_box: float64 [4, 4]. size_m: float64 [3]. known: false where
+    the pose is that of the label nearest in time. restless: whether the box moves between that
+    label and the next one; false where the pose is known.
     """
 
     world_from_box: np.ndarray
@@ -269,13 +258,10 @@ class Carried:
 def carry(
     paths: ActorPaths, a: DepthView, b: DepthView, is_actor: np.ndarray | None = None
 ) -> Carried:
-    """Where A's surfaces are when B is taken. Cameras are in the world of the boxes.
-
-    is_actor: bool [H, W], pixels of A that are known to show an actor: outside of every box they
-    are left out, as nobody knows where they go (the recording car's own bonnet, say).
-
-    Raises:
-        ValueError: a camera is orthographic.
+    """Where A's surfaces are when B is taken. Cameras are in the world of the boxes. is_actor: bool
+    [H, W], pixels of A that are known to show an actor: outside of every box they are left out, as
+    nobody knows where they go (the recording car's own bonnet, say). Raises ValueError: a camera is
+    orthographic.
     """
     points = world_points(a)
     at_a, at_b = paths.at(a.camera.timestamp_ns), paths.at(b.camera.timestamp_ns)

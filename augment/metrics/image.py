@@ -22,9 +22,7 @@ CLOSE_M = 0.05
 
 def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio, dB: 10 log10(1 / mean squared error); infinite where equal.
-
-    Raises:
-        ValueError: shapes, types or values are not as this module says, or no pixel counts.
+    Raises ValueError: shapes, types or values are not as this module says, or no pixel counts.
     """
     a, b, w = _pair(picture, reference, weight)
     error = ((a - b) ** 2).mean(axis=2)
@@ -33,24 +31,19 @@ def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None =
 
 
 def ssim(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Structural similarity (Wang et al. 2004), averaged over the picture and its channels.
-
-    An 11x11 Gaussian window of sigma 1.5 on each colour channel, C1 = 0.01^2, C2 = 0.03^2, range 1.
-    As in 3D Gaussian Splatting (Kerbl et al. 2023) every pixel counts, and outside the picture all
-    is 0. That lifts the score of pixels near the border slightly against Wang's valid windows.
-
-    Raises:
-        ValueError: as psnr.
+    """Structural similarity (Wang et al. 2004), averaged over the picture and its channels. An
+    11x11 Gaussian window of sigma 1.5 on each colour channel, C1 = 0.01^2, C2 = 0.03^2, range 1. As
+    in 3D Gaussian Splatting (Kerbl et al. 2023) every pixel counts, and outside the picture all is
+    0. That lifts the score of pixels near the border slightly against Wang's valid windows. Raises
+    ValueError: as psnr.
     """
     a, b, w = _pair(picture, reference, weight)
     return float(np.average(_ssim_map(a, b), weights=w))
 
 
 def flip(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean of `flip_map`: 0 is the same picture, 1 as different as can be.
-
-    Raises:
-        ValueError: as psnr.
+    """Mean of `flip_map`: 0 is the same picture, 1 as different as can be. Raises ValueError: as
+    psnr.
     """
     w = None if weight is None else _checked_weight(weight, np.shape(reference)[:2])
     error = flip_map(picture, reference, weight).astype(np.float64)
@@ -61,11 +54,7 @@ def flip_map(
     picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
 ) -> np.ndarray:
     """float32 [H, W]: the difference a person sees when the two alternate (Andersson et al. 2020).
-
-    LDR-FLIP of the authors' own package, seen at PIXELS_PER_DEGREE.
-
-    Raises:
-        ValueError: as psnr.
+    LDR-FLIP of the authors' own package, seen at PIXELS_PER_DEGREE. Raises ValueError: as psnr.
     """
     from flip_evaluator import evaluate
 
@@ -83,11 +72,10 @@ def flip_map(
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of depth over a number of pixels; NaN where there are none.
-
-    median_m, p90_m: quantiles of |depth - true|, metres: the smallest error that at least this part
-    of the weight does not exceed. abs_rel: mean of |depth - true| / true. within_5cm: part of the
-    weight whose error is at most CLOSE_M, in [0, 1].
+    """Errors of depth over a number of pixels; NaN where there are none. median_m, p90_m: quantiles
+    of |depth - true|, metres: the smallest error that at least this part of the weight does not
+    exceed. abs_rel: mean of |depth - true| / true. within_5cm: part of the weight whose error is at
+    most CLOSE_M, in [0, 1].
     """
 
     pixels: int
@@ -101,11 +89,8 @@ def depth_errors(
     depth_m: np.ndarray, true_m: np.ndarray, weight: np.ndarray | None = None
 ) -> DepthErrors:
     """Errors of depths against true ones, metres, arrays of one shape; weight >= 0 of that shape.
-
-    Pixels of weight 0 are left out, whatever they hold.
-
-    Raises:
-        ValueError: shapes differ, or a pixel that counts has no finite depth or no true depth > 0.
+    Pixels of weight 0 are left out, whatever they hold. Raises ValueError: shapes differ, or a
+    pixel that counts has no finite depth or no true depth > 0.
     """
     depth, true = np.asarray(depth_m, np.float64), np.asarray(true_m, np.float64)
     if depth.shape != true.shape:

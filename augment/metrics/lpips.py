@@ -92,10 +92,8 @@ class Lpips:
     def __call__(
         self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"]
     ) -> Float[Tensor, " B"]:
-        """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones.
-
-        Raises:
-            ValueError: shapes differ, or the pictures are too small for the network.
+        """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones. Raises
+        ValueError: shapes differ, or the pictures are too small for the network.
         """
         least = self.architecture.least_px
         if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < least:
@@ -127,13 +125,9 @@ class Lpips:
 def picture_lpips(
     network: Lpips, picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
 ) -> float:
-    """The distance of two display-encoded pictures, floats [H, W, 3] in [0, 1].
-
-    weight: bool [H, W]; where it is false the picture is taken to be the reference, so those pixels
-    add nothing of their own. The mean stays one over the whole picture.
-
-    Raises:
-        ValueError: as Lpips.
+    """The distance of two display-encoded pictures, floats [H, W, 3] in [0, 1]. weight: bool [H,
+    W]; where it is false the picture is taken to be the reference, so those pixels add nothing of
+    their own. The mean stays one over the whole picture. Raises ValueError: as Lpips.
     """
     if weight is not None:
         picture = np.where(weight[..., None], picture, reference)
@@ -146,15 +140,11 @@ def picture_lpips(
 
 def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
     """LPIPS with weights from files: `.safetensors`, or state dicts that torch saved (.pth).
-
     weights: the state dict of a whole `lpips.LPIPS(net="alex")` or `"vgg"` (`net.slice1.0.weight`,
     ..., `lin0.model.1.weight`, ...); or, with `heads`, torchvision's `alexnet` or `vgg16`
     (`features.0.weight`, ...; its classifier is left out). heads: LPIPS's own file of linear heads
-    (`lin0.model.1.weight`, ...), version 0.1.
-
-    Raises:
-        MetricError: no such file, not one of these kinds, or tensors that are missing, of another
-            shape or dtype, or not finite; says which.
+    (`lin0.model.1.weight`, ...), version 0.1. Raises MetricError: no such file, not one of these
+    kinds, or tensors that are missing, of another shape or dtype, or not finite; says which.
     """
     found = read_state_dict(weights, MetricError)
     origin = dict.fromkeys(found, weights)

@@ -94,10 +94,10 @@ def test_a_shared_scene_is_the_scene(tmp_path: Path) -> None:
     sky = LatLongSky(torch.rand(4, 8, 3))
     maps = {"front": torch.rand(3, 4)}
     scene = dataclasses.replace(scene, actors=(actor,), sky=sky, color_maps=maps)
-    shared = share_scene(scene, tmp_path)
+    shared = share_scene(scene, scene.frames, tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
     assert len(shared.skeleton) < 20_000 < Path(shared.path).stat().st_size
-    again = shared.open()
+    again, _ = shared.open()
     shared.remove()
     assert not list(tmp_path.iterdir())
     for ours, theirs in (
