@@ -30,8 +30,7 @@ from adapters.uri import (
     parse_uri,
 )
 from augment.errors import AdapterError
-from augment.ground import Ground
-from augment.scene import Scene
+from augment.scene import Ground, Scene
 from recipes.errors import nearest_word
 from recipes.job import JobScene
 
@@ -41,8 +40,7 @@ def open_scene(uri: str) -> Scene:
 
     Raises:
         AdapterError: an unknown scheme (lists the known ones), a missing path, a path that no
-            adapter recognises, or a dataset that its adapter cannot use.
-    """
+            adapter recognises, or a dataset that its adapter cannot use."""
     scheme, path, query = parse_uri(uri)
     camera_path = query.pop(CAMERA_PATH_KEY, None)
     ground_z = query.pop(GROUND_KEY, None)
@@ -86,11 +84,7 @@ def _with_ground(scene: Scene, text: str) -> Scene:
 
 
 def recognise(path: Path) -> str:
-    """The scheme of a path by its contents.
-
-    Raises:
-        AdapterError: nothing there, or nothing known; says what was looked for.
-    """
+    """The scheme of a path by its contents."""
     _check_there(path)
     scheme = recognised(path)
     if scheme is None:
@@ -122,12 +116,7 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
 
     An entry whose path has `*`, `**` or `[...]` stands for all that match, as in a shell (a `?`
     begins the query); each keeps the entry's query, frames, cameras and recipes. folder: where
-    relative paths start.
-
-    Raises:
-        AdapterError: a pattern matches nothing or too much is below it to be looked through, a
-            scene is named twice, or a pattern has a name.
-    """
+    relative paths start."""
     scenes: dict[str, JobScene] = {}
     for entry in entries:
         found = _expanded(entry, folder)

@@ -17,29 +17,180 @@ import importlib
 import logging
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from augment.errors import BackendUnavailable, SceneError
-from augment.ground_heights import (
-    LEVEL_M,
-    STRETCH_M,
-    Ground,
-    GroundSource,
-    Stretches,
-    measure_ground,
-)
 from augment.labels import ClassifiesLidar
 from augment.render.threads import select_thread_pool
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, Ground, GroundSource, Scene
 from augment.semantics import SemanticClass
 
-# --------------------------------------------------------------------------------------------------
-# Which points lie on the ground, where nothing is labelled: planes through low points (RANSAC). One
-# plane does not fit a road that bends and climbs, so each WINDOW_M of the path has its own. The
-# planes are open3d's; open3d is imported when they are wanted.
+# ---- The height of a road along a driven path, from points that lie on it ------------------------
+# The path is cut into stretches; each has the median height of the points in a corridor around it,
+# so that neither a stray point nor the pavement decides.
+
+STRETCH_M = 3.0
+LEVEL_M = 6.0  # a road this far above or below the car is another one
+# Half widths of the corridor across and along the path. A LiDAR sees no road right below itself,
+# so that beside a short path the road must be sought further away.
+_CORRIDORS_M = ((2.5, STRETCH_M / 2), (4.0, 4.0), (8.0, 8.0), (16.0, 16.0), (math.inf, math.inf))
+_MIN_IN_STRETCH = 20
+_MIN_IN_ALL = 200  # some returns near a sensor are mislabelled: a few are not enough
+_MAX_MEASURED = 400_000
+_STANDING_M = 0.5  # positions nearer to each other are noise of a car that stands
+_STEEPEST = 0.15  # rise over run; no road is steeper over a stretch
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPoints:
+    """For each of N points: its stretch, and metres to its middle along and across the path."""
+
+    stretch: np.ndarray
+    along_m: np.ndarray
+    across_m: np.ndarray
+
+    def within(self, across_m: float, along_m: float) -> np.ndarray:
+        """Which points are, bool [N]."""
+        return (self.across_m <= across_m) & (self.along_m <= along_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """The stretches of a path: their middles float64 [S, 3] and unit directions [S, 2]."""
+
+    middles: np.ndarray
+    headings: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.middles)
+
+    @staticmethod
+    def of(positions: np.ndarray) -> Stretches:
+        """Points every STRETCH_M along positions float64 [P, 3], P >= 1, in order of time."""
+        kept = [positions[0]]
+        for position in positions[1:]:
+            if np.hypot(*(position - kept[-1])[:2]) >= _STANDING_M:
+                kept.append(position)
+        if len(kept) == 1:
+            return Stretches(np.array(kept, np.float64), np.array([[1.0, 0.0]]))
+        corners = np.array(kept, np.float64)
+        steps = np.hypot(*np.diff(corners[:, :2], axis=0).T)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        places = np.linspace(0, along[-1], 1 + max(1, round(along[-1] / STRETCH_M)))
+        middles = np.stack([np.interp(places, along, c) for c in corners.T], axis=1)
+        segment = np.clip(np.searchsorted(along, places, side="right") - 1, 0, len(steps) - 1)
+        headings = np.diff(corners[:, :2], axis=0)[segment] / steps[segment, None]
+        return Stretches(middles, headings)
+
+    def locate(self, points: np.ndarray) -> LocatedPoints:
+        """Which stretch each of the points [N, 3] is nearest to, seen from above, and where."""
+        nearest = np.asarray(KDTree(self.middles[:, :2]).query(points[:, :2])[1])
+        offset = points[:, :2] - self.middles[nearest, :2]
+        heading = self.headings[nearest]
+        along = (offset * heading).sum(1)
+        across = offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1]
+        return LocatedPoints(nearest, np.abs(along), np.abs(across))
+
+
+def measure_ground(
+    points: np.ndarray, positions: np.ndarray, source: GroundSource, *, level_m: float = LEVEL_M
+) -> Ground | None:
+    """The road along positions float64 [P, 3] from points [N, 3] of its surface; both in the
+    scene's world. None where there are too few.
+
+    level_m: points further above or below the path are another road's.
+    """
+    stretches = Stretches.of(positions)
+    points = np.asarray(points[:: 1 + len(points) // _MAX_MEASURED], np.float64)
+    if len(points) < _MIN_IN_ALL:
+        return None
+    located = stretches.locate(points)
+    level = np.abs(points[:, 2] - stretches.middles[located.stretch, 2]) <= level_m
+    groups = _widest_known(located, level, len(stretches))
+    if not groups:
+        return None
+    heights = np.array([np.median(points[index, 2]) for index in groups.values()])
+    places = stretches.middles[list(groups), :2]
+    used = points[np.concatenate(list(groups.values()))]
+    residuals = [_plane(points[index])[1] for index in groups.values()]
+    median_z = float(np.median(heights))
+    return Ground(
+        lowest_z_m=min(_lowest(heights, places), median_z),
+        median_z_m=median_z,
+        source=source,
+        residual_m=float(np.median(np.abs(np.concatenate(residuals)))),
+        points=len(used),
+        tilt_deg=_tilt_deg(used),
+    )
+
+
+def _widest_known(located: LocatedPoints, level: np.ndarray, count: int) -> dict[int, np.ndarray]:
+    """Indices of the points of each stretch that has enough of them; none where all have too few.
+
+    The narrowest corridor in which half of the stretches are known, or else the one that knows
+    most of them.
+    """
+    best: dict[int, np.ndarray] = {}
+    for across_m, along_m in _CORRIDORS_M:
+        groups = _by_stretch(located, level & located.within(across_m, along_m))
+        if len(groups) > len(best) and sum(map(len, groups.values())) >= _MIN_IN_ALL:
+            best = groups
+        if 2 * len(best) >= count:
+            break
+    return best
+
+
+def _by_stretch(located: LocatedPoints, chosen: np.ndarray) -> dict[int, np.ndarray]:
+    index = np.flatnonzero(chosen)
+    index = index[np.argsort(located.stretch[index], kind="stable")]
+    numbers, first = np.unique(located.stretch[index], return_index=True)
+    parts = np.split(index, first[1:])
+    return {
+        int(number): part
+        for number, part in zip(numbers, parts, strict=False)  # no numbers still have one part
+        if len(part) >= _MIN_IN_STRETCH
+    }
+
+
+def _lowest(heights: np.ndarray, places: np.ndarray) -> float:
+    """The lowest of the heights [S] at places [S, 2] that a neighbour confirms: roads climb only
+    so steeply, and a single wrong stretch must not set the level of a flood.
+    """
+    if len(heights) == 1:
+        return float(heights[0])
+    allowed = _STEEPEST * np.hypot(*np.diff(places, axis=0).T)
+    rise = np.diff(heights)  # from each stretch to the next
+    confirmed = np.zeros(len(heights), bool)
+    confirmed[:-1] |= rise <= allowed
+    confirmed[1:] |= -rise <= allowed
+    return float(heights[confirmed].min())
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes [2] of the least-squares plane over x and y, and residuals [N] at right angles."""
+    local = points - points.mean(axis=0)
+    slopes = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]
+    residuals = local[:, 2] - local[:, :2] @ slopes
+    return slopes, residuals / math.sqrt(1 + float(slopes @ slopes))
+
+
+def _tilt_deg(points: np.ndarray) -> float:
+    """Angle to +z of the normal of one plane through all points, the furthest left out."""
+    slopes, residuals = _plane(points)
+    for _ in range(2):
+        near = np.abs(residuals) <= max(3 * float(np.median(np.abs(residuals))), 0.01)
+        points = points[near]
+        slopes, residuals = _plane(points)
+    return math.degrees(math.atan(float(np.hypot(*slopes))))
+
+
+# ---- Which points lie on the ground where nothing is labelled: open3d's planes through low points
+# One plane does not fit a road that bends and climbs, so each WINDOW_M of the path has its own.
 
 WINDOW_M = 40.0
 STEEPEST_DEG = 15.0  # a plane further from level is a wall's, a hillside's or a roof's
@@ -135,6 +286,8 @@ def _level_plane(o3d: Any, points: np.ndarray) -> np.ndarray | None:
         points = np.delete(points, inliers, axis=0)
     return None
 
+
+# ---- The ground of a scene -----------------------------------------------------------------------
 
 logger = logging.getLogger(__name__)
 
@@ -331,6 +484,3 @@ def _from_path(scene: Scene, positions: np.ndarray) -> Ground:
     if seen.any() and np.median((cameras - heights)[seen]) < _EGO_ON_ROAD_M:
         heights = cameras[seen] - CAMERA_HEIGHT_M
     return Ground(float(heights.min()), float(np.median(heights)), "ego path")
-
-
-__all__ = ["Ground", "GroundSource", "check_metric_and_level", "ground_of", "ground_sentence"]

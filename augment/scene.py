@@ -8,7 +8,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,11 +19,9 @@ from augment import kernels
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat
-from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.render.sh import rotate_sh, sh_turn
 from augment.render.threads import kernel_threads
-from augment.semantics import SemanticClass
 from augment.sky import Sky
 
 # ---- Where an actor is over time -----------------------------------------------------------------
@@ -94,8 +92,7 @@ class Track:
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
-@dataclass(frozen=True)
-class _Knots:
+class _Knots(NamedTuple):
     """A track in Python's own numbers: for a single pose, torch's and NumPy's calls take a hundred
     times as long as the arithmetic. quats: wxyz, T of 4. centres: T of 3.
     """
@@ -130,9 +127,8 @@ def _rotation(quat: Sequence[float]) -> list[list[float]]:
 
 
 # ---- Colours that change over time: a Fourier series of every splat's view-independent colour ----
-# Street Gaussians gives an actor's splats such colours (Yan et al. 2024, section 3.1, "4D spherical
-# harmonics"): sh_00(t) = sum_k c_k b_k(t) with b_k = cos(pi k t) for even k, sin(pi (k + 1) t) for
-# odd k.
+# Yan et al. 2024 (Street Gaussians), section 3.1, "4D spherical harmonics": sh_00(t) = sum_k c_k
+# b_k(t) with b_k = cos(pi k t) for even k, sin(pi (k + 1) t) for odd k.
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,14 +221,9 @@ def _colors_by_kernel(
     if turn is not None and sh.shape[1] > 1:
         matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
     out = np.empty(tuple(sh.shape), np.float32)
+    rows, terms = sh.detach().contiguous().numpy(), np.asarray(weights, np.float32)
     with kernel_threads(1):
-        kernels.colors_at(
-            sh.detach().contiguous().numpy(),
-            coefficients,
-            np.asarray(weights, np.float32),
-            matrix,
-            out,
-        )
+        kernels.colors_at(rows, coefficients, terms, matrix, out)
     return torch.from_numpy(out)
 
 
@@ -259,14 +250,9 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         count = self.means.shape[0]
-        expected = {
-            "means": (count, 3),
-            "quats": (count, 4),
-            "scales": (count, 3),
-            "opacities": (count,),
-        }
-        for name, shape in expected.items():
-            value = getattr(self, name)
+        columns = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+        for name, own in columns.items():
+            value, shape = getattr(self, name), (count, *own)
             if tuple(value.shape) != shape:
                 raise ValueError(
                     f"{name} must be {list(shape)} with N={count} (from means); "
@@ -295,32 +281,20 @@ class Gaussians:
 
     @property
     def nbytes(self) -> int:
-        tensors = [self.means, self.quats, self.scales, self.opacities, self.sh]
-        if self.semantic is not None:
-            tensors.append(self.semantic)
-        return sum(t.numel() * t.element_size() for t in tensors)
+        return sum(t.numel() * t.element_size() for t in self._tensors().values())
+
+    def _tensors(self) -> dict[str, Tensor]:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at the given indices or mask, in that order."""
-        return Gaussians(
-            means=self.means[index],
-            quats=self.quats[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            sh=self.sh[index],
-            semantic=None if self.semantic is None else self.semantic[index],
-        )
+        return Gaussians(**{name: tensor[index] for name, tensor in self._tensors().items()})
 
     @staticmethod
     def empty(sh_degree: int = 0) -> Gaussians:
-        k = SH_COUNTS[sh_degree]
-        return Gaussians(
-            means=torch.zeros(0, 3),
-            quats=torch.zeros(0, 4),
-            scales=torch.zeros(0, 3),
-            opacities=torch.zeros(0),
-            sh=torch.zeros(0, k, 3),
-        )
+        shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, SH_COUNTS[sh_degree], 3))
+        return Gaussians(*(torch.zeros(shape) for shape in shapes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,6 +373,33 @@ class PosedGaussians:
         if self.color_maps is None or len(self.color_maps) == 1:
             return None
         return self.gaussians.semantic if self.color_rows is None else self.color_rows
+
+
+GroundSource = Literal["lidar labels", "road splats", "ransac", "ego path", "stated"]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where the road under the ego path is, scene world, and how that is known.
+
+    lowest_z_m, median_z_m: over the stretches of the path. residual_m: median distance of the
+    `points` used from the planes of their stretches, None without any. tilt_deg: angle between the
+    road's normal and +z (a road that slopes, or a gravity that is off); None where unknown.
+    """
+
+    lowest_z_m: float
+    median_z_m: float
+    source: GroundSource
+    residual_m: float | None = None
+    points: int = 0
+    tilt_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.lowest_z_m <= self.median_z_m:  # also catches NaN
+            raise ValueError(
+                f"a ground's lowest height must not be above its median one; got lowest_z_m "
+                f"{self.lowest_z_m}, median_z_m {self.median_z_m}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -561,10 +562,7 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
     Raises:
         SceneError: nothing usable remains.
     """
-    finite = torch.ones(len(gaussians), dtype=torch.bool)
-    for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
-        finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
-    finite &= torch.isfinite(gaussians.opacities)
+    finite = _finite_rows(gaussians)
     norms = quat_lengths(gaussians.quats)
     largest = torch.maximum(gaussians.means.abs().amax(1), gaussians.scales.amax(1))
     is_far = finite & (norms > 0) & (gaussians.scales.amin(1) > 0) & (largest > MAX_EXTENT_M)
@@ -586,15 +584,15 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
         gaussians, norms = gaussians.select(keep), norms[keep]
     if len(gaussians) == 0:
         raise SceneError(f"{where} holds no usable Gaussians. " + " ".join(problems))
-    unit = Gaussians(
-        means=gaussians.means,
-        quats=(gaussians.quats / norms[:, None]).to(gaussians.quats.dtype),
-        scales=gaussians.scales,
-        opacities=gaussians.opacities.clamp(0, 1),
-        sh=gaussians.sh,
-        semantic=gaussians.semantic,
-    )
-    return unit, problems
+    quats = (gaussians.quats / norms[:, None]).to(gaussians.quats.dtype)
+    return replace(gaussians, quats=quats, opacities=gaussians.opacities.clamp(0, 1)), problems
+
+
+def _finite_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
+    finite = torch.isfinite(gaussians.opacities)
+    for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
+        finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
+    return finite
 
 
 def quat_lengths(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N"]:
@@ -607,21 +605,7 @@ def quat_lengths(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N"]:
     return quats.double().norm(dim=1)
 
 
-__all__ = [
-    "Actor",
-    "Gaussians",
-    "PosedGaussians",
-    "Scene",
-    "SemanticClass",
-    "Track",
-    "check_gaussians",
-    "quat_lengths",
-]
-
-
-# ---- Whether Gaussians can be drawn as they are, told without copying them -----------------------
-# `augment.scene.check_gaussians` leaves out what cannot be drawn, at the cost of copies; these say
-# beforehand whether it has anything to do, and of which rows.
+# ---- Whether `check_gaussians` has anything to do, and of which rows: without its copies ---------
 
 _QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is to be normalised
 _ROWS = 1 << 16  # looked at together: temporaries stay in the cache
@@ -637,9 +621,7 @@ def is_drawable(gaussians: Gaussians) -> bool:
 
 def drawable_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
     """The Gaussians that `check_gaussians` keeps."""
-    keep = torch.isfinite(gaussians.opacities)
-    for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
-        keep &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
+    keep = _finite_rows(gaussians)
     for tensor in (gaussians.means, gaussians.scales):
         keep &= tensor.abs().amax(1) <= MAX_EXTENT_M
     return keep & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)

@@ -9,8 +9,7 @@ import torch
 from scenes import camera_ahead, random_gaussians, random_pose
 
 from augment.cameras import Frame
-from augment.ground_heights import Ground
-from augment.scene import Actor, ColorWaves, Gaussians, Scene, Track
+from augment.scene import Actor, ColorWaves, Gaussians, Ground, Scene, Track
 from augment.sky import CubemapSky
 
 START_NS = 1_557_540_079_200_123_457  # too many digits for a float64

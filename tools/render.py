@@ -26,7 +26,6 @@ from augment.effects.lidar.beam import weathered_sweep
 from augment.errors import ClimateGSError
 from augment.geometry import rigid
 from augment.ground import ground_of
-from augment.ground_heights import Ground
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.blocks import JobStatus, Plan, read_status, shard_of
 from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
@@ -50,7 +49,7 @@ from augment.render.buffers import CPU, CUDA
 from augment.render.cpu import driver as cpu
 from augment.render.cuda.runtime import is_interpreted
 from augment.render.threads import thread_count
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
 from augment.views import render_view
 from recipes.change import found

@@ -27,9 +27,9 @@ from adapters.raw_drive import DriveOptions, Sweep
 from adapters.world import join_gaussians
 from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.ground import Ground, measure_from_classes
+from augment.ground import measure_from_classes
 from augment.labels import LabelSource
-from augment.scene import Actor, Gaussians, Scene
+from augment.scene import Actor, Gaussians, Ground, Scene
 
 logger = logging.getLogger(__name__)
 
@@ -80,11 +80,7 @@ def build_lidar_scene(
     without neighbours, and actors of which nothing is left. lidar_top_deg: highest elevation that
     the LiDAR looks at. problems: of reading; those of building follow them. added: Gaussians of the
     background from elsewhere. ground: measured unless given; where it is not found, ground_z_m is a
-    low height.
-
-    Raises:
-        AdapterError: no Gaussian is left, and if_empty says why.
-    """
+    low height."""
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in frames])
     times_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
     background, actors = split_sweeps(sweeps, tracks)

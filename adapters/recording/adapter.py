@@ -58,12 +58,11 @@ from augment.cameras import Camera, Frame
 from augment.effects.lidar.beam import intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError, OutputError
-from augment.ground import Ground
 from augment.jobs.files import decode_png, depth_in_metres
 from augment.jobs.layout import folder_name
 from augment.jobs.tables import ATTRIBUTE_PREFIX, is_ours, read_boxes, read_lidar, read_table
 from augment.labels import Boxes, LidarSweep
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, Ground, Scene
 from augment.semantics import SemanticClass
 from recipes.files import open_file
 
@@ -450,8 +449,7 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
 
     Raises:
         AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
-            image; a damaged LiDAR file or table of boxes; a file outside the folder.
-    """
+            image; a damaged LiDAR file or table of boxes; a file outside the folder."""
     options = DriveOptions.from_query("recording", query)
     root = Path(path)
     if not root.is_dir():
@@ -541,8 +539,8 @@ def _best_scene(
     check_cameras_above(root / CALIBRATION, frames, road)
     budget = min(_MAX_GAUSSIANS, options.max_gaussians)
     shells = guess_shells(views_of(used), road, round(budget * _SHELL_SHARE))
-    coarse = dataclasses.replace(
-        options, voxel_m=max(_VOXEL_M, options.voxel_m), max_gaussians=budget - len(shells)
+    coarse = options.model_copy(
+        update={"voxel_m": max(_VOXEL_M, options.voxel_m), "max_gaussians": budget - len(shells)}
     )
     sweeps = guess_surfaces(road, objects.moving, objects.still)
     # Whatever is found in the guessed surfaces is the height they were given.

@@ -20,9 +20,9 @@ from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import CAMBER, EGO_Y_M, road_z
 from augment.errors import BackendUnavailable
 from augment.files.ply import write_ply
-from augment.ground import Ground, ground_of, load_open3d
+from augment.ground import ground_of, load_open3d
 from augment.labels import ClassifiesLidar, LidarSweep
-from augment.scene import Scene
+from augment.scene import Ground, Scene
 from augment.semantics import SemanticClass
 from tools.explain import describe_scene, scene_text
 

@@ -22,10 +22,9 @@ from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import remember_support, support_of
 from augment.geometry import rigid
-from augment.ground_heights import Ground
 from augment.plan import make_plan
 from augment.render.composite import quantise
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view

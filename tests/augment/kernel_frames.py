@@ -15,11 +15,10 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.effects.snow.height_map import draw_views
 from augment.geometry import rigid
-from augment.ground import Ground
 from augment.render.buffers import RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
+from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
 from augment.views import render_view

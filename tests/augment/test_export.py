@@ -33,7 +33,8 @@ from augment.geometry import rigid, rotmat_from_quat, transform_points
 from augment.jobs import atomic as atomic_folder
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, SemanticClass, Track
+from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, Track
+from augment.semantics import SemanticClass
 
 NOW = START_NS + 100_000_000
 

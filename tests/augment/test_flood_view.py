@@ -11,11 +11,10 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.geometry import rigid
-from augment.ground_heights import Ground
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.composite import quantise
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, Sky
 from augment.views import render_buffers, render_view

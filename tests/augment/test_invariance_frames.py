@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.ground_heights import Ground
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, Ground, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
 from recipes.schema import Flood, Output, Recipe, Smog, Weather

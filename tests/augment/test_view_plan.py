@@ -12,11 +12,10 @@ from augment import views as apply
 from augment.cameras import Camera
 from augment.effects.flood.flood_view import _bed_margins, _mirror_margins
 from augment.geometry import rigid, rotmat_from_quat
-from augment.ground_heights import Ground
 from augment.plan import Bounds, ViewPlan, bound, bound_chunks, make_plan, may_show, plan_view
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
-from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
+from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
 from augment.views import render_buffers, render_view
 from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood, Snow, Waves

@@ -8,15 +8,22 @@ import types
 import pytest
 import torch
 
-from augment.ground_heights import Ground
 from augment.render.constants import RasterSettings
 from augment.render.reference import blend_weights, order_by_depth, project_parts
-from augment.scene import PosedGaussians
+from augment.scene import Ground, PosedGaussians
 from tests.snow_scenes import drive, sheet, wall
 from tests.tools.test_bench import TickingClock, check_figures
 from tools.bench import gpu
-from tools.bench.gpu import GpuCase, Timing, bench_gpu, write_table
-from tools.bench.gpu_ceilings import LANES, Ceilings, count_blends, measure_ceilings
+from tools.bench.gpu import (
+    LANES,
+    Ceilings,
+    GpuCase,
+    Timing,
+    count_blends,
+    measure,
+    measure_ceilings,
+    write_table,
+)
 from tools.bench.harness import WallClock
 from tools.bench.scenes import RasterCase, random_scene
 from tools.cli import main
@@ -30,7 +37,7 @@ def once(clock=None) -> Timing:
 
 
 def test_ceilings_are_work_over_time():
-    found = measure_ceilings(once().rounds, copy_bytes=1 << 12, programs=2, steps=3)
+    found = measure_ceilings(once(), copy_bytes=1 << 12, programs=2, steps=3)
     assert found == Ceilings(bytes_per_s=2 * 4096, blends_per_s=2 * LANES * 3)
     assert found.ms(8192.0) == pytest.approx(1000)
     assert found.ms(0.0, 2 * 2 * LANES * 3) == pytest.approx(2000)
@@ -51,31 +58,15 @@ def test_blends_are_those_of_the_definition():
     y, x = torch.meshgrid(torch.arange(17) + 0.5, torch.arange(20) + 0.5, indexing="ij")
     pixels = torch.stack([x.reshape(-1), y.reshape(-1)])
     weights, after = blend_weights(splats, pixels, torch.ones(340), settings)
-    assert counted.done == int((weights > 0).sum()) > 2000
+    assert counted["done"] == int((weights > 0).sum()) > 2000
     assert bool((after[-1] <= 0.05).any())  # some pixels are finished before their lists end
     lengths = tiles.tile_offsets.diff()
-    assert counted.listed == int((lengths * torch.tensor([256, 64, 16, 4])).sum())
-    assert counted.done <= counted.reached <= counted.listed
-    assert counted.entries <= int(lengths.sum()) and counted.used <= len(gaussians)
+    assert counted["listed"] == int((lengths * torch.tensor([256, 64, 16, 4])).sum())
+    assert counted["done"] <= counted["reached"] <= counted["listed"]
+    assert counted["entries"] <= int(lengths.sum()) and counted["used"] <= len(gaussians)
 
 
-def test_the_floor_of_a_frame_whose_bytes_are_known():
-    found = gpu.measure_raster(SMALL, once(), SPEEDS)
-    assert found["same_bits"] and found["stages_ms"].keys() == {"project", "list", "blend"}
-    assert found["ms"]["clean"]["median"] == 1000 and found["smog_over_clean"]["median"] == 1
-    assert "not installed" in found["gsplat"]["left_out"]
-    floor, shown = found["floor"], found["floor"]["visible"]
-    assert floor["splats"] == 40 and 0 < floor["used"] <= shown <= 40
-    # Means, scales and opacity of all, key and count; of those in view quaternion, 16 functions of
-    # SH, record and rectangle.
-    moved = floor["bytes_of"]
-    assert moved["project"] == 40 * (28 + 8) + shown * (16 + 192 + 64 + 8)
-    assert moved["list"] == 40 * 8 + shown * 8 + 4 * floor["pairs"] + 4 * 5
-    assert moved["blend"] == 4 * floor["entries"] + 64 * floor["used"] + 20 * 17 * 16
-    assert floor["ms"]["blend"] == pytest.approx(max(moved["blend"], floor["done"]) / 1e3)
-
-
-def test_gsplat_takes_turns_with_ours_or_is_left_out(monkeypatch):
+def test_the_floor_of_a_frame_whose_bytes_are_known_and_gsplat_beside_ours(monkeypatch):
     module = types.ModuleType("gsplat")
     module.__spec__ = importlib.machinery.ModuleSpec("gsplat", None)
     monkeypatch.setitem(sys.modules, "gsplat", module)
@@ -88,13 +79,25 @@ def test_gsplat_takes_turns_with_ours_or_is_left_out(monkeypatch):
         return ours.rgb[None], ours.alpha[None, ..., None], {}
 
     module.rasterization = rasterization
-    found = gpu._beside_gsplat({"clean": int, "smog": int}, gaussians, camera, once())
+    found = gpu.measure_raster(SMALL, once(), SPEEDS)
+    assert found["same_bits"] and found["stages_ms"].keys() == {"project", "list", "blend"}
     assert set(found["ms"]) == {"clean", "smog", "gsplat, packed", "gsplat, unpacked"}
+    assert found["ms"]["clean"]["median"] == 1000 and found["smog_over_clean"]["median"] == 1
     assert found["gsplat"]["ratio"]["median"] == 1.0 and found["gsplat"]["rgb"]["max"] == 0
+    floor, shown = found["floor"], found["floor"]["visible"]
+    assert floor["splats"] == 40 and 0 < floor["used"] <= shown <= 40
+    # Means, scales and opacity of all, key and count; of those in view quaternion, 16 functions of
+    # SH, record and rectangle.
+    moved = floor["bytes_of"]
+    assert moved["project"] == 40 * (28 + 8) + shown * (16 + 192 + 64 + 8)
+    assert moved["list"] == 40 * 8 + shown * 8 + 4 * floor["pairs"] + 4 * 5
+    assert moved["blend"] == 4 * floor["entries"] + 64 * floor["used"] + 20 * 17 * 16
+    assert floor["ms"]["blend"] == pytest.approx(max(moved["blend"], floor["done"]) / 1e3)
     module.rasterization = None
     assert "gsplat failed: TypeError" in gpu.gsplat_draws(gaussians, camera)
 
 
+@pytest.mark.long
 def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
     """Weathered frames and placement by the CPU backend; the style's section fails."""
     road, ground = sheet((2, 6), (-2, 2), rgb=(0.3, 0.35, 0.3)), Ground(0.0, 0.0, "stated")
@@ -120,7 +123,7 @@ def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
     }
     monkeypatch.setattr(gpu, "run_section", lambda name, *_: found[name])
     path = tmp_path / "gpu.json"
-    result = bench_gpu(GpuCase(), timing=once(), json_file=path, in_processes=False)
+    result = measure(GpuCase(), timing=once(), json_file=path, in_processes=False)
     tables, sections = check_figures(result), result["facts"]["sections"]
     assert path.is_file() and sections["style"] == {"failed": "KeyError: 'style'"}
     assert [row[-1] for title, rows in tables.items() if "Street" in title for row in rows] == [
@@ -143,10 +146,10 @@ def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
 
 def test_without_ceilings_nothing_else_is_measured_and_unknown_sections_are_refused(monkeypatch):
     monkeypatch.setattr(gpu, "run_section", lambda *_: {"left_out": "no time was left"})
-    found = bench_gpu(GpuCase(), timing=once(), in_processes=False)["facts"]["sections"]
+    found = measure(GpuCase(), timing=once(), in_processes=False)["facts"]["sections"]
     assert "could not be measured" in found["raster"]["left_out"]
     with pytest.raises(ValueError, match=r"sections are ceilings, .*; got y"):
-        bench_gpu(GpuCase(), sections=("y",), timing=once())
+        measure(GpuCase(), sections=("y",), timing=once())
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -161,7 +164,7 @@ def test_a_small_run_on_a_gpu(tmp_path):
     case = dataclasses.replace(
         gpu.QUICK, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
     )
-    result = bench_gpu(case, timing=Timing(3, 1), json_file=tmp_path / "gpu.json")
+    result = measure(case, timing=Timing(3, 1), json_file=tmp_path / "gpu.json")
     sections = result["facts"]["sections"]
     assert not [name for name in gpu.SECTIONS if "failed" in sections[name]]
     assert sections["raster"]["same_bits"] and sections["raster"]["peak_mib"] > 0
