@@ -25,7 +25,7 @@ from adapters.street.layout import (
     frame_time_ns,
     parse_parameters,
 )
-from adapters.street.light import build_sky
+from adapters.street.light import Body, build_sky
 from adapters.street.splats import (
     SHADOW_RGB,
     ContactShadow,
@@ -36,7 +36,7 @@ from adapters.street.splats import (
     shadow_gaussians,
     splat,
 )
-from adapters.street.world import Body, MovingBody, Street, build_street
+from adapters.street.world import MovingBody, Street, build_street
 from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.errors import SceneError

@@ -15,6 +15,8 @@ draws nothing nearer than its near plane of 0.1 m.
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,19 +108,18 @@ def read_gaussians(
     )
 
 
-def left_out(models: Mapping[str, Any], where: str) -> tuple[str, ...]:
+def left_out(models: Mapping[str, Any], where: str) -> list[str]:
     """A sentence for each model that is not drawn, with the number of its Gaussians."""
     sentences = []
     for name in models:
         if name in (BACKGROUND, RIGID, *OTHERS):
             continue
         means = section(models, name, where).get("_means")
-        what = f"the model {name} is"
-        if isinstance(means, Tensor):
-            what = f"{len(means)} Gaussians of {name} are"
+        is_count = isinstance(means, Tensor)
+        what = f"{len(means)} Gaussians of {name} are" if is_count else f"the model {name} is"
         reason = _REASONS.get(name, "models of this kind are not known here")
         sentences.append(f"{where}: {what} left out: {reason}")
-    return tuple(sentences)
+    return sentences
 
 
 def turned_to_actor(
@@ -215,7 +216,7 @@ def make_actors(
     identities: Sequence[Instance | None],
     run: Run,
     where: str,
-) -> tuple[tuple[Actor, ...], tuple[str, ...]]:
+) -> tuple[list[Actor], list[str]]:
     """One actor for each object that has Gaussians and is in some frame.
 
     owners: int64 [N], the object of each of the Gaussians. A track has a knot at each frame's time,
@@ -224,13 +225,14 @@ def make_actors(
     actors, problems, absent = [], [], []
     axes, turn = run.convention.object_from_actor, scene_from_model(run)
     for index, identity in enumerate(identities):
-        track_id = f"rigid-{index}" if identity is None else identity.track_id
+        track_id, label = f"rigid-{index}", _LABEL
+        if identity is not None:
+            track_id, label = identity.track_id, identity.label
         own = np.flatnonzero(owners == index)
         seen = np.flatnonzero(poses.visible[:, index])
         if len(own) == 0 or len(seen) == 0:
             absent.append(track_id)
             continue
-        rotations, places = poses.rotations[seen, index] @ axes, poses.positions[seen, index]
         try:
             usable, about = check_gaussians(
                 gaussians.select(torch.from_numpy(own)), where=f"{where} object {index}"
@@ -239,13 +241,12 @@ def make_actors(
             problems.append(str(error))
             continue
         problems += about
-        label = _LABEL if identity is None else identity.label
-        turned = turned_to_actor(usable, axes, turn)
+        rotations, places = poses.rotations[seen, index] @ axes, poses.positions[seen, index]
         actors.append(
             Actor(
                 track_id=track_id,
                 label=label,
-                gaussians=with_class_of(label, turned),
+                gaussians=with_class_of(label, turned_to_actor(usable, axes, turn)),
                 track=Track(
                     torch.from_numpy((run.frames.start + seen).astype(np.int64) * FRAME_NS),
                     rigid(torch.from_numpy(turn @ rotations), torch.from_numpy(places @ turn.T)),
@@ -261,7 +262,7 @@ def make_actors(
             f"{where}: objects without Gaussians, or visible in no frame, are no actors: "
             f"{', '.join(absent)}"
         )
-    return tuple(actors), tuple(problems)
+    return actors, problems
 
 
 def identify(
@@ -278,10 +279,8 @@ def identify(
         shown = poses.visible[:, index]
         candidates = []
         for instance in instances:
-            if len(instance.frames) == 0:
-                continue
             inside = np.isin(instance.frames, numbers)
-            if not np.array_equal(instance.frames[inside], numbers[shown]) or not shown.any():
+            if not np.array_equal(instance.frames[inside], numbers[shown]) or not inside.any():
                 continue
             size = instance.sizes_m[inside].mean(0)
             if np.abs(size - poses.sizes_m[index]).max() > _SAME_SIZE_M:
@@ -294,11 +293,8 @@ def identify(
         if is_clear and len(candidates) > 1:
             is_clear = candidates[1][0] > _CLEARER * candidates[0][0] + _SAME_SIZE_M
         clear.append(candidates[0][1] if is_clear else None)
-    taken_ids = [instance.track_id for instance in clear if instance is not None]
-    return [
-        None if instance is None or taken_ids.count(instance.track_id) > 1 else instance
-        for instance in clear
-    ]
+    times_taken = Counter(instance.track_id for instance in clear if instance is not None)
+    return [None if i is None or times_taken[i.track_id] > 1 else i for i in clear]
 
 
 # ---- The sky of a run as a cube map of the scene's world -----------------------------------------
@@ -347,18 +343,19 @@ def turned_faces(faces: Tensor, source_from_target: np.ndarray) -> Tensor:
 
     faces: [6, R, R, 3]. source_from_target: [3, 3], a rotation.
     """
-    if not np.isin(source_from_target, (-1.0, 0.0, 1.0)).all():
-        return _drawn_faces(CubemapSky(faces), source_from_target)
     turned = torch.empty_like(faces)
-    for target, (source, quarters) in enumerate(_turns_of_faces(source_from_target)):
-        turned[target] = torch.rot90(faces[source], quarters)
-    return turned
-
-
-def _drawn_faces(sky: CubemapSky, source_from_target: np.ndarray) -> Tensor:
-    """Each face as a camera of 90 degrees sees it; a face is the mirror image of such a picture."""
-    size = sky.faces.shape[1]
-    faces = torch.empty_like(sky.faces)
+    if np.isin(source_from_target, (-1.0, 0.0, 1.0)).all():
+        # Found on a cube map of two texels an edge: where four texels go, all do.
+        turn = torch.from_numpy(source_from_target).float()
+        face, s, t = cubemap_coordinates(directions_of_cubemap(2) @ turn.T)
+        texels = torch.arange(24).reshape(6, 2, 2)
+        for target, shown in enumerate(face * 4 + (t > 0) * 2 + (s > 0)):
+            for source, quarters in itertools.product(range(6), range(4)):
+                if torch.equal(torch.rot90(texels[source], quarters), shown):
+                    turned[target] = torch.rot90(faces[source], quarters)
+        return turned
+    # Each face as a camera of 90 degrees sees it; a face is the mirror image of such a picture.
+    size = faces.shape[1]
     for face, corners in enumerate(directions_of_cubemap(2).double()):
         left, down = corners[0, 0] - corners[0, 1], corners[1, 0] - corners[0, 0]
         axes = torch.nn.functional.normalize(torch.stack([left, down, corners.sum((0, 1))]))
@@ -366,26 +363,8 @@ def _drawn_faces(sky: CubemapSky, source_from_target: np.ndarray) -> Tensor:
         pose[:3, :3] = axes @ torch.from_numpy(source_from_target.T.copy())
         camera = Camera("face", size, size, *[size / 2] * 4, camera_from_world=pose)
         empty = torch.zeros(size, size, 3)
-        faces[face] = composite_sky(empty, empty[..., 0], camera, sky).flip(1)
-    return faces
-
-
-def _turns_of_faces(source_from_target: np.ndarray) -> list[tuple[int, int]]:
-    """For each face, the one that it shows and by how many quarter turns, found on a cube map of
-    two texels an edge: where four texels go, all do."""
-    turn = torch.from_numpy(source_from_target).float()
-    face, s, t = cubemap_coordinates(directions_of_cubemap(2) @ turn.T)
-    shown = face * 4 + (t > 0) * 2 + (s > 0)
-    texels = torch.arange(24).reshape(6, 2, 2)
-    return [
-        next(
-            (source, quarters)
-            for source in range(6)
-            for quarters in range(4)
-            if torch.equal(torch.rot90(texels[source], quarters), texels_of_face)
-        )
-        for texels_of_face in shown
-    ]
+        turned[face] = composite_sky(empty, empty[..., 0], camera, CubemapSky(faces)).flip(1)
+    return turned
 
 
 def _baked(
@@ -471,16 +450,18 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     background, unusable = check_gaussians(background, where=f"{where} {BACKGROUND}")
     change = WorldChange(rotation=scene_from_model(run))
     actors, about_actors = _actors(models, run, step, where)
-    about_renderer = (
-        f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
-        f"small splats fainter than they are drawn here; a recipe's render: {{antialiased: true}} "
-        f"does the same",
-    )
+    about_renderer = []
+    if run.is_set("trainer.render.antialiased"):
+        about_renderer = [
+            f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
+            f"small splats fainter than they are drawn here; a recipe's render: "
+            f"{{antialiased: true}} does the same"
+        ]
     return Scene(
         name=run.folder.absolute().name,
         source=format_uri("drivestudio", path, query),
         background=change.gaussians(background, np.zeros(3)),
-        actors=actors,
+        actors=tuple(actors),
         sky=sky,
         frames=frames,
         labels=DriveStudioLabels(run),
@@ -494,7 +475,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             *about_sky,
             *corrections.problems,
             *about_frames,
-            *(about_renderer if run.is_set("trainer.render.antialiased") else ()),
+            *about_renderer,
         ),
         made_by={
             "method": "drivestudio",
@@ -516,9 +497,9 @@ def drivestudio_labels(path: str, query: dict[str, str]) -> DriveStudioLabels:
 
 def _actors(
     models: Mapping[str, Any], run: Run, step: int, where: str
-) -> tuple[tuple[Actor, ...], tuple[str, ...]]:
+) -> tuple[list[Actor], list[str]]:
     if RIGID not in models:
-        return (), ()
+        return [], []
     content, where = section(models, RIGID, where), f"{where} {RIGID}"
     gaussians, problems = read_gaussians(
         content, step=step, sh_interval=run.sh_interval(RIGID), where=where
@@ -542,4 +523,4 @@ def _actors(
             f"box is known to be theirs: {', '.join(unknown)}",
         )
     actors, about = make_actors(gaussians, owners, poses, identities, run, where)
-    return actors, problems + about
+    return actors, [*problems, *about]

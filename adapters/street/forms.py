@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,130 +98,123 @@ class Material(IntEnum):
     SHOP = 15  # a shop's pane: as GLASS, with goods behind it
 
 
-def albedo(
-    material: np.ndarray,
-    rgb: np.ndarray,
-    variation: np.ndarray,
-    local: np.ndarray,
-    points: np.ndarray,
-) -> np.ndarray:
-    """Linear albedo [N, 3] at points [N, 3] of the body's frame with local coordinates [N, 3]."""
-    out = rgb.copy()
+class Spots(NamedTuple):
+    """N places on surfaces of one material. rgb [N, 3]: the shapes' own. variation [N], local
+    [N, 3], points [N, 3]: body frame."""
+
+    rgb: np.ndarray
+    variation: np.ndarray
+    local: np.ndarray
+    points: np.ndarray
+
+    @property
+    def wall(self) -> np.ndarray:
+        """Along the wall and up: walls follow x or y, so that the sum is one of them, shifted."""
+        return np.stack([self.points[:, 0] + self.points[:, 1], self.points[:, 2]], 1)
+
+
+def albedo(shapes: Shapes, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Linear albedo [N, 3] on shapes [N] at local coordinates [N, 3]."""
+    material, points = shapes.material[shape], shapes.points(shape, local)
+    out = shapes.rgb[shape]
     for value in np.unique(material):
-        rule = _RULES.get(Material(int(value)))
-        if rule is not None:
+        if rule := _RULES.get(Material(int(value))):
             here = np.flatnonzero(material == value)
-            out[here] = rule(out[here], variation[here], local[here], points[here])
+            variation = shapes.variation[shape[here]]
+            out[here] = rule(Spots(out[here], variation, local[here], points[here]))
     return np.clip(out, 0.0, 1.0)
 
 
-_Rule = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
-def _asphalt(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    flat = points[:, :2]
+def _asphalt(at: Spots) -> np.ndarray:
+    flat = at.points[:, :2]
     tracks = value_noise(flat * [0.05, 1.1], 3)  # the long streaks that wheels leave
     grain = 0.09 * fractal_noise(flat * 1.6, 2, 1) + 0.05 * value_noise(flat * 0.3, 2)
-    return rgb * (1 + grain + 0.03 * tracks)[:, None]
+    return at.rgb * (1 + grain + 0.03 * tracks)[:, None]
 
 
-def _marking(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    worn = np.clip(fractal_noise(points[:, :2] * 2.5, 2, 11) - 0.1, 0, 1)
-    return rgb * (1 - 0.5 * worn)[:, None]
+def _marking(at: Spots) -> np.ndarray:
+    worn = np.clip(fractal_noise(at.points[:, :2] * 2.5, 2, 11) - 0.1, 0, 1)
+    return at.rgb * (1 - 0.5 * worn)[:, None]
 
 
-def _paving(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    slab = np.floor(points[:, :2] / 0.6)
+def _paving(at: Spots) -> np.ndarray:
+    slab = np.floor(at.points[:, :2] / 0.6)
     tone = 0.10 * (hashed(slab.astype(np.int32), 5) - 0.5)
-    return rgb * (1 + tone + 0.05 * value_noise(points[:, :2] * 0.9, 6))[:, None]
+    return at.rgb * (1 + tone + 0.05 * value_noise(at.points[:, :2] * 0.9, 6))[:, None]
 
 
-def _wall_plane(points: np.ndarray) -> np.ndarray:
-    """Along-the-wall and up: walls follow x or y, so that the sum is one of them, shifted."""
-    return np.stack([points[:, 0] + points[:, 1], points[:, 2]], 1)
+def _plaster(at: Spots) -> np.ndarray:
+    patches = 0.05 * fractal_noise(at.wall * 0.7, 2, 21)
+    streaks = 0.04 * value_noise(at.wall * [2.2, 0.25], 22)
+    dirt = 0.18 * np.exp(-np.maximum(at.points[:, 2], 0) / 0.5)
+    return at.rgb * (1 + patches + streaks - dirt)[:, None]
 
 
-def _plaster(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    wall = _wall_plane(points)
-    patches = 0.05 * fractal_noise(wall * 0.7, 2, 21)
-    streaks = 0.04 * value_noise(wall * [2.2, 0.25], 22)
-    dirt = 0.18 * np.exp(-np.maximum(points[:, 2], 0) / 0.5)
-    return rgb * (1 + patches + streaks - dirt)[:, None]
-
-
-def _courses(size_m: tuple[float, float], spread: float, seed: int) -> _Rule:
+def _courses(at: Spots, size_m: tuple[float, float], spread: float, seed: int) -> np.ndarray:
     """Blocks in running bond, each with its own tone."""
-
-    def rule(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-        wall = _wall_plane(points)
-        row = np.floor(wall[:, 1] / size_m[1])
-        column = np.floor(wall[:, 0] / size_m[0] + 0.5 * (row % 2))
-        tone = spread * (hashed(np.stack([column, row], 1).astype(np.int32), seed) - 0.5)
-        return rgb * (1 + tone + 0.05 * value_noise(wall * 0.8, seed + 1))[:, None]
-
-    return rule
+    wall = at.wall
+    row = np.floor(wall[:, 1] / size_m[1])
+    column = np.floor(wall[:, 0] / size_m[0] + 0.5 * (row % 2))
+    tone = spread * (hashed(np.stack([column, row], 1).astype(np.int32), seed) - 0.5)
+    return at.rgb * (1 + tone + 0.05 * value_noise(wall * 0.8, seed + 1))[:, None]
 
 
-def _grass(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    grain = 0.22 * fractal_noise(points[:, :2] * 0.5, 3, 61)
-    dry = 0.5 + 0.5 * fractal_noise(points[:, :2] * 0.08, 2, 62)
-    return rgb * (1 + grain[:, None]) * (1 + dry[:, None] * np.array([0.25, 0.08, 0.0]))
+def _grass(at: Spots) -> np.ndarray:
+    grain = 0.22 * fractal_noise(at.points[:, :2] * 0.5, 3, 61)
+    dry = 0.5 + 0.5 * fractal_noise(at.points[:, :2] * 0.08, 2, 62)
+    return at.rgb * (1 + grain[:, None]) * (1 + dry[:, None] * np.array([0.25, 0.08, 0.0]))
 
 
-def _leaves(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    warm = variation[:, None] - 0.5
-    tint = 1 + warm * np.array([0.5, 0.3, 0.1])
-    return rgb * tint * (1 + 0.35 * value_noise(points * 7.0, 71))[:, None]
+def _leaves(at: Spots) -> np.ndarray:
+    tint = 1 + (at.variation[:, None] - 0.5) * np.array([0.5, 0.3, 0.1])
+    return at.rgb * tint * (1 + 0.35 * value_noise(at.points * 7.0, 71))[:, None]
 
 
-def _leaf(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    tone = 0.75 + 0.5 * ((variation * 13.7) % 1.0)
-    return rgb * tone[:, None] * (1 + (variation[:, None] - 0.5) * np.array([0.6, 0.25, 0.1]))
+def _leaf(at: Spots) -> np.ndarray:
+    tone = 0.75 + 0.5 * ((at.variation * 13.7) % 1.0)
+    tint = 1 + (at.variation[:, None] - 0.5) * np.array([0.6, 0.25, 0.1])
+    return at.rgb * tone[:, None] * tint
 
 
-def _bark(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    return rgb * (1 + 0.3 * value_noise(points * [9.0, 9.0, 2.0], 81))[:, None]
-
-
-def _glass(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+def _glass(at: Spots) -> np.ndarray:
     """What stands behind a pane: mostly a dark room, in some windows a curtain."""
-    curtain = variation > 0.62
-    drawn = np.where(curtain, 0.25 + 0.45 * ((variation * 7.31) % 1.0), 0.0)
+    drawn = np.where(at.variation > 0.62, 0.25 + 0.45 * ((at.variation * 7.31) % 1.0), 0.0)
     cloth = drawn[:, None] * np.array([0.62, 0.58, 0.52])
-    return rgb + cloth * (0.35 + 0.65 * np.clip(local[:, 1:2], 0, 1))
+    return at.rgb + cloth * (0.35 + 0.65 * np.clip(at.local[:, 1:2], 0, 1))
 
 
-def _shop(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+def _shop(at: Spots) -> np.ndarray:
     """Goods on shelves: blocks of colour in a dim room, fewer towards the top."""
-    wall = _wall_plane(points)
-    cell = np.floor(wall / [0.45, 0.62]).astype(np.int32)
-    shown = hashed(cell, 91) < 0.75 - 0.65 * np.clip(local[:, 1], 0, 1)
+    cell = np.floor(at.wall / [0.45, 0.62]).astype(np.int32)
+    shown = hashed(cell, 91) < 0.75 - 0.65 * np.clip(at.local[:, 1], 0, 1)
     hue = np.stack([hashed(cell, 92 + k) for k in range(3)], 1)
     goods = 0.05 + 0.22 * hue * np.array([1.0, 0.85, 0.7])
-    lamp = 0.05 * np.clip(local[:, 1:2] - 0.7, 0, 1) * np.array([1.0, 0.85, 0.6])
-    return rgb + np.where(shown[:, None], goods, 0.0) + lamp
+    lamp = 0.05 * np.clip(at.local[:, 1:2] - 0.7, 0, 1) * np.array([1.0, 0.85, 0.6])
+    return at.rgb + np.where(shown[:, None], goods, 0.0) + lamp
 
 
-def _rim(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+def _rim(at: Spots) -> np.ndarray:
     """Five soft spokes and a hub."""
-    radius = np.hypot(local[:, 0], local[:, 1])
-    spokes = 0.5 + 0.5 * np.cos(5 * np.arctan2(local[:, 1], local[:, 0]))
+    radius = np.hypot(at.local[:, 0], at.local[:, 1])
+    spokes = 0.5 + 0.5 * np.cos(5 * np.arctan2(at.local[:, 1], at.local[:, 0]))
     bright = np.where(radius < 0.25, 1.0, 0.25 + 0.75 * spokes)
-    return rgb * np.where(radius > 0.88, 1.0, bright)[:, None]
+    return at.rgb * np.where(radius > 0.88, 1.0, bright)[:, None]
 
 
-_RULES: dict[Material, _Rule] = {
+_RULES: dict[Material, Callable[[Spots], np.ndarray]] = {
     Material.ASPHALT: _asphalt,
     Material.MARKING: _marking,
     Material.PAVING: _paving,
     Material.PLASTER: _plaster,
-    Material.BRICK: _courses((0.5, 0.16), 0.30, 31),
-    Material.STONE: _courses((0.8, 0.4), 0.16, 41),
-    Material.TILES: _courses((0.4, 0.25), 0.24, 51),
+    Material.BRICK: lambda at: _courses(at, (0.5, 0.16), 0.30, 31),
+    Material.STONE: lambda at: _courses(at, (0.8, 0.4), 0.16, 41),
+    Material.TILES: lambda at: _courses(at, (0.4, 0.25), 0.24, 51),
     Material.GRASS: _grass,
     Material.LEAVES: _leaves,
     Material.LEAF: _leaf,
-    Material.BARK: _bark,
+    Material.BARK: lambda at: (
+        at.rgb * (1 + 0.3 * value_noise(at.points * [9.0, 9.0, 2.0], 81))[:, None]
+    ),
     Material.GLASS: _glass,
     Material.SHOP: _shop,
     Material.RIM: _rim,
@@ -446,19 +440,17 @@ def _edge_bits(
 # ---- Builders ------------------------------------------------------------------------------------
 
 
-def _rows(values: Sequence[float] | np.ndarray) -> np.ndarray:
+Vectors = Sequence[float] | np.ndarray  # [3] or [P, 3]
+
+
+def _rows(values: Vectors) -> np.ndarray:
     return np.atleast_2d(np.asarray(values, np.float64))
 
 
 def parallelograms(
-    origin: Sequence[float] | np.ndarray,
-    u: Sequence[float] | np.ndarray,
-    v: Sequence[float] | np.ndarray,
-    look: Look,
-    *,
-    edges: np.ndarray | int = ALL_EDGES,
+    origin: Vectors, u: Vectors, v: Vectors, look: Look, *, edges: np.ndarray | int = ALL_EDGES
 ) -> Shapes:
-    """Flat panels with corner `origin` and sides u, v ([3] or [P, 3]); they face u x v."""
+    """Flat panels with corner `origin` and sides u, v; they face u x v."""
     origin, u, v = np.broadcast_arrays(_rows(origin), _rows(u), _rows(v))
     normal = np.cross(u, v)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -466,32 +458,27 @@ def parallelograms(
 
 
 def boxes(
-    low: Sequence[float] | np.ndarray,
-    high: Sequence[float] | np.ndarray,
+    low: Vectors,
+    high: Vectors,
     look: Look,
     *,
     faces: Sequence[str] = ("+x", "-x", "+y", "-y", "+z"),
     edges: int = ALL_EDGES,
 ) -> Shapes:
-    """Axis-aligned boxes between corners low and high ([3] or [P, 3]); the named faces only."""
+    """Axis-aligned boxes between corners low and high; the named faces only."""
     low, high = np.broadcast_arrays(_rows(low), _rows(high))
-    corners, us, vs = [], [], []
+    sides = []
     for face in faces:
         axis, outward = "xyz".index(face[1]), face[0] == "+"
-        first, second = ((axis + 1) % 3, (axis + 2) % 3)
-        if not outward:
-            first, second = second, first
-        corner = low.copy()
+        first, second = ((axis + 1) % 3, (axis + 2) % 3)[:: 1 if outward else -1]
+        corner, u, v = low.copy(), np.zeros_like(low), np.zeros_like(low)
         if outward:
             corner[:, axis] = high[:, axis]
-        u, v = np.zeros_like(corner), np.zeros_like(corner)
         u[:, first] = (high - low)[:, first]
         v[:, second] = (high - low)[:, second]
-        corners.append(corner)
-        us.append(u)
-        vs.append(v)
-    sides = (np.concatenate(part) for part in (corners, us, vs))
-    return parallelograms(*sides, look, edges=edges)
+        sides.append((corner, u, v))
+    joined = (np.concatenate(part) for part in zip(*sides, strict=True))
+    return parallelograms(*joined, look, edges=edges)
 
 
 def disc(centre: Sequence[float], normal: Sequence[float], radius_m: float, look: Look) -> Shapes:
@@ -501,17 +488,12 @@ def disc(centre: Sequence[float], normal: Sequence[float], radius_m: float, look
     return make_shapes(Kind.DISC, _rows(centre), axes, look)
 
 
-def tube(
-    start: Sequence[float], end: Sequence[float], radius_m: float, look: Look, *, caps: bool = False
-) -> Shapes:
-    """A round tube between two points, with flat ends if asked."""
+def tube(start: Sequence[float], end: Sequence[float], radius_m: float, look: Look) -> Shapes:
+    """A round tube between two points, open at its ends."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
-    u, v, w = _frame(b - a)
+    u, v, _ = _frame(b - a)
     axes = np.stack([u * radius_m, v * radius_m, (b - a) / 2])[None]
-    side = make_shapes(Kind.CYLINDER, _rows((a + b) / 2), axes, look)
-    if not caps:
-        return side
-    return join([side, disc(b, w, radius_m, look), disc(a, -w, radius_m, look)])
+    return make_shapes(Kind.CYLINDER, _rows((a + b) / 2), axes, look)
 
 
 def ellipsoids(centres: np.ndarray, axes: np.ndarray, look: Look) -> Shapes:
@@ -524,23 +506,19 @@ def ball(centre: Sequence[float], radii: Sequence[float], look: Look) -> Shapes:
     return ellipsoids(_rows(centre), np.diag(np.asarray(radii, np.float64))[None], look)
 
 
-def quads(
-    corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None, edges: int = 0
-) -> Shapes:
+def quads(corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None) -> Shapes:
     """Four-sided panels [P, 4, 3], corners in turn, facing (c1 - c0) x (c3 - c0).
 
-    Parallelograms stay whole; others become two triangles. normals [P, 4, 3]: shading normals at
-    the corners, for panels of a smooth mesh.
+    Parallelograms stay whole; others become two triangles, as do panels of a smooth mesh, whose
+    shading normals at the corners are `normals` [P, 4, 3].
     """
     corners = np.asarray(corners, np.float64)
     slack = np.abs(corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]).max(1)
-    whole = slack < 1e-9
-    if normals is not None:
-        whole[:] = False
+    whole = (slack < 1e-9) & (normals is None)
     parts = []
     if whole.any():
         a, b, _, d = corners[whole].transpose(1, 0, 2)
-        parts.append(parallelograms(a, b - a, d - a, look, edges=edges))
+        parts.append(parallelograms(a, b - a, d - a, look, edges=0))
     if not whole.all():
         c = corners[~whole]
         for (i, j, k), flag in (((0, 1, 3), 0), ((2, 3, 1), OPEN_DIAGONAL)):

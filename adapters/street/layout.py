@@ -5,55 +5,42 @@ Each kind of thing draws from its own stream, so that one more car moves no tree
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from pydantic import BaseModel, ConfigDict, Field
 
+from adapters.camera_files.camera_files import validate
+from adapters.uri import check_query
 from adapters.world import invert_pose
 from augment.cameras import Camera, Frame
-from augment.errors import AdapterError
 from augment.scene import Track
 
-# Smallest and largest value of each parameter; both are allowed.
-LIMITS: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**31 - 1),
-    "frames": (1, 300),
-    "width": (16, 4096),
-    "height": (16, 4096),
-    "speed_mps": (0.0, 20.0),
-    "gaussians": (60_000, 4_000_000),
-    "parked": (0, 40),
-    "moving": (0, 6),
-    "pedestrians": (0, 6),
-    "lidar_columns": (16, 4096),
-    "lidar_rings": (2, 256),
-}
 
+class StreetParameters(BaseModel):
+    """What a URI may ask for, all that decides a street: equal parameters give equal bits."""
 
-@dataclass(frozen=True)
-class StreetParameters:
-    """What a URI may ask for, all that decides a street: equal parameters give equal bits.
+    model_config = ConfigDict(frozen=True)
 
-    seed: layout, colours, sky. frames: at 10 Hz. width, height: of every camera's image, pixels.
-    gaussians: how many to aim for, actors included (met within a few per cent). parked, moving:
-    cars beside and on the road. lidar_columns, lidar_rings: rays per turn and per column.
-    """
-
-    seed: int = 0
-    frames: int = 20
-    width: int = 960
-    height: int = 540
-    speed_mps: float = 8.0
-    gaussians: int = 290_000
-    parked: int = 12
-    moving: int = 3
-    pedestrians: int = 2
-    lidar_columns: int = 1024
-    lidar_rings: int = 64
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="layout, colours, sky")
+    frames: int = Field(20, ge=1, le=300, description="how many, at 10 Hz")
+    width: int = Field(960, ge=16, le=4096, description="of every camera's image, pixels")
+    height: int = Field(540, ge=16, le=4096, description="of every camera's image, pixels")
+    speed_mps: float = Field(8.0, ge=0, le=20, description="of the ego car")
+    gaussians: int = Field(
+        290_000,
+        ge=60_000,
+        le=4_000_000,
+        description="how many to aim for, actors included (met within a few per cent)",
+    )
+    parked: int = Field(12, ge=0, le=40, description="cars beside the road")
+    moving: int = Field(3, ge=0, le=6, description="cars on the road")
+    pedestrians: int = Field(2, ge=0, le=6, description="how many")
+    lidar_columns: int = Field(1024, ge=16, le=4096, description="rays per turn")
+    lidar_rings: int = Field(64, ge=2, le=256, description="rays per column")
 
     @property
     def name(self) -> str:
@@ -67,34 +54,16 @@ class StreetParameters:
     @property
     def uri(self) -> str:
         """Canonical: the seed, then whatever differs from its default, in the order above."""
-        shown = [
-            f"{field.name}={getattr(self, field.name)}"
-            for field in dataclasses.fields(self)
-            if field.name == "seed" or getattr(self, field.name) != field.default
-        ]
+        changed = self.model_dump(exclude_defaults=True) | {"seed": self.seed}
+        shown = [f"{key}={changed[key]}" for key in StreetParameters.model_fields if key in changed]
         return "procedural:street?" + "&".join(shown)
 
 
 def parse_parameters(query: Mapping[str, str]) -> StreetParameters:
     """Parameters of a URI's query."""
-    if unknown := sorted(set(query) - set(LIMITS)):
-        raise AdapterError(
-            f"procedural:street does not know {', '.join(map(repr, unknown))}; "
-            f"it takes {', '.join(LIMITS)}"
-        )
-    return StreetParameters(**{key: _number(key, text) for key, text in query.items()})
-
-
-def _number(key: str, text: str) -> int | float:
-    kind, (low, high) = type(getattr(StreetParameters, key)), LIMITS[key]
-    try:
-        value = kind(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:  # NaN included
-        expected = f"{'a whole number' if kind is int else 'a number'} from {low} to {high}"
-        raise AdapterError(f"procedural:street: {key} must be {expected}; got {text!r}")
-    return value
+    known = {key: str(field.description) for key, field in StreetParameters.model_fields.items()}
+    check_query("procedural:street", query, known)
+    return validate(StreetParameters, dict(query), "procedural:street", "query")
 
 
 FRAME_NS = 100_000_000

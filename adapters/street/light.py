@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.street.forms import Material, Shapes, fractal_noise, value_noise
+from adapters.street.forms import Material, Shapes, albedo, fractal_noise, value_noise
 from adapters.street.raycast import Tree
 from augment.sky import CubemapSky, directions_of_cubemap
 
@@ -65,74 +65,72 @@ class Lighting:
         return start + fraction[:, None] * along
 
 
-def sun_share(
-    shapes: Shapes, tree: Tree, lighting: Lighting, shape: np.ndarray, places: np.ndarray
-) -> np.ndarray:
-    """Share of the sun's disc that is seen from a shape's places, [N].
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Shapes that move together, how rays meet them, and their light, in one frame."""
 
-    shape [N]; places [G, N, 3]: local coordinates, over which the share is averaged (G divides
-    SUN_SAMPLES). Half of the rays are cast first; the others only where those disagree.
-    """
-    groups, count = places.shape[:2]
-    directions = lighting.sun_directions()
-    seen = np.zeros(count)
-    index = np.flatnonzero(_facing_sun(shapes, lighting, shape, places[0]) > 0)
-    for half in range(2):
-        for number in range(half, SUN_SAMPLES, 2):
-            local = places[(number // 2) % groups, index]
-            origins = _off_surface(shapes, lighting, shape[index], local)
-            rays = np.broadcast_to(directions[number], origins.shape)
-            seen[index] += ~tree.occluded(origins, rays)
-        if half == 0:
-            doubtful = (seen[index] > 0) & (seen[index] < SUN_SAMPLES / 2)
-            seen[index[~doubtful]] *= 2
-            index = index[doubtful]
-    return seen / SUN_SAMPLES
+    shapes: Shapes
+    tree: Tree
+    lighting: Lighting
 
+    def colors(self, shape: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Display-encoded colour [N, 3] on shapes [N], averaged over local places [G, N, 3].
 
-def _off_surface(
-    shapes: Shapes, lighting: Lighting, shape: np.ndarray, local: np.ndarray
-) -> np.ndarray:
-    """Where rays to the sun start: just outside; all of a leaf tuft starts at its sunny end."""
-    points = shapes.points(shape, local) + SHADOW_OFFSET_M * shapes.normals(shape, local)
-    leaf = shapes.material[shape] == Material.LEAF
-    size = np.linalg.norm(shapes.axes[shape[leaf]], axis=2).max(1, keepdims=True)
-    points[leaf] = shapes.origin[shape[leaf]] + 1.05 * size * lighting.to_sun
-    return points
+        Albedo and the sun's shadows are averaged; other light is taken at the first place.
+        """
+        shapes, lighting, local = self.shapes, self.lighting, places[0]
+        base = np.zeros((len(shape), 3))
+        for place in places:
+            base += albedo(shapes, shape, place)
+        points, smooth = shapes.points(shape, local), shapes.shading_normals(shape, local)
+        facing = np.maximum(self._facing_sun(shape, local), 0)
+        sun = facing * self._sun_share(shape, places) * lighting.sunlit
+        sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
+        upward = 0.5 + 0.5 * smooth[:, 2]
+        ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
+        radiance = base / len(places) * (sun[:, None] * SUN_RGB + ambient)
+        material = shapes.material[shape]
+        glossy = np.isin(material, (Material.GLASS, Material.SHOP, Material.PAINT))
+        if glossy.any():
+            given = (points, smooth, material, sun, sky)
+            radiance[glossy] += _mirrored(lighting, *(values[glossy] for values in given))
+        # Far things pale towards the horizon, by their distance to the cameras' path.
+        distance = np.linalg.norm(points - lighting.eyes_for(points), axis=1)
+        veil = 1 - np.exp(-np.maximum(distance - 25, 0) / 260)
+        return encode_display(radiance * (1 - veil)[:, None] + veil[:, None] * HAZE_RGB * 0.8)
 
+    def _sun_share(self, shape: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Share of the sun's disc that is seen, [N], averaged over the places (G divides
+        SUN_SAMPLES). Half of the rays are cast first; the others only where those disagree."""
+        directions = self.lighting.sun_directions()
+        seen = np.zeros(len(shape))
+        index = np.flatnonzero(self._facing_sun(shape, places[0]) > 0)
+        for half in range(2):
+            for number in range(half, SUN_SAMPLES, 2):
+                local = places[(number // 2) % len(places), index]
+                origins = self._off_surface(shape[index], local)
+                rays = np.broadcast_to(directions[number], origins.shape)
+                seen[index] += ~self.tree.occluded(origins, rays)
+            if half == 0:
+                doubtful = (seen[index] > 0) & (seen[index] < SUN_SAMPLES / 2)
+                seen[index[~doubtful]] *= 2
+                index = index[doubtful]
+        return seen / SUN_SAMPLES
 
-def _facing_sun(
-    shapes: Shapes, lighting: Lighting, shape: np.ndarray, local: np.ndarray
-) -> np.ndarray:
-    """Cosine of the sun's angle of incidence; light also comes through leaves from behind."""
-    facing = shapes.shading_normals(shape, local) @ lighting.to_sun
-    leaf = shapes.material[shape] == Material.LEAF
-    return np.where(leaf, 0.35 + 0.65 * np.abs(facing), facing)
+    def _off_surface(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Where rays to the sun start: just outside; all of a leaf tuft starts at its sunny end."""
+        shapes = self.shapes
+        points = shapes.points(shape, local) + SHADOW_OFFSET_M * shapes.normals(shape, local)
+        leaf = shapes.material[shape] == Material.LEAF
+        size = np.linalg.norm(shapes.axes[shape[leaf]], axis=2).max(1, keepdims=True)
+        points[leaf] = shapes.origin[shape[leaf]] + 1.05 * size * self.lighting.to_sun
+        return points
 
-
-def shade(
-    shapes: Shapes,
-    lighting: Lighting,
-    shape: np.ndarray,
-    local: np.ndarray,
-    base: np.ndarray,
-    seen_sun: np.ndarray,
-) -> np.ndarray:
-    """Display-encoded colour [N, 3] of places; base [N, 3]: albedo, seen_sun [N]: its share."""
-    points = shapes.points(shape, local)
-    smooth = shapes.shading_normals(shape, local)
-    material = shapes.material[shape]
-    sun = np.maximum(_facing_sun(shapes, lighting, shape, local), 0) * seen_sun * lighting.sunlit
-    sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
-    upward = 0.5 + 0.5 * smooth[:, 2]
-    ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
-    radiance = base * (sun[:, None] * SUN_RGB + ambient)
-    glossy = np.isin(material, (Material.GLASS, Material.SHOP, Material.PAINT))
-    if glossy.any():
-        radiance[glossy] += _mirrored(
-            lighting, points[glossy], smooth[glossy], material[glossy], sun[glossy], sky[glossy]
-        )
-    return encode_display(_haze(radiance, lighting, points))
+    def _facing_sun(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Cosine of the sun's angle of incidence; light also comes through leaves from behind."""
+        facing = self.shapes.shading_normals(shape, local) @ self.lighting.to_sun
+        leaf = self.shapes.material[shape] == Material.LEAF
+        return np.where(leaf, 0.35 + 0.65 * np.abs(facing), facing)
 
 
 def _sky_share(lighting: Lighting, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -166,13 +164,9 @@ def _under_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
 
 
 def _mirrored(
-    lighting: Lighting,
-    points: np.ndarray,
-    normals: np.ndarray,
-    material: np.ndarray,
-    sun: np.ndarray,
-    sky: np.ndarray,
-) -> np.ndarray:
+    lighting: Lighting, points: np.ndarray, normals: np.ndarray, material: np.ndarray,
+    sun: np.ndarray, sky: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Reflected radiance [N, 3]: sky above the roofs, the street below, a glint of the sun."""
     view = points - lighting.eyes_for(points)
     view /= np.linalg.norm(view, axis=1, keepdims=True)
@@ -193,13 +187,6 @@ def _mirrored(
     mirrored *= (0.65 + 0.35 / (1 + np.exp(-reflected[:, 2] / 0.02)))[:, None]  # down: the ground
     glint = np.clip(reflected @ lighting.to_sun, 0, 1) ** 180 * 2.5 * (sun > 0)
     return strength[:, None] * mirrored + (~is_glass * glint * 0.25)[:, None] * SUN_RGB
-
-
-def _haze(radiance: np.ndarray, lighting: Lighting, points: np.ndarray) -> np.ndarray:
-    """Far things pale towards the horizon, by their distance to the cameras' path."""
-    distance = np.linalg.norm(points - lighting.eyes_for(points), axis=1)
-    veil = 1 - np.exp(-np.maximum(distance - 25, 0) / 260)
-    return radiance * (1 - veil)[:, None] + veil[:, None] * HAZE_RGB * 0.8
 
 
 def encode_display(radiance: np.ndarray) -> np.ndarray:
@@ -239,15 +226,14 @@ def _radiance(directions: np.ndarray, seed: int, to_sun: np.ndarray) -> np.ndarr
     cosine = np.clip(directions @ to_sun.astype(np.float32), -1, 1)
     glow = 0.35 * np.clip(cosine, 0, 1) ** 12 + 0.8 * np.clip(cosine, 0, 1) ** 220
     sky = sky + glow[:, None] * np.array([1.0, 0.93, 0.80])
-    sky = _with_clouds(sky, directions, cosine, seed)
+    _add_clouds(sky, directions, cosine, seed)
     disc = np.clip((cosine - np.cos(0.013)) / (1 - np.cos(0.013)) * 4, 0, 1)
     sky = sky + disc[:, None] * 12.0
-    return _with_skyline(sky, directions, seed)
+    _add_skyline(sky, directions, seed)
+    return sky
 
 
-def _with_clouds(
-    sky: np.ndarray, directions: np.ndarray, cosine: np.ndarray, seed: int
-) -> np.ndarray:
+def _add_clouds(sky: np.ndarray, directions: np.ndarray, cosine: np.ndarray, seed: int) -> None:
     up = directions[:, 2]
     high = up > 0.02
     d = directions[high]
@@ -263,24 +249,18 @@ def _with_clouds(
     cloud = lit * (1 - shade) + CLOUD_SHADE_RGB * 1.35 * shade
     far = np.exp(-up[high] / 0.10)[:, None]
     cloud = cloud * (1 - 0.7 * far) + HORIZON_RGB * 0.7 * far
-    out = sky.copy()
-    out[high] = sky[high] + density[:, None] * 0.92 * (cloud - sky[high])
-    return out
+    sky[high] = sky[high] + density[:, None] * 0.92 * (cloud - sky[high])
 
 
-def _with_skyline(sky: np.ndarray, directions: np.ndarray, seed: int) -> np.ndarray:
+def _add_skyline(sky: np.ndarray, directions: np.ndarray, seed: int) -> None:
     """Two hazy ridges of hills and woods just above the horizon."""
     near_horizon = np.flatnonzero(directions[:, 2] < 0.12)
     d = directions[near_horizon]
     azimuth = np.arctan2(d[:, 1], d[:, 0])
     # On a circle, so that the ridge closes at azimuth +-pi.
     circle = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
-    elevation = d[:, 2]
-    out = sky.copy()
     far, near = np.array([0.50, 0.60, 0.72]), HAZE_RGB * 0.62
-    ridges = ((3.0, 0.030, 0.028, far), (9.0, 0.012, 0.014, near))
-    for scale, base, spread, rgb in ridges:
+    for scale, base, spread, rgb in ((3.0, 0.030, 0.028, far), (9.0, 0.012, 0.014, near)):
         crest = base + spread * fractal_noise(circle * scale, 4, seed * 7 + 300 + int(scale))
-        inside = np.clip((crest - elevation) / 0.004 + 0.5, 0, 1)[:, None]
-        out[near_horizon] += inside * (rgb - out[near_horizon])
-    return out
+        inside = np.clip((crest - d[:, 2]) / 0.004 + 0.5, 0, 1)[:, None]
+        sky[near_horizon] += inside * (rgb - sky[near_horizon])

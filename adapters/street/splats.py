@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Material, Shapes, join
-from adapters.street.light import SKY_RGB, SUN_RGB
+from adapters.street.light import SKY_RGB, SUN_RGB, Body
 from adapters.street.raycast import Tree
-from adapters.street.world import Body, MovingBody
+from adapters.street.world import MovingBody
 from adapters.world import join_gaussians
 from augment.geometry import quat_from_rotmat
 from augment.scene import Gaussians

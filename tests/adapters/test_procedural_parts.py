@@ -41,7 +41,7 @@ def _some_shapes(rng: np.random.Generator, copies: int) -> Shapes:
     one = [
         boxes((-0.5, -0.3, 0.0), (0.5, 0.3, 0.8), LOOK),
         disc((0, 0, 1.0), (0.3, 0.2, 1.0), 0.6, LOOK),
-        tube((0.2, 0, 0), (0.5, 0.4, 1.3), 0.15, LOOK, caps=True),
+        tube((0.2, 0, 0), (0.5, 0.4, 1.3), 0.15, LOOK),
         ball((0, 0.5, 0.4), (0.5, 0.2, 0.3), LOOK),
         triangle(np.array([[0, 0, 0], [1, 0, 0.2], [0, 1, 0.4]]), LOOK),
         quads(np.array([[[0, 0, 0], [1, 0, 0], [0.8, 1, 0.3], [0.1, 1, 0.3]]]), LOOK),
