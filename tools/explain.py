@@ -28,8 +28,12 @@ from augment.timing import stopwatch
 from augment.views import render_view
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
+from tools.output import fill
 
-# ---- What is in a scene, for people and for machines ---------------------------------------------
+DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # stages that run the rasteriser
+FRAME = "frame"  # the whole view
+ROUNDS = 3  # of all views; the fastest of each counts
+VIEWS = 3
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
@@ -148,90 +152,13 @@ def _describe_labels(scene: Scene) -> dict[str, Any]:
 
 def scene_text(facts: dict[str, Any]) -> str:
     """The facts of `describe_scene` as a page of text."""
-    background, frames, labels = facts["background"], facts["frames"], facts["labels"]
-    low, high = background["bounds_98_percent_m"]
-    size = " x ".join(f"{b - a:.1f}" for a, b in zip(low, high, strict=True))
-    lines = [
-        f"{facts['name']}  ({facts['source']})",
-        f"  Gaussians   {facts['gaussians']:,} ({facts['gaussian_bytes'] / 2**20:.0f} MiB), "
-        f"background {background['count']:,}, SH degree {background['sh_degree']}",
-        f"  extent      {size} m (middle 98 % of the background)",
-        f"  splats      median scale {background['median_scale_m'] * 100:.1f} cm, "
-        f"median opacity {background['median_opacity']:.2f}",
-        f"  ground      {facts['ground']['sentence']}",
-        f"  scale       {'metres' if facts['has_metric_scale'] else 'unknown unit'}",
-        f"  up          {'+z' if facts['has_known_gravity'] else 'taken as +z, not known'}",
-        f"  sky         {facts['sky']}",
-        f"  frames      {_frames(frames)}",
-    ]
-    if facts["recorded_source"] is not None:
-        lines.insert(1, f"  made from   {facts['recorded_source']}")
-    lines += [f"  made by     {name}: {_short(value)}" for name, value in facts["made_by"].items()]
-    lines += [
-        f"  camera      {c['name']}: {c['width']}x{c['height']} px, "
-        f"{c['horizontal_fov_deg']:.0f} deg wide, {c['images']} images"
-        + _gains(facts["color_maps"].get(c["name"]))
-        + _own_maps(facts["image_color_maps"].get(c["name"], 0))
-        for c in facts["cameras"]
-    ]
-    lines += [
-        f"  actor       {a['track_id']} ({a['label']}): {a['gaussians']:,} Gaussians"
-        + ("" if a["color_terms"] == 1 else f", colours over time in {a['color_terms']} terms")
-        for a in facts["actors"]
-    ]
-    boxes, lidar = labels["boxes"], labels["lidar"]
-    lines.append(
-        "  boxes       "
-        + ("none" if boxes is None else f"{boxes['in_first_frame']} in the first frame")
-    )
-    lines.append(
-        "  LiDAR       "
-        + (
-            "none in the first frame"
-            if lidar is None
-            else f"{lidar['points_in_first_frame']:,} points in the first frame; "
-            f"columns {', '.join(lidar['columns'])}"
-        )
-    )
-    if background["classes"]:
-        known = sorted(background["classes"].items(), key=lambda item: -item[1])
-        lines.append("  classes     " + ", ".join(f"{name} {count:,}" for name, count in known))
-    lines += [f"  problem     {p}" for p in facts["problems"]] or ["  problems    none found"]
-    return "\n".join(lines)
-
-
-def _gains(color_map: list[list[float]] | None) -> str:
-    """How much a camera's colour map changes mid grey, by channel."""
-    if color_map is None:
-        return ""
-    gains = (sum(row[:3]) + row[3] / 0.5 for row in color_map)
-    return f", records mid grey x {' '.join(f'{gain:.2f}' for gain in gains)}"
-
-
-def _own_maps(count: int) -> str:
-    return f", {count} images with a colour map of their own" if count else ""
+    made_by = {name: _short(value) for name, value in facts["made_by"].items()}
+    return fill("inspect.txt", **{**facts, "made_by": made_by})
 
 
 def _short(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 100 else text[:97] + "..."
-
-
-def _frames(frames: dict[str, Any]) -> str:
-    if frames["count"] == 0:
-        return "none: give a camera path"
-    return (
-        f"{frames['count']} ({frames['first']} to {frames['last']}), "
-        f"{frames['duration_s']:.1f} s, ego path {frames['ego_path_m']:.1f} m"
-    )
-
-
-# ---- explain -------------------------------------------------------------------------------------
-
-DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # stages that run the rasteriser
-FRAME = "frame"  # the whole view
-ROUNDS = 3  # of all views; the fastest of each counts
-VIEWS = 3
 
 
 def explain_recipe(
@@ -405,38 +332,14 @@ def _sum(times: Sequence[Mapping[str, float]], *names: str) -> float:
 
 def explanation_text(facts: dict[str, Any]) -> str:
     """The facts of `explain_recipe` as a page of text."""
-    recipe, scene, plan = facts["recipe"], facts["scene"], facts["plan"]
-    images = len(scene["cameras"]) * scene["frames"] * facts["variants"]
-    lines = [
-        f"recipe {recipe['name']}, variant {recipe['variant']} of {facts['variants']}, "
-        f"seed {recipe['seed']}, hash {facts['recipe_hash']}",
-        f"scene  {scene['name']} ({scene['source']}): {len(scene['cameras'])} cameras x "
-        f"{scene['frames']} frames, {images} images in all variants",
-        "",
-        "effects in numbers:",
-    ]
-    effects = {"style": recipe["style"], **recipe["weather"]}
-    effects = {name: numbers for name, numbers in effects.items() if numbers}
-    lines += [
-        f"  {path} = {value}" for name in effects for path, value in _flat(name, effects[name])
-    ] or ["  none: this is the clean render"]
-    lines += _quality_lines(facts)
-    lines += ["", *_pass_lines(plan["steps"], facts["times"]), *_view_lines(facts["views"])]
-    return "\n".join(lines)
-
-
-def _quality_lines(facts: dict[str, Any]) -> list[str]:
-    """What the recipe trades speed for accuracy with, and who says so."""
-    wish, settings = facts["quality"], facts["settings"]
-    title = f"quality {wish}" if wish else "no quality is asked for"
-    if not facts["is_chosen"]:
-        title += ", chosen in view of the scene when a job starts; until then reference"
-    listed = ", ".join(f"{path} {_word(value)}" for path, value in settings.items())
-    return ["", f"{title}:", f"  {listed}"]
-
-
-def _word(value: Any) -> str:
-    return "all" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    effects = {"style": facts["recipe"]["style"], **facts["recipe"]["weather"]}
+    return fill(
+        "explain.txt",
+        **facts,
+        numbers=[item for name, n in effects.items() if n for item in _flat(name, n)],
+        passes=_pass_lines(facts["plan"]["steps"], facts["times"]),
+        absent=[name for name, count in facts["views"].items() if count is None],
+    )
 
 
 def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
@@ -447,16 +350,14 @@ def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> li
     width = max(len(name) for name in (*(step["name"] for step in steps), *others))
     shares = {step["name"]: _share(step["name"], times) for step in steps if step["runs"]}
     column = max((len(text) for text in shares.values()), default=0)
-    lines = ["passes, in order:"]
-    lines += [
+    lines = [
         f"  {'runs ' if step['runs'] else 'skips'}  {step['name']:<{width}}  "
         f"{shares.get(step['name'], ''):>{column}}{'  ' if column else ''}{step['why']}"
         for step in steps
     ]
-    if times:
-        lines += [f"         {name:<{width}}  {_percent(share[name]):>{column}}" for name in others]
-        lines += ["", *_method_lines(times)]
-    return lines
+    return lines + [
+        f"         {name:<{width}}  {_percent(share[name]):>{column}}" for name in others
+    ]
 
 
 def _share(name: str, times: dict[str, Any] | None) -> str:
@@ -474,37 +375,6 @@ def _share(name: str, times: dict[str, Any] | None) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
-
-
-def _method_lines(times: dict[str, Any]) -> list[str]:
-    """How the shares were found."""
-    lines = [
-        f"shares of {times['frame_ms']:.0f} ms a view: {times['views']} views spread over frames "
-        f"and cameras,",
-        f"the fastest of {times['rounds']} runs each after a warm-up, {times['threads']} threads; "
-        f"files are not written",
-    ]
-    if times["folded"]:
-        lines += [
-            "in brackets: runs inside the rasteriser and part of the shares of what is drawn; by",
-            f"the difference to the same views without it; noise, from run to run: "
-            f"{_percent(times['noise'])}",
-        ]
-    lines += [f"once for the scene: {name}, {s:.1f} s" for name, s in times["once_s"].items()]
-    return lines
-
-
-def _view_lines(views: dict[str, Any]) -> list[str]:
-    if not views["count"]:
-        return []
-    lines = [
-        f"  {what} can be in view in {views[what]} of {views['count']}"
-        for what in ("water", "snow", "actors")
-        if views[what] is not None
-    ]
-    if views["actors"] is not None:
-        lines[-1] += f", {views['mean_actors']:.1f} of {views['scene_actors']} on average"
-    return ["", "cameras (the others skip it):", *lines] if lines else []
 
 
 def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:

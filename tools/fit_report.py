@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jinja2 import Environment, PackageLoader
 from tqdm import tqdm
 
 from adapters.uri import parse_uri
@@ -43,6 +42,7 @@ from tools.drawing import (
     write,
     write_rgb,
 )
+from tools.output import fill
 from tools.training import FIT_PANELS, write_curves
 
 if TYPE_CHECKING:
@@ -202,11 +202,8 @@ def _markdown(scene: Scene, report: Mapping[str, Any], pictures: Mapping[str, st
         _, text, factor = _COLUMNS[name]
         return text.format(row[name] * factor, unit=unit) if name in row else "-"
 
-    templates = Environment(
-        loader=PackageLoader("tools"), trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )  # fmt: skip
-    return templates.get_template("fit_report.md").render(
+    text = fill(
+        "fit_report.md",
         scene=scene,
         report=report,
         pictures=pictures,
@@ -215,6 +212,7 @@ def _markdown(scene: Scene, report: Mapping[str, Any], pictures: Mapping[str, st
         rows=[*report["cameras"].items(), ("**all**", total)],
         cell=cell,
     )
+    return text + "\n"
 
 
 def _plain(value: Any) -> Any:

@@ -32,6 +32,17 @@ def print_images(result: Any, took: str) -> None:
         print_note(f"... and {more} more; the manifest has them all")
 
 
+def fill(template: str, **facts: Any) -> str:
+    """The text of one of tools/templates."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("tools")
+    environment = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(template).render(facts).rstrip("\n")
+
+
 def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) -> None:
     """Write facts to a file, if one is named, and by default say so.
 
