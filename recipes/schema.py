@@ -17,7 +17,6 @@ from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from recipes.change import changed, found, is_given, replaced
 from recipes.weather import (
     FILES,
     Closed,
@@ -29,7 +28,11 @@ from recipes.weather import (
     Snow,
     Style,
     Whole,
+    changed,
+    found,
+    is_given,
     one_of,
+    replaced,
 )
 
 # ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------

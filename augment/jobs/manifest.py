@@ -25,8 +25,8 @@ from augment.jobs.atomic import write_atomic
 from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
-from recipes.change import found
 from recipes.schema import Recipe, knobs_of
+from recipes.weather import found
 
 # ---- manifest ------------------------------------------------------------------------------------
 

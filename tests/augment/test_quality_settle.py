@@ -37,11 +37,11 @@ from augment.jobs.store import open_store
 from augment.metrics.image import flip
 from augment.plan import make_plan
 from augment.views import render_view
-from recipes.change import found
 from recipes.errors import RecipeError
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import Recipe, as_reference, free_knobs
+from recipes.weather import found
 
 PLAIN = "output: {depth: none, labels: false, lidar: false}\n"
 

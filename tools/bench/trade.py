@@ -1,23 +1,42 @@
 """Speed for accuracy: what each knob of a recipe costs and saves on a scene, and the tiers.
 
-Settings are timed a few at a time, in turns with the reference and the clean frame, so that what
-the machine does meanwhile falls on all; ratios are taken within each turn. Pictures are compared in
-8 bits by PSNR, SSIM and FLIP. Flicker is what is left in time: let E_t be the picture less the
-reference's, at frame t. E_(t+1) is warped into frame t by the reference's depth, so that the
-drive's motion does not count, and flicker is the root mean square of E_t - warped E_(t+1): 0 for an
-error that sticks to its surface, sqrt(2) times the error's own RMS for one that is drawn anew.
+Settings are timed a few at a time, in turns with the reference and the clean frame; ratios are
+taken within each turn. Pictures are compared in 8 bits by PSNR, SSIM and FLIP. Flicker is what is
+left in time: with E_t the picture less the reference's at frame t, E_(t+1) is warped into frame t
+by the reference's depth, so that the drive's motion does not count, and flicker is the root mean
+square of E_t - warped E_(t+1): 0 for an error that sticks to its surface, sqrt(2) times the error's
+own RMS for one that is drawn anew.
+
+The tiers of `quality` follow by a rule from the figures of docs/trade/*.json:
+
+1. Of each knob the values that save time: those faster than every more accurate one by at least
+   MIN_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
+   reference, over all recipes and scenes in which it changes the picture.
+2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
+   of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes
+   and views (augment.jobs.quality.within_flip).
+
+    python -m tools.bench.trade [TABLE.json=SCENE_URI ...]
+
+renders what step 2 asks for and the tables lack, adds it to them, then the tiers themselves, in
+place of rows of earlier ones, with TABLE_tiers.jpg beside; and makes docs/trade.md's tables anew.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
+import json
 import math
 import statistics
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -26,10 +45,10 @@ from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
 from augment.cameras import Camera
 from augment.effects.flood.water_plane import plane_depth
-from augment.errors import SceneError
+from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
-from augment.jobs.quality import Trial, render_trial
+from augment.jobs.quality import Cost, Settings, Trial, render_trial, useful, within_flip
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import CLOSE_M, flip, ssim
 from augment.plan import make_plan
@@ -37,12 +56,12 @@ from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
 from augment.views import SURFACE_ALPHA, render_buffers
-from recipes.change import changed
 from recipes.load import load_recipe
 from recipes.schema import (
     BY_PATH,
     KNOBS,
     TIERS,
+    Knob,
     Output,
     Quality,
     Recipe,
@@ -53,20 +72,25 @@ from recipes.schema import (
     knobs_of,
     with_settings,
 )
-from recipes.weather import Flood, Snow, Style
-from tools.bench.gpu import gpu_facts, peak_gpu_mib
+from recipes.weather import Flood, Snow, Style, changed
 from tools.bench.harness import (
-    RESET_PEAK,
     Figures,
     Table,
     extra_mib,
     figures,
+    gpu_facts,
     in_turns,
     load_average,
     machine_facts,
+    machine_line,
+    markdown_lines,
+    peak_gpu_mib,
+    replace_marked,
     spread_ms,
+    spread_ratio,
 )
-from tools.bench.scenes import scene_of_recipe
+from tools.bench.scenes import front_name, scene_of_recipe
+from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
 
 WHOLE = "whole"  # stands for a knob where several are set
@@ -120,10 +144,6 @@ class Setting:
     recipe: Recipe
     given: Mapping[str, Value] = field(default_factory=dict)
 
-    @property
-    def name(self) -> str:
-        return f"{self.knob}={self.value}"
-
 
 def trade_recipe(name: str) -> Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
@@ -143,10 +163,8 @@ def trade_recipe(name: str) -> Recipe:
 def settings_of_trade(
     recipe: Recipe, case: TradeCase, wholes: Wholes | None = None
 ) -> list[Setting]:
-    """Reference first, each knob's other values alone, then wholes: by default the tiers and the
-    recipe with its own settings.
-
-    wholes: other wholes instead, by name; then single knobs are left out.
+    """Reference first, each knob's other values alone, then the recipe with its own settings, and
+    the tiers. wholes: in place of all but the reference.
     """
     best = as_reference(recipe)
     chosen = [knob for knob in knobs_of(recipe) if knob.chosen]
@@ -180,7 +198,7 @@ def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
     shared = [name for name in now.cameras if name in after.cameras]
     if not shared:
         raise SceneError(f"{scene.name}: frames {now.index} and {after.index} share no camera")
-    front = min((name for name in shared if "front" in name), key=len, default=shared[0])
+    front = front_name(shared)
     ahead = now.cameras[front].camera_from_world[2, :3]
     away = min(now.cameras, key=lambda n: float(now.cameras[n].camera_from_world[2, :3] @ ahead))
     views = [(now, front), (after, front)] + ([(now, away)] if away != front else [])
@@ -212,8 +230,6 @@ class Stage:
         self.scene_for(recipe)
         if self._backend == CUDA:
             return peak_gpu_mib(lambda: self.render(recipe, camera))[1]
-        if not RESET_PEAK.is_file():
-            return None
         release_scratch()
         return extra_mib(lambda: self.render(recipe, camera))
 
@@ -302,9 +318,10 @@ def depth_figures(
     """
     if any(depth is None for depth in depths) or not any(region.any() for region in where):
         return {"abs_rel": None, "off_5cm": None}
-    images = [np.concatenate([i[r] for i, r in zip(each, where, strict=True)]).astype(np.float64)
-              for each in (depths, right)]  # fmt: skip
-    own, good = images
+    own, good = (
+        np.concatenate([i[r] for i, r in zip(each, where, strict=True)]).astype(np.float64)
+        for each in (depths, right)
+    )
     error, known = np.abs(own - good), own > 0
     shares = (error / good)[known]
     return {
@@ -319,21 +336,19 @@ def flicker(standards: Sequence[Standard], own: Sequence[Trial], best: Sequence[
     """
     if all(np.array_equal(t.picture, b.picture) for t, b in zip(own, best, strict=True)):
         return 0.0
+    errors = [
+        (trial.picture.astype(np.float32) - good.picture) / np.float32(255)
+        for trial, good in zip(own, best, strict=True)
+    ]
     first, second = (
-        DepthView(
-            standard.camera,
-            (trial.picture.astype(np.float32) - good.picture) / np.float32(255),
-            standard.first_m,
-            standard.alpha,
-        )
-        for standard, trial, good in zip(standards, own, best, strict=True)
+        DepthView(standard.camera, error, standard.first_m, standard.alpha)
+        for standard, error in zip(standards, errors, strict=True)
     )
     warped, counts = warp_view(first, second)
     if not counts.any():
         return math.nan
-    return math.sqrt(
-        float(((first.picture[counts].astype(np.float64) - warped[counts]) ** 2).mean())
-    )
+    change = first.picture[counts].astype(np.float64) - warped[counts]
+    return math.sqrt(float((change**2).mean()))
 
 
 def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
@@ -363,7 +378,6 @@ def bench_trade(
     recipes: Sequence[str] = RECIPES,
     case: TradeCase = WHOLE_CASE,
     *,
-    progress: bool = True,
     wholes: Wholes | None = None,
     backend: str = CPU,
 ) -> Trade:
@@ -384,12 +398,11 @@ def bench_trade(
     warm_up(drawn)
     true_m = true_depths(scene_uri, cameras)
     entries, pictures = [], {}
-    for recipe in tqdm(drawn, unit="recipe", disable=not progress):
+    for recipe in tqdm(drawn, unit="recipe"):
         stage = Stage(scene, backend)
-        rows, shown = measure_recipe(stage, cameras, recipe, case, wholes, true_m)
+        rows, pictures[recipe.name] = measure_recipe(stage, cameras, recipe, case, wholes, true_m)
         rows = [{name: _rounded(value) for name, value in row.items()} for row in rows]
         entries.append({"recipe": recipe.name, "rows": rows})
-        pictures[recipe.name] = shown
     found = {
         "scene": scene.name,
         "gaussians": len(scene.background.means),
@@ -418,10 +431,9 @@ def measure_recipe(
     """Rows, reference first, and the first view's pictures of the wholes, by name. true_m: the
     scene's exact depth by view; not used with snow, whose surface is another.
     """
-    settings = settings_of_trade(recipe, case, wholes)
-    best, others = settings[0], settings[1:]
-    bare = recipe.model_copy(update={"weather": Weather(), "style": None})
-    clean = Setting(CLEAN, CLEAN, as_reference(bare))
+    best, *others = settings_of_trade(recipe, case, wholes)
+    plain = recipe.model_copy(update={"weather": Weather(), "style": None})
+    clean = Setting(CLEAN, CLEAN, as_reference(plain))
     known = None if recipe.weather.snow is not None else true_m
     standards = [
         standard_of(stage.scene_for(best.recipe), camera, best.recipe, true)
@@ -431,46 +443,46 @@ def measure_recipe(
     pictures: dict[str, np.ndarray] = {}
     for start in range(0, max(len(others), 1), AT_A_TIME):
         group = others[start : start + AT_A_TIME]
-        trials, seconds = time_group(stage, cameras, [clean, best, *group], case.repeats)
-        for setting in [*([] if rows else [best]), *group]:
+        timed = time_group(stage, cameras, [clean, best, *group], case.repeats)
+        (_, clean_s), (best_trials, best_s), *_ = timed
+        shown = [best, *group] if not rows else group
+        for setting, (trials, seconds) in zip(shown, timed[-len(shown) :], strict=True):
             row: Row = {"knob": setting.knob, "value": setting.value}
             if setting.knob == WHOLE and setting.given:
                 row["settings"] = dict(setting.given)
-            own, ms = seconds[setting.name], spread_ms(seconds[setting.name])
+            ms = spread_ms(seconds)
             row |= {"ms": ms["median"], "ms_min": ms["min"], "ms_p90": ms["p90"]}
-            for name, beside in (("over_reference", best), ("over_clean", clean)):
-                pairs = zip(own, seconds[beside.name], strict=True)
-                row[name] = statistics.median(a / b for a, b in pairs)
-            row |= _errors(setting, trials[setting.name], trials[best.name], standards)
+            row["over_reference"] = spread_ratio(seconds, best_s)["median"]
+            row["over_clean"] = spread_ratio(seconds, clean_s)["median"]
+            row |= _errors(setting, trials, best_trials, standards)
             if case.memory:
                 row["mib"] = stage.frame_mib(setting.recipe, cameras[0])
             rows.append(row)
             if setting.knob == WHOLE:
-                pictures[str(setting.value)] = trials[setting.name][0].picture
+                pictures[str(setting.value)] = trials[0].picture
     if wholes is None:
-        rows += jpeg_rows([trial.picture for trial in trials[best.name]])
+        rows += jpeg_rows([trial.picture for trial in best_trials])
     return rows, pictures
 
 
 def time_group(
     stage: Stage, cameras: Sequence[Camera], settings: Sequence[Setting], repeats: int
-) -> tuple[dict[str, list[Trial]], dict[str, list[float]]]:
-    """By the settings' names: pictures by view, and seconds. Frames take turns, on one view after
-    the other; the first of each, which loads and lays what it needs, gives the picture and is not
+) -> list[tuple[list[Trial], list[float]]]:
+    """Of each setting the pictures by view, and seconds. Frames take turns, on one view after the
+    other; the first of each, which loads and lays what it needs, gives the picture and is not
     timed.
     """
-    by_name = {setting.name: setting.recipe for setting in settings}
-    trials: dict[str, list[Trial]] = {name: [] for name in by_name}
-    seconds: dict[str, list[float]] = {name: [] for name in by_name}
+    found: dict[int, tuple[list[Trial], list[float]]] = {n: ([], []) for n in range(len(settings))}
     for camera in cameras:
         for repeat in range(repeats + 1):
-            for name in in_turns(by_name, repeat):
-                trial = stage.render(by_name[name], camera)
+            for number in in_turns(found, repeat):
+                trial = stage.render(settings[number].recipe, camera)
+                trials, seconds = found[number]
                 if repeat:
-                    seconds[name].append(trial.seconds)
+                    seconds.append(trial.seconds)
                 else:
-                    trials[name].append(trial)
-    return trials, seconds
+                    trials.append(trial)
+    return [*found.values()]
 
 
 def _errors(
@@ -524,9 +536,6 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
-# ---- tables -------------------------------------------------------------------------------------
-
-
 def table_of(trade: Mapping[str, Any]) -> list[Row]:
     """One row for every recipe, knob and value: {scene, recipe, knob, value, ms, flip, ...}."""
     return [
@@ -536,8 +545,10 @@ def table_of(trade: Mapping[str, Any]) -> list[Row]:
     ]
 
 
-def trade_tables(trade: Mapping[str, Any]) -> list[Table]:
-    """For people: of every recipe the settings, wholes first, and the files."""
+def printable(trade: Mapping[str, Any]) -> Figures:
+    """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
+    first, and the files.
+    """
     order = {path: number for number, path in enumerate([WHOLE, *(knob.path for knob in KNOBS)])}
     tables = []
     for entry in trade["recipes"]:
@@ -548,12 +559,7 @@ def trade_tables(trade: Mapping[str, Any]) -> list[Table]:
         ):
             cells = [[_cell(key, row.get(key)) for key in columns.values()] for row in shown]
             tables += [Table(title, tuple(columns), cells)] if cells else []
-    return tables
-
-
-def printable(trade: Mapping[str, Any]) -> Figures:
-    """The tables in the one form that all subjects are printed in."""
-    shown = figures("trade", trade_tables(trade), machine=trade["machine"], gpu=trade["gpu"])
+    shown = figures("trade", tables, machine=trade["machine"], gpu=trade["gpu"])
     return {**shown, "load_after": trade["load_after"]}
 
 
@@ -561,11 +567,196 @@ def _cell(key: str, value: Any) -> Any:
     if key == "knob":
         return value.removeprefix("weather.")
     if key == "value":
-        return "all" if value is None else str(value)
+        return _text(value)
     return 100 * value if key in ("off_5cm", "abs_rel") and value is not None else value
 
 
-def views_line(trade: Mapping[str, Any]) -> str:
+def _text(value: Value) -> str:
+    return "all" if value is None else str(value)
+
+
+# ---- the rule of the tiers ----------------------------------------------------------------------
+
+# What a viewer takes for the same picture: on every published scene under every recipe it is below
+# the FLIP of a JPEG at quality 92, which is what people who look at pictures take for lossless.
+INVISIBLE_FLIP, INVISIBLE_QUALITY = 0.02, 92
+# What differs plainly and shows the same: reconstructions differ as much from the recordings that
+# they are made of (docs/reconstruction.md: 0.05 to 0.11 on held-out views).
+DRAFT_FLIP = 0.10
+BOUNDS = {"draft": DRAFT_FLIP, "balanced": INVISIBLE_FLIP}
+Tables = Sequence[Mapping[str, Any]]
+
+
+class Unmeasured(Exception):
+    """Settings that the rule has to know the error of, and no row has."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(f"not measured together: {settings}")
+        self.settings = settings
+
+
+def tiers_from(tables: Tables) -> dict[str, dict[str, Value]]:
+    """What each tier sets, by the knobs' paths; knobs at reference are left out.
+
+    Raises:
+        Unmeasured: the tables lack settings that have to be rendered together.
+    """
+    return {name: tier_from(tables, bound) for name, bound in BOUNDS.items()}
+
+
+def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
+    """The rule for one bound.
+
+    Raises:
+        Unmeasured: see tiers_from.
+    """
+    rows = _all_rows(tables)
+    costs = {knob.path: knob_costs(rows, knob) for knob in KNOBS if knob.chosen}
+    # From the fastest to reference, as within_flip takes them.
+    ladders = {path: useful(each)[::-1] for path, each in costs.items()}
+    flips = {path: {cost.value: cost.flip for cost in each} for path, each in costs.items()}
+
+    def least_ms(path: str) -> float:
+        """Of the values that are within the bound alone."""
+        return min(cost.ms for cost in ladders[path] if cost.flip <= bound)
+
+    chosen = within_flip(
+        {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=least_ms)},
+        bound,
+        lambda path, value: flips[path][value],
+        lambda settings: whole_flip(rows, settings) > bound,
+    )
+    return {path: value for path, value in chosen.items() if value != BY_PATH[path].reference}
+
+
+def knob_costs(rows: Sequence[Row], knob: Knob) -> list[Cost]:
+    """Of its values, fast to accurate. ms: here per cent of the reference's time. flip: the worst.
+
+    Values that no table has, and those that change no picture, are left out: of the latter a time
+    would be noise.
+    """
+    costs = []
+    for value in knob.values[:-1]:
+        own = [row for row in _of_value(rows, knob, value) if row["worst_flip"] > 0]
+        if own:
+            worst = max(row["worst_flip"] for row in own)
+            costs.append(Cost(value, 100 * _mean_ratio(own), worst))
+    return [*costs, Cost(knob.reference, 100.0, 0.0)]
+
+
+def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
+    """The worst of the rows of these settings together.
+
+    Raises:
+        Unmeasured: a recipe has none.
+    """
+    worst = 0.0
+    for recipe in sorted({(row["scene"], row["recipe"]) for row in rows}):
+        own = [row for row in rows if (row["scene"], row["recipe"]) == recipe]
+        found = [row["worst_flip"] for row in own if _is_of(row, settings)]
+        found += _alone(own, settings)
+        if not found:
+            raise Unmeasured(settings)
+        worst = max(worst, *found)
+    return worst
+
+
+def _alone(rows: Sequence[Row], settings: Settings) -> list[float]:
+    """The error of settings of which one, or none, differs from reference for a recipe."""
+    knobs = {row["knob"] for row in rows}
+    moved = {p: v for p, v in settings.items() if p in knobs and v != BY_PATH[p].reference}
+    if not moved:
+        return [0.0]
+    if len(moved) > 1:
+        return []
+    return [row["worst_flip"] for row in rows if (row["knob"], row["value"]) in moved.items()]
+
+
+def _is_of(row: Row, settings: Settings) -> bool:
+    given = row.get("settings")
+    return (
+        row["knob"] == WHOLE
+        and given is not None
+        and all(settings.get(path, value) == value for path, value in given.items())
+    )
+
+
+def _all_rows(tables: Tables) -> list[Row]:
+    return [row for table in tables for row in table_of(table)]
+
+
+def _of_value(rows: Sequence[Row], knob: Knob, value: Value) -> list[Row]:
+    return [row for row in rows if (row["knob"], row["value"]) == (knob.path, value)]
+
+
+def _mean_ratio(rows: Sequence[Row]) -> float:
+    return math.exp(sum(math.log(row["over_reference"]) for row in rows) / len(rows))
+
+
+def settle(
+    tables: Sequence[dict[str, Any]], uris: Sequence[str], case: TradeCase
+) -> dict[str, dict[str, Value]]:
+    """The tiers; what the rule has to know and the tables lack is rendered and added to them."""
+    while True:
+        try:
+            return tiers_from(tables)
+        except Unmeasured as missing:
+            for table, uri in zip(tables, uris, strict=True):
+                rows = table_of(table)
+                tried = {r["value"] for r in rows if str(r["value"]).startswith("candidate")}
+                measure_wholes(table, uri, {f"candidate {len(tried) + 1}": missing.settings}, case)
+
+
+def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeCase) -> Trade:
+    """Render settings on the table's scene and put their rows in place of those of their names."""
+    names = [entry["recipe"] for entry in table["recipes"]]
+    trade = bench_trade(uri, names, case, wholes=wholes)
+    for entry, new in zip(table["recipes"], trade.figures["recipes"], strict=True):
+        kept = [row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in wholes]
+        entry["rows"] = kept + [row for row in new["rows"] if row["value"] in wholes]
+    return trade
+
+
+def invisible_evidence(tables: Tables) -> list[float]:
+    """Mean FLIP of JPEGs of INVISIBLE_QUALITY against PNG, by scene and recipe."""
+    rows = _of_value(_all_rows(tables), BY_PATH[JPEG], INVISIBLE_QUALITY)
+    return [row["flip"] for row in rows]
+
+
+# ---- docs/trade.md ------------------------------------------------------------------------------
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = DOCS / "trade.md"
+SCENES = {"street": "street", "pandaset": "PandaSet 002"}
+START = "<!-- {name}: made by python -m tools.bench.trade -->"
+END = "<!-- end of {name} -->"
+
+
+def read_tables() -> list[dict[str, Any]]:
+    """The kept figures of SCENES, under the names that people know them by."""
+    files = {title: DOCS / "trade" / f"{name}.json" for name, title in SCENES.items()}
+    return [{**json.loads(path.read_text()), "scene": title} for title, path in files.items()]
+
+
+def document(text: str, tables: Tables) -> str:
+    """The document with its tables made anew.
+
+    Raises:
+        ValueError: it lacks a marker.
+    """
+    sections = {
+        "machine": [f"- {machine_line(t)}; {_views_line(t)}." for t in tables],
+        "tiers": _tier_lines(),
+        "wholes": _whole_lines(tables),
+        "knobs": _knob_lines(tables),
+    }
+    for name, lines in sections.items():
+        start, end = START.format(name=name), END.format(name=name)
+        text = replace_marked(text, start, end, "\n".join(lines))
+    return text
+
+
+def _views_line(trade: Mapping[str, Any]) -> str:
     views = [
         f"{v['camera']} of frame {v['frame']} ({v['width']}x{v['height']})" for v in trade["views"]
     ]
@@ -573,3 +764,153 @@ def views_line(trade: Mapping[str, Any]) -> str:
         f"{trade['scene']}, {trade['gaussians']:,} Gaussians; {', '.join(views)}; "
         f"{trade['repeats']} timed frames of each view and setting"
     )
+
+
+def _tier_lines() -> list[str]:
+    rows = []
+    for knob in (knob for knob in KNOBS if knob.chosen):
+        values = [TIERS[name].get(knob.path, knob.reference) for name in BOUNDS]
+        rows.append([f"`{knob.path}`", knob.what, *map(_text, [*values, knob.reference])])
+    return _lines(["knob", "what it is", *BOUNDS, REFERENCE], rows)
+
+
+def _whole_lines(tables: Tables) -> list[str]:
+    """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
+    settings, rows = (DEFAULTS, *BOUNDS), []
+    for table in tables:
+        found = {(r["recipe"], r["value"]): r for r in table_of(table) if r["knob"] == WHOLE}
+        for recipe in dict.fromkeys(recipe for recipe, _ in found):
+            of = [found[recipe, name] for name in settings]
+            cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in of]
+            ms = f"{found[recipe, REFERENCE]['ms']:.0f}"
+            rows.append([table["scene"], recipe, ms, *cells])
+    header = ["scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in settings)]
+    return _lines(header, rows)
+
+
+def _knob_lines(tables: Tables) -> list[str]:
+    """Over all recipes that a knob has an effect on: mean ratio of times and the worst errors."""
+    each, rows = ("x reference", "worst FLIP", "depth off"), []
+    for knob in (knob for knob in KNOBS if knob.path != JPEG):
+        for value in knob.values if knob.path == DEPTH else knob.values[:-1]:
+            of = [_of_value(table_of(table), knob, value) for table in tables]
+            cells = [cell for own in of for cell in _knob_cells(own)]
+            rows.append([f"`{knob.path}`", _text(value), *cells])
+    return _lines(
+        ["knob", "value", *(f"{t['scene']}: {name}" for t in tables for name in each)], rows
+    )
+
+
+def _knob_cells(rows: Sequence[Row]) -> list[str]:
+    if not rows:
+        return ["-", "-", "-"]
+    ratios = [row["over_reference"] for row in rows]
+    off = max((row["off_5cm"] for row in rows if row["off_5cm"] is not None), default=None)
+    return [
+        f"{_mean_ratio(rows):.2f} ({min(ratios):.2f}-{max(ratios):.2f})",
+        f"{max(row['worst_flip'] for row in rows):.3f}",
+        "-" if off is None else f"{100 * off:.2f} %",
+    ]
+
+
+def _lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Of a Markdown table; all columns but the first two to the right."""
+    return markdown_lines(header, ["---", "---", *["---:"] * (len(header) - 2)], rows)
+
+
+# ---- pictures -----------------------------------------------------------------------------------
+
+CROP_PX, CROP_AT = 300, (0.5, 0.56)  # height, and middle within the picture, of what is shown
+
+
+def check_matplotlib() -> None:
+    """Raises ClimateGSError where it is not installed, which takes no minutes to find out."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ClimateGSError("the trade's chart needs matplotlib: pip install 'climategs[plots]'")
+
+
+def draw_trade(folder: Path, trade: Trade) -> list[Path]:
+    """trade_<scene>.png, FLIP against time by recipe, and trade_<scene>_tiers.jpg."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = "".join(c if c.isalnum() else "_" for c in trade.figures["scene"])
+    chart, tiers = folder / f"trade_{name}.png", folder / f"trade_{name}_tiers.jpg"
+    draw_chart(chart, trade.figures)
+    draw_tiers(tiers, trade)
+    return [chart, tiers]
+
+
+def draw_chart(path: Path, figures: Mapping[str, Any]) -> None:
+    """A panel for each recipe: a line a knob, from its values to the reference; settings as a
+    whole.
+    """
+    from matplotlib.figure import Figure
+
+    recipes = figures["recipes"]
+    lines = -(-len(recipes) // 2)
+    figure = Figure(figsize=(13, 4.6 * lines), layout="constrained")
+    for number, entry in enumerate(recipes, 1):
+        axes = figure.add_subplot(lines, min(2, len(recipes)), number, title=entry["recipe"])
+        points: dict[str, list[tuple[float, float]]] = {}
+        for row in entry["rows"]:
+            if row["knob"] not in (DEPTH, JPEG) and not str(row["value"]).startswith("candidate"):
+                is_whole = row["knob"] == WHOLE
+                name = row["value"] if is_whole else row["knob"].removeprefix("weather.")
+                own = points.setdefault(name, [] if is_whole else [(1.0, 0.0)])
+                own.insert(-1, (row["over_reference"], row["flip"]))
+        for name, own in points.items():
+            axes.plot(*zip(*own, strict=True), marker="D" if len(own) == 1 else ".", label=name)
+        axes.set_yscale("symlog", linthresh=1e-3)  # 0 is on it
+        axes.set_xlim(left=0)
+        axes.set_xlabel("time over the reference's")
+        axes.set_ylabel("mean FLIP against the reference")
+        axes.legend(fontsize="x-small")
+    figure.savefig(path, metadata={"Software": None})
+
+
+def draw_tiers(path: Path, trade: Trade) -> None:
+    """A row a recipe: the same part of the reference and the tiers, with their time and error. The
+    part is half the picture's height about CROP_AT; pixels are not smoothed, for they are what is
+    compared.
+    """
+    lines = []
+    for entry in trade.figures["recipes"]:
+        whole = {row["value"]: row for row in entry["rows"] if row["knob"] == WHOLE}
+        panels = []
+        for name in (REFERENCE, *list(BOUNDS)[::-1]):
+            picture = trade.pictures[entry["recipe"]][name]
+            height, width = picture.shape[:2]
+            tall, wide = height // 2, min(width, height * 2 // 3)
+            top = min(max(0, round(CROP_AT[1] * height - tall / 2)), height - tall)
+            left = min(max(0, round(CROP_AT[0] * width - wide / 2)), width - wide)
+            part = picture[top : top + tall, left : left + wide]
+            size = (round(CROP_PX * wide / tall), CROP_PX)
+            shown = cv2.resize(part, size, interpolation=cv2.INTER_NEAREST)
+            error = "" if name == REFERENCE else f", FLIP {whole[name]['flip']:.4f}"
+            text = f"{whole[name]['ms']:.0f} ms{error}"
+            panels.append(captioned(shown, f"{entry['recipe']}, {name}", text))
+        lines.append(strip(panels))
+    write_rgb(path, np.concatenate(lines))
+
+
+def main(arguments: Sequence[str]) -> None:
+    """[TABLE.json=SCENE_URI ...]: see the module."""
+    pairs = [argument.partition("=") for argument in arguments]
+    if not all(uri for _, _, uri in pairs):
+        raise SystemExit("usage: python -m tools.bench.trade [TABLE.json=SCENE_URI ...]")
+    paths, uris = [Path(path) for path, _, _ in pairs], [uri for _, _, uri in pairs]
+    tables = [json.loads(path.read_text()) for path in paths]
+    if tables:
+        width = max(view["width"] for view in tables[0]["views"])
+        case = TradeCase(width=width, repeats=tables[0]["repeats"])
+        tiers = settle(tables, uris, case)
+        for path, uri, table in zip(paths, uris, tables, strict=True):
+            trade = measure_wholes(table, uri, tiers, case)
+            draw_tiers(path.with_name(f"{path.stem}_tiers.jpg"), trade)
+            path.write_text(json.dumps(table, indent=1) + "\n")
+        for name, settings in tiers.items():
+            print(f"{name}: {settings}")
+    PAGE.write_text(document(PAGE.read_text(), read_tables()))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
