@@ -461,7 +461,7 @@ def _bench_commands() -> dict[str, Callable[..., int]]:
             "`climategs bench` is part of the source checkout, not of the installed package: clone "
             "the repository and run it there (pip install --editable ., or python -m tools.cli)"
         )
-    from tools.bench.commands import COMMANDS
+    from tools.bench import COMMANDS
 
     return COMMANDS
 

@@ -7,7 +7,7 @@ from adapters.procedural import open_truth
 from adapters.uri import parse_uri
 from recipes.schema import Smog
 from tests.streets import open_street
-from tools.bench.smog import away_from_silhouettes, smog_error, smog_recipe, truth_view
+from tools.bench.effects import away_from_silhouettes, smog_error, smog_model_recipe, truth_view
 
 STREET = "procedural:street?seed=3&frames=1&gaussians=150000&parked=4&moving=1&pedestrians=1"
 
@@ -24,7 +24,7 @@ def street():
 def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):
     scene, view = street
     smog = Smog(visibility_m=80, scale_height_m=scale_height_m)
-    error = smog_error(smog_recipe(smog, model), scene, view)
+    error = smog_error(smog_model_recipe(smog, model), scene, view)
     smooth = error[view.regions["smooth"]]
     assert len(smooth) > 10_000  # most of the picture that is not sky is measured
     # The bounds a viewer cannot see: one grey level at the median, four at the worst hundredth.
@@ -34,12 +34,3 @@ def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_
     assert np.quantile(error[view.regions["silhouette"]], 0.99) > 4.0
 
 
-def test_silhouettes_are_found():
-    depth = np.full((20, 20), 10.0)
-    depth[:, 10:] = 30.0
-    same = np.zeros((20, 20), np.int64)
-    smooth = away_from_silhouettes(depth, same, same)
-    assert smooth[:, :8].all() and smooth[:, 12:].all() and not smooth[:, 8:12].any()
-    classes = np.where(np.arange(20) < 5, 1, 2)[:, None].repeat(20, 1)
-    smooth = away_from_silhouettes(np.full((20, 20), 10.0), classes, same)
-    assert not smooth[3:7].any() and smooth[8:].all()

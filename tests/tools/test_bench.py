@@ -1,5 +1,6 @@
 """The benches: how the harness measures, and one small run of each subject."""
 
+import dataclasses
 import importlib.util
 import json
 import math
@@ -11,16 +12,19 @@ import pytest
 import torch
 
 from augment.errors import ClimateGSError
+from augment.metrics.consistency import DepthView
 from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
-from tools.bench import fit
-from tools.bench.dataset import DECODING, DatasetCase, bench_dataset
-from tools.bench.fit import FitCase, bench_fit, time_steps
+from tests.streets import SMALL_STREET, open_street
+from tools.bench import dataset, effects, fit, jobs, raster
+from tools.bench.effects import EffectCase, MaskedView, clockwise, mask_agreement
 from tools.bench.harness import (
     Table,
+    WallClock,
     figures,
     format_cell,
+    machine_facts,
     markdown,
     peak_mib_in_subprocess,
     print_figures,
@@ -28,33 +32,20 @@ from tools.bench.harness import (
     rounds,
     run_in_subprocess,
     spread,
-    spread_ms,
     spread_ratio,
 )
-from tools.bench.jobs import BARE, JobsCase, bench_jobs
-from tools.bench.raster import _frame_of, bench_raster
 from tools.bench.scenes import RasterCase, random_scene
 from tools.cli import main
-from tools.training import Outcome
-
-TINY = RasterCase(400, 48, 32)
 
 
-class TickingClock:
+class TickingClock(WallClock):
     """Every mark is a second after the last."""
 
-    def __init__(self):
-        self.now, self.waits = 0.0, 0
+    now = 0.0
 
     def mark(self):
         self.now += 1.0
         return self.now
-
-    def wait(self):
-        self.waits += 1
-
-    def seconds(self, first, then):
-        return then - first
 
 
 def check_figures(result):
@@ -70,20 +61,17 @@ def check_figures(result):
 
 
 def test_cases_take_turns_and_the_first_round_does_not_count():
-    clock, calls = TickingClock(), []
+    calls = []
     cases = {name: lambda name=name: calls.append(name) for name in "ab"}
-    seconds = rounds(cases, 2, warm_up=1, clock=clock, progress=False)
-    assert "".join(calls) == "baabba" and clock.waits == 2
-    assert seconds == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
+    seconds = rounds(cases, 2, warm_up=1, clock=TickingClock())
+    assert "".join(calls) == "baabba" and seconds == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
     with pytest.raises(ValueError, match="repeats >= 1 and a case"):
         rounds(cases, 0)
 
 
 def test_spreads_are_quantiles_and_ratios_are_taken_pair_by_pair():
     found = spread([5.0, 1.0, 2.0, 3.0, 4.0])
-    assert (found["min"], found["median"]) == (1.0, 3.0)
-    assert found["p90"] == pytest.approx(np.quantile([1, 2, 3, 4, 5], 0.9))
-    assert spread_ms([0.002])["median"] == pytest.approx(2.0)
+    assert found == {"median": 3.0, "min": 1.0, "p90": np.quantile([1, 2, 3, 4, 5], 0.9)}
     assert spread_ratio([2.0, 9.0, 8.0], [1.0, 3.0, 8.0])["median"] == 2.0
 
 
@@ -95,21 +83,14 @@ def test_numbers_are_shown_to_three_digits():
 
 def test_figures_print_and_become_markdown(capsys):
     table = Table("Frames", ("scene", "ms"), [("small", 1.234), ("large", None)], "a note")
-    result = figures("raster", [table], warm_up_s=2.0)
+    result = figures("raster", [table], machine=machine_facts(), warm_up_s=2.0)
     check_figures(result)
     print_figures(result)
     shown = capsys.readouterr().out
     assert "scene    ms\nsmall  1.23\nlarge\n  a note\n" in shown
-    machine = result["machine"]
-    assert machine["processor"] in shown and result["facts"] == {"warm_up_s": 2.0}
-    assert machine["cores"] >= 1 and machine["thread_pool"] in ("tbb", "omp", "workqueue")
-    lines = markdown(result).splitlines()
-    assert [line for line in lines[1:7] if line] == [
-        "**Frames**",
-        "| scene | ms |",
-        "| --- | ---: |",
-        "| small | 1.23 |",
-    ]
+    assert result["machine"]["processor"] in shown and result["facts"] == {"warm_up_s": 2.0}
+    lines = ["**Frames**", "| scene | ms |", "| --- | ---: |", "| small | 1.23 |"]
+    assert [line for line in markdown(result).splitlines()[1:7] if line] == lines
 
 
 def test_a_document_keeps_all_but_what_is_between_its_markers():
@@ -121,6 +102,7 @@ def test_a_document_keeps_all_but_what_is_between_its_markers():
         replace_marked(page, "<c>", "<b>", "new")
 
 
+@pytest.mark.long
 def test_work_in_a_subprocess_ends_in_a_record_whatever_its_end(capfd):
     assert run_in_subprocess(dict, ({"a": 1},), 60)["a"] == 1
     assert run_in_subprocess(os._exit, (3,), 60) == {"failed": "its process ended with code 3"}
@@ -129,8 +111,9 @@ def test_work_in_a_subprocess_ends_in_a_record_whatever_its_end(capfd):
     assert run_in_subprocess(dict, (), 0) == {"left_out": "no time was left"}
 
 
+@pytest.mark.long
 def test_peak_memory_holds_the_images_and_little_more():
-    extra = peak_mib_in_subprocess(_frame_of, (RasterCase(2_000, 1600, 1200),))
+    extra = peak_mib_in_subprocess(raster.frame_of, (RasterCase(2_000, 1600, 1200),))
     if extra is None:
         pytest.skip("/proc does not tell resident memory here")
     images = 1600 * 1200 * 4 * 4 / 2**20  # rgb and alpha, float32: 29 MiB, and as much again
@@ -145,7 +128,7 @@ def test_without_the_source_checkout_the_command_says_so(monkeypatch, capsys):
     assert "part of the source checkout" in capsys.readouterr().err
 
 
-# ---- scenes -------------------------------------------------------------------------------------
+# ---- scenes and views ---------------------------------------------------------------------------
 
 
 def test_the_random_scene_is_as_described():
@@ -163,18 +146,44 @@ def test_the_random_scene_is_as_described():
     splats = project_parts([PosedGaussians(gaussians)], camera, RasterSettings())
     inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([640, 480]))).all(1)
     assert float(inside.double().mean()) == pytest.approx(1 / 1.1**2, abs=0.01)
-    assert torch.equal(random_scene(TINY)[0].sh, random_scene(TINY)[0].sh)
-    assert not torch.equal(random_scene(TINY)[0].sh, random_scene(TINY, seed=1)[0].sh)
+
+
+def test_neighbours_go_once_around():
+    ring = ["front", "front_right", "right", "back", "left", "front_left"]
+    cameras = open_street().frames[0].cameras
+    assert clockwise(cameras) == list(zip(ring, [*ring[1:], ring[0]], strict=True))
+
+
+def test_views_agree_with_themselves_and_not_with_what_is_elsewhere():
+    camera = open_street().frames[0].cameras["front"].scaled(0.1)
+    size = (camera.height, camera.width)
+    rgb = np.random.default_rng(0).uniform(0.1, 0.9, (*size, 3))
+    mask = np.zeros(size, bool)
+    mask[: size[0] // 2] = True
+
+    def agreement(rgb2, mask2, depth_m):
+        other = dataclasses.replace(camera)
+        views = {
+            camera: MaskedView(DepthView(camera, rgb, np.full(size, 10.0), np.ones(size)), mask),
+            other: MaskedView(DepthView(other, rgb2, np.full(size, depth_m), np.ones(size)), mask2),
+        }
+        return mask_agreement([("same", camera, other)], views.__getitem__)[0][1:]
+
+    points, agreeing, worst, rms = agreement(rgb, mask, 10.0)
+    assert points > 0.9 * mask.size and agreeing == worst == 1
+    assert rms == pytest.approx(0, abs=1e-6)
+    assert agreement(rgb + 0.1, mask, 10.0)[3] == pytest.approx(25.5)
+    assert agreement(rgb, ~mask, 10.0)[1:] == [0, 0, None]
+    assert agreement(rgb, mask, 11.0) == [0, None, None, None]
 
 
 # ---- subjects -----------------------------------------------------------------------------------
 
 
 def test_raster_measures_stages_work_and_the_reference():
-    small = RasterCase(300, 64, 48)
-    result = bench_raster([TINY], repeats=3, memory=False, reference_case=small, progress=False)
-    tables = check_figures(result)
-    rows = {name: ms for _, name, *ms in tables["Frames"]}
+    cases = raster.RasterCases([RasterCase(400, 48, 32)], RasterCase(300, 64, 48), memory=False)
+    result = raster.measure(repeats=3, cases=cases)
+    rows = {name: ms for _, name, *ms in check_figures(result)["Frames"]}
     assert [*rows] == ["project", "sort", "bin", "raster", "frame", "with smog"]
     # every stage lies within its frame, so even their least times must fit into the slowest
     assert 0 < sum(low for _, low, _ in [*rows.values()][:4]) <= rows["frame"][2]
@@ -184,36 +193,57 @@ def test_raster_measures_stages_work_and_the_reference():
     assert beside["p999"] <= 1e-4  # the agreement that backends promise
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("name", effects.EFFECTS)
+def test_effects_have_their_tables(name, monkeypatch):
+    monkeypatch.setattr(effects, "open_scene", open_street)
+    monkeypatch.setattr(effects, "WAVES", ("calm",))
+    size = {"width": 96, "height": 64, "scale": 0.2, "cell_m": 0.2, "splats": 2_000}
+    views = {"frames": (0,), "cameras": ("front",), "presets": ("overcast",), "memory": False}
+    case = EffectCase(scenes=(SMALL_STREET,), street=SMALL_STREET, **size, **views)
+    result = effects.measure(name, case=case, repeats=1)
+    tables = check_figures(result)
+    frames, stages = (
+        next(rows for title, rows in tables.items() if title.startswith(start))
+        for start in ("Frames", "Stages")
+    )
+    assert result["bench"] == name and all(min(row[1:]) > 0 for row in frames)
+    assert "rasterise" in [row[0] for row in stages]
+
+
+@pytest.mark.long
 def test_dataset_measures_reading_rendering_and_a_large_manifest():
-    case = DatasetCase(images=5, scale=0.05, rows=700, live=2, workers=(1,))
     readings = ("image, depth, boxes, float32, verified",)
-    result = bench_dataset(case, repeats=1, readings=readings, memory=False, progress=False)
-    reading, live, [(rows, held, _)] = check_figures(result).values()
-    assert [row[0] for row in reading] == [DECODING, *readings]
+    size = {"images": 5, "scale": 0.05, "rows": 700, "live": 2}
+    case = dataset.DatasetCase(**size, workers=(1,), readings=readings, memory=False)
+    tables = check_figures(dataset.measure(case=case, repeats=1))
+    reading, live, [(rows, held, _)] = tables.values()
+    assert [row[0] for row in reading] == [dataset.DECODING, *readings]
     assert [row[3] for row in (*reading, *live)][::2] == [1, 1]
     assert all(rate > 0 for *_, rate, _ in (*reading, *live))
     # Some eighty bytes a row, where the Arrow table has 440.
     assert rows == 700 and 700 * 32 < held * 2**20 < 700 * 200
 
 
+@pytest.mark.long
 def test_jobs_measures_machinery_a_long_job_and_opening():
     scene = "procedural:street?seed=3&frames=2&gaussians=60000"
-    case = JobsCase(scene, 0.05, variants=2, images=8, gaussians=500)
-    result = bench_jobs(case, repeats=1, workers=(), memory=False, progress=False)
+    size = {"variants": 2, "images": 8, "gaussians": 500, "workers": (), "memory": False}
+    result = jobs.measure(case=jobs.JobsCase(scene, 0.05, **size), repeats=1)
     compared, long, opened = check_figures(result).values()
-    assert [name for name, *_ in compared] == [BARE, "generate, this process"]
+    assert [name for name, *_ in compared] == [jobs.BARE, "generate, this process"]
     assert all(ms > 0 for _, ms, *_ in (*compared, *opened)) and compared[0][-1] == 1
     assert dict(long)["images"] == 8 and dict(long)["blocks"] == 1
     assert len(opened) == 4 and all(mib > 0 for _, _, mib, _ in opened)
 
 
+@pytest.mark.long
 def test_fit_measures_steps_at_a_fixed_number_of_splats():
-    case = FitCase(
-        splats=20_000, steps=3, frames=2, gaussians=60_000, cameras=("front",),
-        render_scale=0.1, fit_steps=0, street_scale=1.0,
-    )  # fmt: skip
-    result = bench_fit(case, progress=False)
-    (steps,), facts = check_figures(result).values(), result["facts"]
+    size = {"splats": 20_000, "steps": 3, "frames": 2, "gaussians": 60_000, "fit_steps": 2}
+    images = {"cameras": ("front",), "render_scale": 0.1, "street_scale": 1.0}
+    case = fit.FitCase(**size, **images)
+    result = fit.measure(case=case)
+    (steps, fits), facts = check_figures(result).values(), result["facts"]
     stages = {name: ms for name, *ms in steps}
     assert stages.keys() == {
         "whole step", "load", "forward", "loss", "backward", "optimise", "densify"
@@ -222,14 +252,6 @@ def test_fit_measures_steps_at_a_fixed_number_of_splats():
     least = sum(low for name, (_, low, _) in stages.items() if name != "whole step")
     assert least <= stages["whole step"][2]
     assert facts["splats"] == 20_000 and facts["memory_mib"]["peak"] > 0
+    assert fits[0][1] == 2 and fits[0][2] > 10
     with pytest.raises(ClimateGSError, match="no recorded images"):
-        time_steps("procedural:street?seed=3&frames=1&gaussians=60000", 1.0, case)
-
-
-def test_a_fit_is_listed_with_its_held_out_views_and_true_depth(monkeypatch):
-    mean = {"psnr": 30.5, "ssim": 0.9, "flip": 0.07, "depth_median_m": 0.05, "depth_p90_m": 0.3}
-    truth = {"median": {"median_m": 0.03, "p90_m": 0.2}}
-    report = {"step": 4, "mean": mean, "truth": truth, "seconds": 90.0}
-    monkeypatch.setattr(fit, "fit_scene", lambda options, progress: Outcome(0, report))
-    (row,) = fit.fit_table({"street": None}).rows
-    assert row == ("street", 4, 30.5, 0.9, 0.07, 0.05, 0.3, 0.03, 0.2, 1.5)
+        fit.measure(scene="procedural:street?seed=3&frames=1&gaussians=60000", case=case)

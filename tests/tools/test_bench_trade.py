@@ -44,7 +44,7 @@ def trade():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench, "open_scene", open_street)
         patch.setattr(bench, "knobs_of", some_knobs)
-        return bench.bench_trade(SMALL_STREET, ["flood"], TINY, progress=False)
+        return bench.bench_trade(SMALL_STREET, ["flood"], TINY)
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,24 @@
-"""The rule that makes tiers of tables."""
+"""The rule that makes tiers of tables; the package's tiers, tables and document agree with it."""
 
 import pytest
 
-from recipes.schema import BY_PATH
-from tools.bench.trade import WHOLE
-from tools.bench.trade_rule import Unmeasured, measure_wholes, settle, tier_from
+from recipes.schema import BY_PATH, TIERS
+from tools.bench.trade import (
+    DOCS,
+    INVISIBLE_FLIP,
+    PAGE,
+    SCENES,
+    WHOLE,
+    Unmeasured,
+    document,
+    draw_chart,
+    invisible_evidence,
+    measure_wholes,
+    read_tables,
+    settle,
+    tier_from,
+    tiers_from,
+)
 
 STOP, CLIP, FRESNEL = "render.transmittance_stop", "render.radius_clip_px", "weather.flood.fresnel"
 
@@ -105,7 +119,7 @@ def test_settling_adds_what_the_rule_asks_for(monkeypatch):
         rows = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, name, 0.5, 0.005, given)]
         return type("Trade", (), {"figures": table(clean=rows)})
 
-    monkeypatch.setattr("tools.bench.trade_rule.bench_trade", measured)
+    monkeypatch.setattr("tools.bench.trade.bench_trade", measured)
     tiers = settle([made_up], ["some:scene"], None)
     assert tiers["balanced"] == {STOP: 0.01, CLIP: 1.0}
     assert tiers["draft"] == {STOP: 0.05, CLIP: 2.0}
@@ -119,6 +133,38 @@ def test_rows_of_tiers_replace_those_of_earlier_ones(monkeypatch):
     made_up = table(clean=old)
     new = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, "draft", 0.5, 0.1, {CLIP: 2.0})]
     trade = type("Trade", (), {"figures": table(clean=new)})
-    monkeypatch.setattr("tools.bench.trade_rule.bench_trade", lambda *_, **__: trade)
+    monkeypatch.setattr("tools.bench.trade.bench_trade", lambda *_, **__: trade)
     assert measure_wholes(made_up, "some:scene", {"draft": {CLIP: 2.0}}, None) is trade
     assert made_up["recipes"][0]["rows"] == [old[0], *SINGLE, new[1]]
+
+
+# ---- what is published --------------------------------------------------------------------------
+
+MAX_BYTES = 150_000
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return read_tables()
+
+
+def test_tiers_are_what_the_rule_gives_for_the_published_tables(tables):
+    assert {name: dict(settings) for name, settings in TIERS.items()} == tiers_from(tables)
+
+
+def test_the_invisible_bound_is_below_a_good_jpegs_error(tables):
+    evidence = invisible_evidence(tables)
+    assert len(evidence) == sum(len(table["recipes"]) for table in tables)
+    assert min(evidence) >= INVISIBLE_FLIP
+
+
+def test_the_document_agrees_with_the_tables(tables):
+    assert PAGE.read_text() == document(PAGE.read_text(), tables)
+    for name in SCENES:
+        assert (DOCS / "trade" / f"{name}.json").stat().st_size < MAX_BYTES
+
+
+def test_published_figures_make_a_chart(tables, tmp_path):
+    pytest.importorskip("matplotlib")
+    draw_chart(tmp_path / "chart.png", tables[0])
+    assert (tmp_path / "chart.png").stat().st_size > 10_000

@@ -1,0 +1,201 @@
+"""The commands of `climategs bench`: each measures one subject on this machine, prints its tables,
+and writes its figures as JSON where it is told to. Subjects are imported when they are run.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction
+
+from tools.output import JsonFile, write_json
+
+Device = Literal["cpu", "cuda"]
+Effect = Literal["smog", "flood", "snow", "style"]
+EFFECTS: tuple[Effect, ...] = ("smog", "flood", "snow", "style")
+
+
+def bench_raster(
+    repeats: int = 7, quick: bool = False, device: Device = "cpu", json_file: JsonFile = None
+) -> int:
+    """The rasteriser on random scenes: each stage's time, memory, the torch reference beside it.
+
+    Args:
+        repeats: Timed frames a scene.
+        quick: The smaller scene only.
+        device: On cuda the GPU's rasteriser, on the larger scene: `bench gpu --sections raster`.
+        json_file: Also write the figures to this file.
+    """
+    if device == "cuda":
+        return bench_gpu(repeats, quick, sections=("raster",), json_file=json_file)
+    return _show(_subject("raster").measure(quick, repeats), json_file)
+
+
+def bench_effects(
+    only: tuple[Effect, ...] = EFFECTS,
+    repeats: int = 7,
+    quick: bool = False,
+    scene: str | None = None,
+    photos: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What smog, flood, snow and styles cost a frame, and how far they are from what is known.
+
+    Args:
+        only: Some of the effects.
+        repeats: Timed frames of each kind.
+        quick: Small scenes and few kinds.
+        scene: A scene for cost, beside the procedural street.
+        photos: A folder of photographs to score styles on.
+        json_file: Also write the figures to this file, by effect.
+    """
+    results: dict[str, Any] = {}
+    for name in only:
+        results[name] = _subject("effects").measure(name, quick, scene, photos, repeats)
+        _show(results[name], None)
+        write_json(json_file, results, say=name == only[-1])
+    return 0
+
+
+def bench_fit(scene: str | None = None, quick: bool = False, json_file: JsonFile = None) -> int:
+    """Time of each stage of a reconstruction's step, memory, and a fit of the procedural street.
+
+    Args:
+        scene: Raw data whose steps are timed; by default a drive down the procedural street is
+            recorded, and also fitted to every other frame.
+        quick: Fewer steps, and no fit.
+        json_file: Also write the figures to this file.
+    """
+    return _show(_subject("fit").measure(quick, scene), json_file)
+
+
+def bench_jobs(
+    repeats: int = 3, quick: bool = False, scene: str | None = None, json_file: JsonFile = None
+) -> int:
+    """What a job adds to bare rendering, a job of 10,000 images, and opening scenes.
+
+    Args:
+        repeats: How often each way is timed.
+        quick: A few tiny images, a job of 500, and a smaller scene.
+        scene: Another scene to open, such as street_gaussians:MODEL.
+        json_file: Also write the figures to this file.
+    """
+    return _show(_subject("jobs").measure(quick, scene, repeats), json_file)
+
+
+def bench_dataset(
+    folder: Path | None = None, repeats: int = 3, quick: bool = False, json_file: JsonFile = None
+) -> int:
+    """Images a second out of an output folder and rendered on the fly; memory of a long manifest.
+
+    Args:
+        folder: An output folder with JPEG images; by default one is made.
+        repeats: How often each way is timed.
+        quick: Few images.
+        json_file: Also write the figures to this file.
+    """
+    return _show(_subject("dataset").measure(quick, folder, repeats), json_file)
+
+
+def bench_gpu(
+    repeats: int = 30,
+    quick: bool = False,
+    placement: Annotated[tuple[str, ...], UseAppendAction] = (),
+    sections: tuple[str, ...] = (),
+    minutes: float = 9.0,
+    table: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """Every figure of the GPU backend, beside what it is to reach and the least it can take.
+
+    Times, stages, achieved bandwidth, memory, determinism, and the pictures' distance from the CPU
+    backend's and, where it is installed, gsplat's.
+
+    Args:
+        repeats: Timed runs of each.
+        quick: A small scene.
+        placement: A scene to find a place for snow in, besides the street; may be given several
+            times.
+        sections: Some of raster, style, frames, placement and agreement (with the CPU backend's
+            pictures); by default all.
+        minutes: After these a section that still runs is stopped, and no other begins.
+        table: Also write the tables, as Markdown: into a document's marked place, or a file of
+            their own.
+        json_file: Also write the figures to this file, after every section.
+    """
+    import dataclasses
+
+    _subject("harness").check_gpu()
+    subject = _subject("gpu")
+    case = dataclasses.replace(subject.QUICK if quick else subject.WHOLE, placement=placement)
+    timing = subject.Timing(repeats=repeats)
+    result = subject.measure(case, sections or subject.SECTIONS, timing, minutes, json_file)
+    if table is not None:
+        subject.write_table(table, result)
+    _show(result, json_file, () if table is None else (table,))
+    return int(any("failed" in found for found in result["facts"]["sections"].values()))
+
+
+def bench_trade(
+    scene: str = "procedural:street?seed=3&frames=6",
+    recipe: Annotated[tuple[str, ...], UseAppendAction] = (),
+    quick: bool = False,
+    device: Device = "cpu",
+    table: Path | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What each setting that buys speed costs in accuracy on a scene, and the tiers as a whole.
+
+    Args:
+        scene: What is rendered.
+        recipe: A preset or a file, or clean, smog, flood, snow, style or all; may be given several
+            times. By default those six.
+        quick: Small pictures, one timed frame of each, and no memory.
+        device: What renders.
+        table: Also write the tables to this file, as Markdown.
+        pictures: Also draw error against time, and the tiers side by side, here.
+        json_file: Also write the figures to this file.
+    """
+    harness = _subject("harness")
+    if device == "cuda":
+        harness.check_gpu()
+    subject = _subject("trade")
+    if pictures is not None:
+        subject.check_matplotlib()
+    case = subject.QUICK if quick else subject.WHOLE_CASE
+    found = subject.bench_trade(scene, recipe or subject.RECIPES, case, backend=device)
+    shown, written = subject.printable(found.figures), list[Path]()
+    if table is not None:
+        table.write_text(harness.markdown(shown), encoding="utf-8")
+        written.append(table)
+    if pictures is not None:
+        written += subject.draw_trade(pictures, found)
+    _show(shown, None, written)
+    write_json(json_file, found.figures)
+    return 0
+
+
+COMMANDS = {
+    "raster": bench_raster,
+    "effects": bench_effects,
+    "trade": bench_trade,
+    "fit": bench_fit,
+    "jobs": bench_jobs,
+    "dataset": bench_dataset,
+    "gpu": bench_gpu,
+}
+
+
+def _subject(name: str) -> Any:
+    return importlib.import_module(f"tools.bench.{name}")
+
+
+def _show(result: dict[str, Any], json_file: Path | None, written: Any = ()) -> int:
+    _subject("harness").print_figures(result)
+    for path in written:
+        print(f"wrote {path}")
+    write_json(json_file, result)
+    return 0

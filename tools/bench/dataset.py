@@ -7,7 +7,7 @@ one that is there already. Files are read once before, so that the disk does not
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from torch.utils.data import DataLoader, Dataset
 
+from adapters.base import open_scene
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.jobs.atomic import write_atomic
 from augment.jobs.layout import MANIFEST
 from augment.jobs.manifest import manifest_bytes, read_manifest
-from augment.scene import Scene
 from augment.views import render_view
 from recipes.load import load_recipe
 from recipes.schema import Output, Recipe
@@ -37,17 +37,16 @@ from tools.bench.harness import (
     spread,
     spread_ratio,
 )
-from tools.bench.scenes import record_street, street_scene
+from tools.bench.scenes import record_street, street_uri
 
 BATCH = 8
 CAMERAS = ("front", "front_left", "front_right", "back")
-_UINT8 = {"load": ("image",), "image_type": "uint8"}
 DECODING = "decoding alone (cv2.imdecode)"
 # What is read of every sample: WeatherDataset's options. Images are compared with their checksums
 # where `verify` is not False.
 READINGS: Mapping[str, dict[str, Any]] = {
-    "image, uint8": {**_UINT8, "verify": False},
-    "image, uint8, verified": _UINT8,
+    "image, uint8": {"load": ("image",), "image_type": "uint8", "verify": False},
+    "image, uint8, verified": {"load": ("image",), "image_type": "uint8"},
     "image, float32": {"load": ("image",), "verify": False},
     "image, float32, verified": {"load": ("image",)},
     "image, boxes, float32, verified": {"load": ("image", "boxes")},
@@ -58,7 +57,8 @@ READINGS: Mapping[str, dict[str, Any]] = {
 @dataclass(frozen=True)
 class DatasetCase:
     """images: in the folder. scale: of 960x540. rows: of the manifest whose memory is taken. live:
-    images rendered on the fly. gaussians: of the street. workers: of DataLoaders.
+    images rendered on the fly. gaussians: of the street. workers: of DataLoaders. memory: whether
+    it is measured.
     """
 
     images: int = 256
@@ -67,52 +67,41 @@ class DatasetCase:
     live: int = 16
     gaussians: int = 60_000
     workers: tuple[int, ...] = (2, 1)
+    readings: tuple[str, ...] = tuple(READINGS)
+    memory: bool = True
 
 
 WHOLE, QUICK = DatasetCase(), DatasetCase(images=32, rows=20_000, live=4)
 
 
-def bench_dataset(
-    case: DatasetCase = WHOLE,
-    *,
+def measure(
+    quick: bool = False,
     folder: Path | None = None,
     repeats: int = 3,
-    readings: Iterable[str] = tuple(READINGS),
-    memory: bool = True,
-    progress: bool = True,
+    case: DatasetCase | None = None,
 ) -> Figures:
     """folder: an output folder with JPEG images to read; None makes one."""
-    machine = machine_facts()
+    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         scratch = Path(name)
         if folder is None:
-            folder = _write_folder(scratch / "out", case)
-        facts, rows = _reading(folder, case.workers, [*readings], repeats, progress)
-        live = _live(case, repeats, progress)
+            folder = scratch / "out"
+            recipe = Recipe(name="clear", output=Output(image="jpg", depth="median"))
+            size = {"frames": -(-case.images // len(CAMERAS)), "gaussians": case.gaussians}
+            record_street(folder, recipe, scale=case.scale, cameras=CAMERAS, **size)
+        facts, rows = _read(folder, case, repeats)
+        live = _render_live(case, repeats)
         large = _write_manifest_of(scratch / "large", folder, case.rows)
         held = WeatherDataset(large).rows.nbytes / 2**20
-        peak = peak_mib_in_subprocess(_opening_of, (large,)) if memory else None
+        peak = peak_mib_in_subprocess(_opening_of, (large,)) if case.memory else None
     title = "{images} JPEGs of {width}x{height}, {kib:.0f} KiB each, batches of ".format(**facts)
-    rates = ("what", "workers", "images/s", "of decoding")
+    rates, memory = ("what", "workers", "images/s"), ("rows", "MiB held", "MiB at most")
     tables = [
-        Table(f"{title}{BATCH}", rates, rows),
-        Table("Rendered on the fly", ("what", "workers", "images/s", "of rendering"), live),
-        Table(
-            "Opening a large manifest",
-            ("rows", "MiB held", "MiB at most"),
-            [(case.rows, held, peak)],
-        ),
+        Table(f"{title}{BATCH}", (*rates, "of decoding"), rows),
+        Table("Rendered on the fly", (*rates, "of rendering"), live),
+        Table("Opening a large manifest", memory, [(case.rows, held, peak)]),
     ]
     return figures("dataset", tables, machine=machine, **facts)
-
-
-def _write_folder(folder: Path, case: DatasetCase) -> Path:
-    recipe = Recipe(name="clear", output=Output(image="jpg", depth="median"))
-    frames = -(-case.images // len(CAMERAS))
-    record_street(
-        folder, recipe, scale=case.scale, cameras=CAMERAS, frames=frames, gaussians=case.gaussians
-    )
-    return folder
 
 
 def _write_manifest_of(target: Path, folder: Path, count: int) -> Path:
@@ -137,62 +126,47 @@ def _opening_of(folder: Path) -> Action:
     return lambda: WeatherDataset(folder)
 
 
-# ---- rates --------------------------------------------------------------------------------------
-
-
-def _reading(
-    folder: Path, workers: Sequence[int], readings: Sequence[str], repeats: int, progress: bool
-) -> tuple[dict[str, Any], list[tuple]]:
+def _read(folder: Path, case: DatasetCase, repeats: int) -> tuple[Figures, list[tuple]]:
     dataset = WeatherDataset(folder)
     files = [(folder / path).read_bytes() for path in dataset.table["image_path"].to_pylist()]
-    facts = {
-        "images": len(files),
-        "width": int(dataset.rows["width"][0]),
-        "height": int(dataset.rows["height"][0]),
-        "kib": sum(map(len, files)) / len(files) / 1024,
-    }
+    size = {name: int(dataset.rows[name][0]) for name in ("width", "height")}
+    facts = {"images": len(files), **size, "kib": sum(map(len, files)) / len(files) / 1024}
     rows: list[tuple] = []
-    for count in workers:
-        cases = {DECODING: _passes(_Decoding(files), count)}
-        cases |= {
-            name: _passes(WeatherDataset(folder, **READINGS[name]), count) for name in readings
+    for workers in case.workers:
+        ways = {DECODING: _pass_through(_Decoding(files), workers)} | {
+            name: _pass_through(WeatherDataset(folder, **READINGS[name]), workers)
+            for name in case.readings
         }
-        rows += _rates(rounds(cases, repeats, progress=progress), count, len(files))
+        rows += _rates(rounds(ways, repeats), workers, len(files))
     return facts, rows
 
 
-def _live(case: DatasetCase, repeats: int, progress: bool) -> list[tuple]:
+def _render_live(case: DatasetCase, repeats: int) -> list[tuple]:
     """Samples of a scene in fog beside the same views without a DataLoader."""
-    scene = street_scene(frames=-(-case.live // len(CAMERAS)), gaussians=case.gaussians)
+    scene = open_scene(street_uri(-(-case.live // len(CAMERAS)), case.gaussians))
     recipe = load_recipe("dense-fog").resolve(0)
     recipe = recipe.model_copy(update={"output": Output(depth="none", labels=False)})
     live = SceneDataset(scene, recipe, cameras=CAMERAS, load=("image",))
-    cases = {"rendering alone": lambda: _render_all(scene, recipe)}
-    cases |= {"SceneDataset": _passes(live, 0)}
-    return _rates(rounds(cases, repeats, progress=progress), 0, len(live))
 
+    def render_all() -> None:
+        for frame in scene.frames:
+            for name in CAMERAS:
+                render_view(scene, frame.cameras[name], recipe)
 
-def _render_all(scene: Scene, recipe: Recipe) -> None:
-    for frame in scene.frames:
-        for name in CAMERAS:
-            render_view(scene, frame.cameras[name], recipe)
+    ways = {"rendering alone": render_all, "SceneDataset": _pass_through(live, 0)}
+    return _rates(rounds(ways, repeats), 0, len(live))
 
 
 def _rates(seconds: Mapping[str, list[float]], workers: int, images: int) -> list[tuple]:
     """Medians; the fraction is of the first case, round by round."""
     limit = next(iter(seconds.values()))
     return [
-        (
-            name,
-            workers,
-            spread([images / each for each in own])["median"],
-            spread_ratio(limit, own)["median"],
-        )
+        (name, workers, images / spread(own)["median"], spread_ratio(limit, own)["median"])
         for name, own in seconds.items()
     ]
 
 
-def _passes(dataset: Dataset, workers: int) -> Callable[[], int]:
+def _pass_through(dataset: Dataset, workers: int) -> Callable[[], int]:
     """One pass through a dataset, whose workers live on."""
     loader = DataLoader(
         dataset,

@@ -9,7 +9,6 @@ import dataclasses
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,19 +20,16 @@ from adapters.training_views.views import RecordedViews
 from augment.errors import ClimateGSError
 from augment.reconstruct.config import DensifyConfig, FitConfig
 from augment.reconstruct.trainer import Trainer
-from augment.reconstruct.view import ViewSource
 from augment.render.cpu.driver import warm_up
 from augment.scene import Scene
 from recipes.load import load_recipe
 from tools.bench.harness import (
-    RESET_PEAK,
     Figures,
     Table,
+    begin_peak,
     figures,
     machine_facts,
-    return_free_memory,
     spread_ms,
-    spread_row,
     status_mib,
 )
 from tools.bench.scenes import record_street
@@ -42,6 +38,8 @@ from tools.options import FitOptions
 
 UNTIMED = 6  # first steps: compiling, and every view of a short recording decoded once
 NO_GROWTH = DensifyConfig(start=1.0, stop=0.0)  # its part of the run ends before it starts
+FIT_COLUMNS = ("fit", "steps", "PSNR dB", "SSIM", "FLIP", "depth median m", "90 % m",
+               "true depth median m", "90 % m", "minutes")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,69 +64,42 @@ WHOLE = FitCase()
 QUICK = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
 
 
-def bench_fit(
-    case: FitCase = WHOLE, *, scene_uri: str | None = None, progress: bool = True
-) -> Figures:
-    """scene_uri: raw data to time steps on; by default a drive down the procedural street is
-    recorded, and also fitted to every other frame.
+def measure(quick: bool = False, scene: str | None = None, case: FitCase | None = None) -> Figures:
+    """scene: raw data to time steps on; by default a drive down the procedural street is recorded,
+    and also fitted to every other frame.
 
     Raises:
         ClimateGSError: the scene cannot be opened or has no recorded images.
     """
-    machine = machine_facts()
+    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
+    if scene is not None:
+        steps, facts = time_steps(scene, case.scale, case)
+        return figures("fit", [steps], machine=machine, scene=scene, **facts)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
-        if scene_uri is not None:
-            steps, facts = time_steps(scene_uri, case.scale, case, progress)
-            return figures("fit", [steps], machine=machine, scene=scene_uri, **facts)
-        street, recording = record_street(
-            Path(name) / "raw",
-            load_recipe("clear").resolve(0),
-            scale=case.render_scale,
-            cameras=case.cameras,
-            frames=case.frames,
-            gaussians=case.gaussians,
-        )
-        uri, tables = f"recording:{recording}", []
-        steps, facts = time_steps(uri, case.street_scale, case, progress)
+        size = {"frames": case.frames, "gaussians": case.gaussians}
+        images = {"scale": case.render_scale, "cameras": case.cameras}
+        clear = load_recipe("clear").resolve(0)
+        street, recording = record_street(Path(name) / "raw", clear, **images, **size)
+        uri = f"recording:{recording}"
+        steps, facts = time_steps(uri, case.street_scale, case)
+        tables = [steps]
         if case.fit_steps:
-            options = FitOptions(
-                scene=uri,
-                out=Path(name) / "fitted",
-                steps=case.fit_steps,
-                scale=case.street_scale,
-                truth=street.source,
-            )
-            tables = [fit_table({"procedural street": options}, progress=progress)]
-    return figures("fit", [steps, *tables], machine=machine, scene=street.source, **facts)
+            tables.append(_fit_table(uri, Path(name) / "fitted", street.source, case))
+    return figures("fit", tables, machine=machine, scene=street.source, **facts)
 
 
-def fit_table(fits: Mapping[str, FitOptions], *, progress: bool = True) -> Table:
-    """Fits, and how their held-out views are: the table of docs/reconstruction.md. Where the street
-    that was recorded is known, depth is also compared with its surfaces.
-    """
-    rows = []
-    for name, options in fits.items():
-        report = fit_scene(options, progress=progress).report
-        mean, truth = report["mean"], (report.get("truth") or {}).get("median", {})
-        scores = ("psnr", "ssim", "flip", "depth_median_m", "depth_p90_m")
-        rows.append(
-            (
-                name,
-                report["step"],
-                *(mean.get(score) for score in scores),
-                truth.get("median_m"),
-                truth.get("p90_m"),
-                report["seconds"] / 60,
-            )
-        )
-    columns = ("fit", "steps", "PSNR dB", "SSIM", "FLIP", "depth median m", "90 % m",
-               "true depth median m", "90 % m", "minutes")  # fmt: skip
-    return Table("Held-out views", columns, rows)
+def _fit_table(uri: str, out: Path, truth: str, case: FitCase) -> Table:
+    """A fit of the street: its held-out views, and its depth beside the street's exact one."""
+    options = {"steps": case.fit_steps, "scale": case.street_scale, "truth": truth}
+    report = fit_scene(FitOptions(scene=uri, out=out, **options)).report
+    mean, exact = report["mean"], (report.get("truth") or {}).get("median", {})
+    scores = [mean.get(s) for s in ("psnr", "ssim", "flip", "depth_median_m", "depth_p90_m")]
+    depth = exact.get("median_m"), exact.get("p90_m")
+    row = ("procedural street", report["step"], *scores, *depth, report["seconds"] / 60)
+    return Table("Held-out views", FIT_COLUMNS, [row])
 
 
-def time_steps(
-    uri: str, scale: float, case: FitCase, progress: bool = True
-) -> tuple[Table, Figures]:
+def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
     """Of `case.steps` steps after the first; where the scene makes more than `case.splats`
     Gaussians, so many are kept.
     """
@@ -138,38 +109,35 @@ def time_steps(
             f"{scene.source} has no recorded images, so there is nothing to fit to"
         )
     scene = _thinned(scene, case.splats)
-    source: ViewSource = RecordedViews(scene, scale=scale)
+    source = RecordedViews(scene, scale=scale)
     for key in source.train:
         source.load(key)  # as in a long run, where images come from memory
-    return_free_memory()
-    before = status_mib("VmRSS") if RESET_PEAK.is_file() else None
-    if before is not None:
-        RESET_PEAK.write_text("5")
-    started = time.perf_counter()
+    before, started = begin_peak(), time.perf_counter()
     warm_up()
     trainer = Trainer(scene, source, FitConfig(sh_every=1, densify=NO_GROWTH))
     for _ in range(UNTIMED):
         trainer.run_step()
     warm_up_s, seconds = time.perf_counter() - started, defaultdict(list)
-    for _ in tqdm(range(case.steps), unit="step", disable=not progress):
+    for _ in tqdm(range(case.steps), unit="step"):
         started = time.perf_counter()
         record = trainer.run_step()
         seconds["whole step"].append(time.perf_counter() - started)
         for stage, each in record.stage_s.items():
             seconds[stage].append(each)
-    peak = None if before is None else status_mib("VmHWM")
+    memory, note = None, ""
+    if before is not None:
+        memory = {"before": before, "peak": status_mib("VmHWM")}
+        note = f"resident at most {memory['peak']:.0f} MiB, {before:.0f} before training"
     sizes = sorted({(c.width, c.height) for c in map(source.camera, source.train)})
-    title = f"A step of {len(trainer.splats):,} splats, {len(source.train)} views of " + ", ".join(
-        f"{width}x{height}" for width, height in sizes
-    )
-    rows = [(stage, *spread_row(spread_ms(each))) for stage, each in seconds.items()]
-    note = "" if peak is None else f"resident at most {peak:.0f} MiB, {before:.0f} before training"
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes)
+    title = f"A step of {len(trainer.splats):,} splats, {len(source.train)} views of {shown}"
+    rows = [(stage, *spread_ms(each).values()) for stage, each in seconds.items()]
     facts = {
         "splats": len(trainer.splats),
         "actors": len(scene.actors),
         "steps": case.steps,
         "warm_up_s": warm_up_s,
-        "memory_mib": None if peak is None else {"before": before, "peak": peak},
+        "memory_mib": memory,
     }
     return Table(title, ("stage", "ms", "min", "p90"), rows, note), facts
 

@@ -2,7 +2,9 @@
 
 Sections run in the order of their weight, each in a process of its own: one that fails, and be it
 by a fault that leaves the GPU unusable to its process, or that finds no time left, is said to be
-missing, and the others count.
+missing, and the others count. Beside times stands the least that a picture can take: the longer of
+what its stages move, at the speed of a copy, and of its blends, at the speed of a kernel that does
+nothing else.
 """
 
 from __future__ import annotations
@@ -10,17 +12,20 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
-import gc
 import importlib.util
+import itertools
+import math
 import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
 
 from adapters.base import open_scene
@@ -29,12 +34,25 @@ from augment.effects.smog import SmogMedium
 from augment.effects.snow.placement import place_snow_support
 from augment.effects.snow.snow import placement_settings
 from augment.effects.style.color_maps import StyleMaps, style_gaussians
-from augment.errors import BackendUnavailable
 from augment.plan import make_plan
-from augment.render.buffers import ALPHA, RGB, RenderOutput, available_backends
-from augment.render.constants import COV2D_BLUR, RasterSettings
+from augment.render.buffers import ALPHA, RGB, RenderOutput
+from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.cuda.driver import list_tiles, project, rasterize_cuda
+from augment.render.cuda.runtime import gpu_device, launch
+from augment.render.cuda.splats import TILE, CudaSplats, CudaTiles, GpuStageTimer, gather_inputs
+from augment.render.layout import (
+    C_AT,
+    C_X,
+    C_Y,
+    FALL_Y,
+    LEAN_X,
+    LOG_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    SHARP_X,
+)
 from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.views import WeatheredBuffers, begin_view, render_buffers, render_view
+from augment.views import begin_view, render_buffers, render_view
 from recipes.schema import (
     TIERS,
     Flood,
@@ -50,23 +68,23 @@ from recipes.schema import (
 from tools.bench.harness import (
     Action,
     Cell,
-    Clock,
+    EventClock,
     Figures,
     Table,
     WallClock,
     figures,
+    gpu_facts,
     guarded,
     image_difference,
     machine_facts,
     markdown,
+    peak_gpu_mib,
     replace_marked,
     rounds,
     run_in_subprocess,
     spread,
     spread_ms,
     spread_ratio,
-    spread_row,
-    version_of,
 )
 from tools.bench.scenes import (
     LARGE_CASE,
@@ -83,9 +101,6 @@ from tools.bench.scenes import (
 )
 from tools.output import write_json
 
-if TYPE_CHECKING:
-    from tools.bench.gpu_ceilings import Ceilings
-
 BACKEND = "cuda"
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
@@ -99,24 +114,6 @@ START = "<!-- gpu: made by climategs bench gpu --table docs/performance.md -->"
 END = "<!-- end of gpu -->"
 
 
-# ---- the GPU: clock, memory, what it is ---------------------------------------------------------
-
-
-class EventClock:
-    """The GPU's: marks are events among its work, so that nothing waits while they are set."""
-
-    def mark(self) -> torch.cuda.Event:
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
-
-    def wait(self) -> None:
-        torch.cuda.synchronize()
-
-    def seconds(self, first: torch.cuda.Event, then: torch.cuda.Event) -> float:
-        return first.elapsed_time(then) / 1e3
-
-
 @dataclass(frozen=True)
 class Timing:
     """How often and by which clock. warm_up: rounds before the first that counts.
@@ -127,62 +124,148 @@ class Timing:
 
     repeats: int = 30
     warm_up: int = 5
-    clock: Clock = field(default_factory=EventClock)
+    clock: WallClock = field(default_factory=EventClock)
 
-    def rounds(self, actions: Mapping[str, Action], clock: Clock | None = None) -> dict[str, list]:
-        own = clock or self.clock
-        return rounds(actions, self.repeats, warm_up=self.warm_up, clock=own, progress=False)
+    def rounds(
+        self, actions: Mapping[str, Action], clock: WallClock | None = None
+    ) -> dict[str, list[float]]:
+        return rounds(actions, self.repeats, warm_up=self.warm_up, clock=clock or self.clock)
 
 
-def gpu_facts() -> dict[str, Any] | None:
-    """Of the current GPU; None where torch sees none."""
-    if not torch.cuda.is_available():
-        return None
-    found = torch.cuda.get_device_properties(torch.cuda.current_device())
+# ---- the least that a frame can take ------------------------------------------------------------
+
+LANES = 256  # pixels of a program that only blends
+
+
+@triton.jit(do_not_specialize=["steps"])
+def blend_only(out, steps, alpha_max, alpha_min, LANES: tl.constexpr):
+    """LANES pixels of a row, each blended `steps` times with a splat that moves along the row.
+
+    What a rasteriser's inner loop does for a pixel and a splat once all that is the same for a row
+    is known: a Gaussian, an exponential, the two limits of alpha, transmittance, three colours. The
+    sums are written so that none of it can be left out. out: float32 [programs, LANES].
+    """
+    pixel = tl.arange(0, LANES)
+    x = pixel.to(tl.float32)
+    transmittance = tl.full([LANES], 1.0, tl.float32)
+    red = tl.zeros([LANES], tl.float32)
+    green = tl.zeros([LANES], tl.float32)
+    blue = tl.zeros([LANES], tl.float32)
+    mean = 0.0
+    for _ in range(steps):
+        bend = 0.1 * (x - mean)
+        alpha = tl.minimum(tl.exp2(-0.5 - bend * bend), alpha_max)
+        weight = tl.where(alpha >= alpha_min, alpha * transmittance, 0.0)
+        transmittance -= weight
+        red += weight * 0.3
+        green += weight * 0.5
+        blue += weight * 0.7
+        mean += 0.37
+    tl.store(out + tl.program_id(0) * LANES + pixel, transmittance + red + green + blue)
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """bytes_per_s: read and written, of a copy. blends_per_s: of a pixel and a splat, with colour,
+    everything in registers.
+    """
+
+    bytes_per_s: float
+    blends_per_s: float
+
+    def ms(self, moved: float, blends: float = 0.0) -> float:
+        """The least that so many bytes and blends can take, one beside the other."""
+        return 1e3 * max(moved / self.bytes_per_s, blends / self.blends_per_s)
+
+
+def measure_ceilings(
+    timing: Timing, *, copy_bytes: int = 1 << 30, programs: int = 132 * 32, steps: int = 8192
+) -> Ceilings:
+    """The load is far more than caches hold and launches take."""
+    device, count = gpu_device(), copy_bytes // 4
+    source, target = torch.ones(count, device=device), torch.zeros(count, device=device)
+    out = torch.zeros((programs, LANES), device=device)
+
+    def blend() -> None:
+        limits = (SETTINGS.alpha_max, ALPHA_MIN)
+        launch(blend_only, (programs,), out, steps, *limits, LANES=LANES, num_warps=8)
+
+    seconds = timing.rounds({"copy": lambda: target.copy_(source), "blend": blend})
+    copy_s, blend_s = (statistics.median(each) for each in seconds.values())
+    return Ceilings(2 * 4 * count / copy_s, programs * LANES * steps / blend_s)
+
+
+def floor_of(
+    parts: Sequence[PosedGaussians], camera: Camera, images: RenderOutput, ceilings: Ceilings
+) -> Figures:
+    """What a clean frame must move and blend by stage, counted, and the least that it can take.
+
+    Inputs are read once, results written once, of the colours those of splats in view: what a sort
+    moves besides, and records that several tiles read, are the price of how it is done.
+    """
+    splats = project(gather_inputs(parts, camera, SETTINGS, None, None, with_color=True))
+    tiles = list_tiles(splats, camera, None)
+    counted = count_blends(splats, tiles, camera, SETTINGS)
+    count, visible = len(splats.keys), int((splats.counts > 0).sum())
+    record = splats.records.shape[1] * 4
+    geometry = count * 4 * (3 + 3 + 1) + visible * 4 * 4  # means, scales, opacities; quaternions
+    colors = sum(12 * part.gaussians.sh.shape[1] * len(part.gaussians) for part in parts)
+    keys = 2 * 4 * count  # of depth, and how many tiles
+    drawn = sum(image.nbytes for image in vars(images).values() if image is not None)
+    moved = {
+        "project": geometry + colors * visible // count + keys + visible * (record + 8),
+        "list": keys + visible * 8 + 4 * len(tiles.tile_splat_ids) + 4 * len(tiles.tile_offsets),
+        "blend": 4 * counted["entries"] + counted["used"] * record + drawn,
+    }
+    ms = {n: ceilings.ms(m, counted["done"] if n == "blend" else 0) for n, m in moved.items()}
     return {
-        "name": found.name,
-        "memory_gib": round(found.total_memory / 2**30, 1),
-        "processors": found.multi_processor_count,
-        "capability": f"{found.major}.{found.minor}",
-        "cuda": torch.version.cuda,
-        "triton": version_of("triton"),
+        "bytes": sum(moved.values()),
+        "bytes_of": moved,
+        "ms": {**ms, "frame": sum(ms.values())},
+        "splats": count,
+        "visible": visible,
+        "pairs": len(tiles.tile_splat_ids),
+        **counted,
     }
 
 
-def gpu_mib() -> float | None:
-    """MiB of tensors that lie on the GPU now; None without one."""
-    if not torch.cuda.is_available():
-        return None
-    gc.collect()
-    torch.cuda.synchronize()
-    return torch.cuda.memory_allocated() / 2**20
-
-
-def peak_gpu_mib(action: Action) -> tuple[float, float] | tuple[None, None]:
-    """MiB of tensors on the GPU at the action's highest moment: all of them, and above what lay
-    there before. None without a GPU. What torch holds free is not counted.
+def count_blends(
+    splats: CudaSplats, tiles: CudaTiles, camera: Camera, settings: RasterSettings
+) -> dict[str, int]:
+    """done: pixels and splats that are blended, as the image's definition asks. listed: pixels and
+    splats of the tiles' lists. reached: those of them before all pixels of a tile are finished.
+    entries: entries of lists that are reached. used: splats that are in one of those.
     """
-    before = gpu_mib()
-    if before is None:
-        return None, None
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
-    kept = action()
-    torch.cuda.synchronize()
-    highest = torch.cuda.max_memory_allocated() / 2**20
-    del kept
-    return highest, highest - before
-
-
-def check_gpu() -> None:
-    """Raises BackendUnavailable where there is no GPU to measure."""
-    from augment.render.cuda.runtime import has_gpu
-
-    if not has_gpu():
-        why = available_backends()["cuda"] or (
-            f"torch {torch.__version__} sees no GPU, or TRITON_INTERPRET is set"
+    stop, device = settings.transmittance_stop, splats.records.device
+    used = torch.zeros(len(splats.records), dtype=torch.bool, device=device)
+    found = torch.zeros(4, dtype=torch.int64, device=device)
+    offsets = tiles.tile_offsets.tolist()
+    for tile, (first, last) in enumerate(itertools.pairwise(offsets)):
+        left, top = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+        x, y = (
+            torch.arange(low, min(low + TILE, end), device=device) + 0.5
+            for low, end in ((left, camera.width), (top, camera.height))
         )
-        raise BackendUnavailable(f"there is no GPU to measure here: {why}")
+        y, x = (each.reshape(-1) for each in torch.meshgrid(y, x, indexing="ij"))
+        ids = tiles.tile_splat_ids[first:last].long()
+        splat = splats.records[ids].T[..., None]  # [fields, entries, 1]
+        dx, dy = x - splat[MEAN_X], y - splat[MEAN_Y]
+        bend = splat[SHARP_X] * (dx - splat[LEAN_X] * dy)
+        log_alpha = splat[LOG_OPACITY] - bend * bend - splat[FALL_Y] * dy * dy
+        alpha = log_alpha.exp2().clamp(max=settings.alpha_max)
+        alpha = alpha.where(log_alpha >= math.log2(ALPHA_MIN), 0)
+        if splats.cuts is not None:
+            cut = splats.cuts[ids].T[..., None]
+            alpha = alpha * (cut[C_AT] + cut[C_X] * dx + cut[C_Y] * dy).clamp(0, 1)
+        after = (1 - alpha).cumprod(0)
+        before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+        blended = (alpha > 0) & (before > stop) & (after > min(stop, TRANSMITTANCE_STOP))
+        reached = (before > stop).any(1)
+        used[ids[reached]] = True
+        counts = (blended.sum(), alpha.numel(), reached.sum() * len(x), reached.sum())
+        found += torch.stack([torch.as_tensor(each, device=device) for each in counts])
+    names = ("done", "listed", "reached", "entries")
+    return {**dict(zip(names, found.tolist(), strict=True)), "used": int(used.sum())}
 
 
 # ---- the rasteriser on the random scene ---------------------------------------------------------
@@ -191,63 +274,46 @@ def check_gpu() -> None:
 def draw(
     parts: list[PosedGaussians], camera: Camera, smog: SmogMedium | None = None, timer: Any = None
 ) -> RenderOutput:
-    from augment.render.cuda import driver as cuda
-
-    return cuda.rasterize_cuda(parts, camera, BUFFERS, SETTINGS, smog, timer=timer)
+    return rasterize_cuda(parts, camera, BUFFERS, SETTINGS, smog, timer=timer)
 
 
 def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
-    """Milliseconds on the GPU, from the call's first work to the finished images there."""
-    from tools.bench.gpu_ceilings import floor_of
-
+    """Milliseconds on the GPU, from the call's first work to the finished images there; ours in
+    turns with gsplat's, where it can be had.
+    """
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
     frames = {CLEAN: lambda: draw(parts, camera), SMOG: lambda: draw(parts, camera, MEDIUM)}
-    stages = [_stages_ms(parts, camera) for _ in range(timing.warm_up + timing.repeats)]
+    stages = []
+    for _ in range(timing.warm_up + timing.repeats):  # in frames of their own
+        timer = GpuStageTimer()
+        draw(parts, camera, timer=timer)
+        stages.append(timer.milliseconds())
     peak, extra = peak_gpu_mib(frames[CLEAN])  # before gsplat's copy of the scene lies there, too
-    pairs = [[getattr(frames[CLEAN](), name).cpu() for name in sorted(BUFFERS)] for _ in "ab"]
+    first, second = ([getattr(draw(parts, camera), n).cpu() for n in sorted(BUFFERS)] for _ in "ab")
+    draws = gsplat_draws(gaussians, camera)
+    others = {} if isinstance(draws, str) else draws
+    seconds = timing.rounds({**frames, **others})
+    gsplat: Figures = {"left_out": draws}
+    if others:
+        fastest = min(others, key=lambda name: statistics.median(seconds[name]))
+        ours = draw(parts, camera).rgb
+        assert ours is not None
+        ratio = spread_ratio(seconds[CLEAN], seconds[fastest])
+        rgb = image_difference(ours, others[fastest]())
+        gsplat = {"way": fastest, "ratio": ratio, "rgb": rgb}
     return {
         "case": case.name,
         "scene_mib": gaussians.nbytes / 2**20,
         "peak_mib": peak,
         "frame_mib": extra,
-        "stages_ms": {
-            name: spread([each[name] for each in stages[timing.warm_up :]]) for name in STAGES
-        },
-        "same_bits": all(map(torch.equal, *pairs)),
-        "floor": floor_of(parts, camera, SETTINGS, frames[CLEAN](), ceilings),
-        **_beside_gsplat(frames, gaussians, camera, timing),
-    }
-
-
-def _stages_ms(parts: list[PosedGaussians], camera: Camera) -> dict[str, float]:
-    """Of the rasteriser's stages, in a frame of their own."""
-    from augment.render.cuda.splats import GpuStageTimer
-
-    timer = GpuStageTimer()
-    draw(parts, camera, timer=timer)
-    return timer.milliseconds()
-
-
-def _beside_gsplat(
-    frames: Mapping[str, Action], gaussians: Gaussians, camera: Camera, timing: Timing
-) -> Figures:
-    """Times of our frames, in turns with gsplat's where it can be had."""
-    draws = gsplat_draws(gaussians, camera)
-    others = {} if isinstance(draws, str) else draws
-    seconds = timing.rounds({**frames, **others})
-    found: Figures = {
+        "stages_ms": {s: spread([each[s] for each in stages[timing.warm_up :]]) for s in STAGES},
+        "same_bits": all(map(torch.equal, first, second)),
+        "floor": floor_of(parts, camera, draw(parts, camera), ceilings),
         "ms": {name: spread_ms(each) for name, each in seconds.items()},
         "smog_over_clean": spread_ratio(seconds[SMOG], seconds[CLEAN]),
+        "gsplat": gsplat,
     }
-    if isinstance(draws, str):
-        return {**found, "gsplat": {"left_out": draws}}
-    fastest = min(others, key=lambda name: statistics.median(seconds[name]))
-    ours = draw([PosedGaussians(gaussians)], camera).rgb
-    assert ours is not None
-    ratio = spread_ratio(seconds[CLEAN], seconds[fastest])
-    rgb = image_difference(ours, others[fastest]())
-    return {**found, "gsplat": {"way": fastest, "ratio": ratio, "rgb": rgb}}
 
 
 def gsplat_draws(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Tensor]] | str:
@@ -269,16 +335,13 @@ def gsplat_draws(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[],
 def _gsplat_draw(gaussians: Gaussians, camera: Camera, packed: bool) -> Callable[[], Tensor]:
     from gsplat import rasterization  # type: ignore[import-not-found]
 
-    from augment.render.cuda.runtime import gpu_device
-
     device = gpu_device()
-    intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     given = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities",
              "colors": "sh"}  # fmt: skip
     arguments = {
         **{k: getattr(gaussians, v).detach().contiguous().to(device) for k, v in given.items()},
         "viewmats": camera.camera_from_world.float().to(device)[None],
-        "Ks": torch.tensor([intrinsics], device=device),
+        "Ks": camera.K.float().to(device)[None],
         "width": camera.width,
         "height": camera.height,
         "near_plane": SETTINGS.near_m,
@@ -337,7 +400,7 @@ def measure_frames(
     """
     rows: dict[str, Figures] = {}
 
-    def frame_of(name: str) -> functools.partial[WeatheredBuffers]:
+    def frame_of(name: str) -> functools.partial:
         own, plan = scene_of_recipe(scene, recipes[name], BACKEND), make_plan(recipes[name], scene)
         frame = functools.partial(render_buffers, own, camera, plan, backend=BACKEND)
         frame()  # compiles, copies the scene and places what stays with it
@@ -380,8 +443,6 @@ def _delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> 
 
 def measure_style(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
     """Folding one map and writing the mapped SH of random Gaussians of degree 3, on the GPU."""
-    from augment.render.cuda.runtime import gpu_device
-
     own, _ = random_scene(case)
     fields = {f.name: getattr(own, f.name) for f in dataclasses.fields(own)}
     tensors = {k: v.to(gpu_device()) for k, v in fields.items() if isinstance(v, Tensor)}
@@ -393,12 +454,10 @@ def measure_style(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figur
         style_gaussians(gaussians, maps, out=out, backend=BACKEND)
 
     fold()
+    ms = spread_ms(timing.rounds({"fold": fold})["fold"])
     moved = 2 * out.nbytes
-    return {
-        "gaussians": len(gaussians),
-        "ms": spread_ms(timing.rounds({"fold": fold})["fold"]),
-        "floor": {"bytes": moved, "ms": {"frame": ceilings.ms(moved)}},
-    }
+    floor = {"bytes": moved, "ms": {"frame": ceilings.ms(moved)}}
+    return {"gaussians": len(gaussians), "ms": ms, "floor": floor}
 
 
 def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
@@ -415,7 +474,7 @@ def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
         for name, seconds in found.seconds.items():
             stages[name].append(seconds)
 
-    seconds = rounds({"place": place}, PLACEMENTS, progress=False)["place"]
+    seconds = rounds({"place": place}, PLACEMENTS)["place"]
     return {
         "scene": scene.name,
         "uri": uri,
@@ -459,8 +518,7 @@ def frame_agreement(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe])
 @dataclass(frozen=True)
 class GpuCase:
     """raster: the random scene. street: of the weathered frames, width x height pixels. placement:
-    scenes for snow, besides the street. cell_m: of the snow. minutes: after which no further
-    section begins, and one that runs is stopped. load: as measure_ceilings takes it.
+    scenes for snow, besides the street. cell_m: of the snow. load: as measure_ceilings takes it.
     """
 
     raster: RasterCase = LARGE_CASE
@@ -469,7 +527,6 @@ class GpuCase:
     height: int = 1066
     placement: tuple[str, ...] = ()
     cell_m: float = 0.05
-    minutes: float = 9.0
     load: Mapping[str, int] = field(default_factory=dict)
 
     def open_street(self) -> tuple[Scene, Camera]:
@@ -480,20 +537,14 @@ class GpuCase:
 WHOLE = GpuCase()
 QUICK = GpuCase(SMALL_CASE, "procedural:street?seed=3&frames=1", width=640, height=426)
 CEILINGS = "ceilings"
-
-
 SECTIONS = (CEILINGS, "raster", "style", "frames", "placement", "agreement")
 
 
 def run_section(name: str, case: GpuCase, timing: Timing, ceilings: Ceilings | None) -> Figures:
     """One of SECTIONS; ceilings: None for their own."""
     if ceilings is None:
-        from tools.bench.gpu_ceilings import measure_ceilings
-
-        return {
-            **dataclasses.asdict(measure_ceilings(timing.rounds, **case.load)),
-            "gpu": gpu_facts(),
-        }
+        found = measure_ceilings(timing, **case.load)
+        return {**dataclasses.asdict(found), "gpu": gpu_facts()}
     recipes = frame_recipes(case.cell_m)
     match name:
         case "raster":
@@ -510,16 +561,16 @@ def run_section(name: str, case: GpuCase, timing: Timing, ceilings: Ceilings | N
     return {"scenes": [{**each, "named": each["uri"] != case.street} for each in found]}
 
 
-def bench_gpu(
+def measure(
     case: GpuCase = WHOLE,
-    *,
     sections: Sequence[str] = SECTIONS,
     timing: Timing | None = None,
+    minutes: float = 9.0,
     json_file: Path | None = None,
     in_processes: bool = True,
 ) -> Figures:
-    """json_file: gets the figures after every section. in_processes: each section in one of its
-    own.
+    """minutes: after which no further section begins, and one that runs is stopped. json_file: gets
+    the figures after every section. in_processes: each section in one of its own.
 
     Raises:
         ValueError: no such section.
@@ -536,12 +587,10 @@ def bench_gpu(
         if name != CEILINGS and ceilings is None:
             found[name] = {"left_out": "the GPU's ceilings could not be measured"}
             continue
-        left_s = 60 * case.minutes - (time.perf_counter() - start)
+        left_s = 60 * minutes - (time.perf_counter() - start)
         work = (run_section, (name, case, timing, ceilings))
         found[name] = run_in_subprocess(*work, left_s) if in_processes else guarded(*work)
         if "bytes_per_s" in found[name]:
-            from tools.bench.gpu_ceilings import Ceilings
-
             ceilings = Ceilings(found[name]["bytes_per_s"], found[name]["blends_per_s"])
         write_json(json_file, gpu_figures(found, timing, machine), say=False)
     return gpu_figures(found, timing, machine)
@@ -552,7 +601,7 @@ def bench_gpu(
 
 class Target(NamedTuple):
     """What the backend is to reach on one H200. most: in the unit. value: of a section's facts, a
-    spread or a number; raises _Missing where it was not measured. floor: as of floor_of, if known.
+    spread or a number; raises _Missing where it was not measured.
     """
 
     what: str
@@ -560,7 +609,7 @@ class Target(NamedTuple):
     most: float
     section: str
     value: Callable[[Figures], Any]
-    floor: Callable[[Figures], Figures] | None = None
+    has_floor: bool = False
 
 
 class _Missing(Exception):
@@ -593,7 +642,7 @@ def _worst(errors: Figures) -> float:
 
 
 TARGETS = (
-    Target("clean frame", "ms", 3.0, "raster", lambda f: f["ms"][CLEAN], lambda f: f["floor"]),
+    Target("clean frame", "ms", 3.0, "raster", lambda f: f["ms"][CLEAN], has_floor=True),
     Target("smog in splats, over clean", "x", 1.1, "raster", lambda f: f["smog_over_clean"]),
     Target("street: smog, over clean", "x", 1.1, "frames",
            lambda f: f["frames"][SMOG]["over_clean"]),
@@ -605,7 +654,7 @@ TARGETS = (
     Target("street: rgb off the CPU backend's, 99.9 %, worst frame", "", 1e-3, "agreement",
            lambda f: _worst(f["frames"])),
     Target("style: fold and apply to all SH", "ms", 1.0, "style", lambda f: f["ms"],
-           lambda f: f["floor"]),
+           has_floor=True),
     Target("placement of snow, PandaSet", "s", 1.0, "placement", _slowest_named),
     Target("memory of the clean frame and its scene", "GB", 2.0, "raster",
            lambda f: _gigabytes(f["peak_mib"])),
@@ -624,9 +673,9 @@ def target_row(target: Target, found: Figures) -> tuple[Cell, ...]:
         value = target.value(facts)
     except _Missing as why:
         return (target.what, None, None, None, limit, f"not measured: {why}", None)
-    row = spread_row(value) if isinstance(value, Mapping) else (value, None, None)
+    row = tuple(value.values()) if isinstance(value, Mapping) else (value, None, None)
     verdict = "met" if row[0] <= target.most else "MISSED"
-    floor = None if target.floor is None else target.floor(facts)["ms"]["frame"]
+    floor = facts["floor"]["ms"]["frame"] if target.has_floor else None
     return (target.what, *row, limit, verdict, floor)
 
 
@@ -661,24 +710,34 @@ def gpu_tables(found: Figures) -> list[Table]:
             f"pixels are finished; {floor['pairs']:,} pairs of splats and tiles, "
             f"{floor['entries']:,} reached; {floor['done']:,} blends, {floor['reached']:,} tried"
         )
-        rows = [
-            _stage_row(name, raster["stages_ms"][name], floor["ms"][name], floor["bytes_of"][name])
-            for name in STAGES
-        ]
-        whole = floor["ms"]["frame"], floor["bytes"]
-        for name, ms in raster["ms"].items():
-            rows.append(_stage_row(name, ms, *((None, None) if "gsplat" in name else whole)))
+        rows = []
+        for name, ms in {**raster["stages_ms"], **raster["ms"]}.items():
+            least, moved = floor["ms"].get(name), floor["bytes_of"].get(name)
+            if name in (CLEAN, SMOG):
+                least, moved = floor["ms"]["frame"], floor["bytes"]
+            cells: Sequence[Cell] = (None, None, None, None)
+            if least is not None and (median := ms["median"]):
+                cells = (least, 100 * least / median, moved / 1e6, moved / median / 1e6)
+            rows.append((name, *ms.values(), *cells))
         columns = ("stage", "ms", "min", "p90", "floor ms", "% of it", "MB", "GB/s")
         tables.append(Table(f"Rasteriser, {raster['case']}", columns, rows, note))
     if "frames" in frames:
         columns = ("frame", "ms", "min", "p90", "x clean", "8 bits, alone", "in a row",
                    "MiB", "of it frame", "same bits")  # fmt: skip
-        rows = [_frame_row(name, row) for name, row in frames["frames"].items()]
+        rows = []
+        for name, row in frames["frames"].items():
+            delivered = (row["delivered"]["ms"]["median"], row["delivered"]["row_ms"])
+            rest = (row["peak_mib"], row["frame_mib"], row["same_bits"])
+            rows.append((name, *row["ms"].values(), row["over_clean"]["median"], *delivered, *rest))
         title = f"Street, {frames['gaussians']:,} Gaussians, {frames['camera']}"
         tables.append(Table(title, columns, rows))
     if "scenes" in found["placement"]:
-        columns = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90", "slowest stages")
-        rows = [_placement_row(each) for each in found["placement"]["scenes"]]
+        columns, rows = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90", "slowest"), []
+        for each in found["placement"]["scenes"]:
+            slowest = sorted(each["stages_s"].items(), key=lambda item: -item[1])[:3]
+            stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in slowest)
+            counts = (each["gaussians"], each["cameras"], each["cells"])
+            rows.append((each["scene"], *counts, *each["place_s"].values(), stages))
         tables.append(Table("Where snow lies, once a scene", columns, rows))
     if "frames" in found["agreement"]:
         each = found["agreement"]
@@ -687,29 +746,6 @@ def gpu_tables(found: Figures) -> list[Table]:
         columns = ("rgb off the CPU backend's", "99.9 %", "max", "off by > 0.001", "pixels")
         tables.append(Table("Agreement", columns, [(n, *e.values()) for n, e in named.items()]))
     return tables
-
-
-def _stage_row(
-    name: str, ms: Mapping[str, float], floor: float | None, moved: float | None
-) -> tuple[Cell, ...]:
-    median = ms["median"]
-    if floor is None or moved is None or not median:
-        return (name, *spread_row(ms), floor, None, None, None)
-    return (name, *spread_row(ms), floor, 100 * floor / median, moved / 1e6, moved / median / 1e6)
-
-
-def _frame_row(name: str, row: Figures) -> tuple[Cell, ...]:
-    ratio = row["over_clean"]["median"]
-    delivered = (row["delivered"]["ms"]["median"], row["delivered"]["row_ms"])
-    memory = (row["peak_mib"], row["frame_mib"])
-    return (name, *spread_row(row["ms"]), ratio, *delivered, *memory, row["same_bits"])
-
-
-def _placement_row(found: Figures) -> tuple[Cell, ...]:
-    slowest = sorted(found["stages_s"].items(), key=lambda item: -item[1])[:3]
-    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in slowest)
-    counts = (found["gaussians"], found["cameras"], found["cells"])
-    return (found["scene"], *counts, *spread_row(found["place_s"]), stages)
 
 
 def write_table(path: Path, result: Figures) -> None:

@@ -1,7 +1,7 @@
 """What every subject of `climategs bench` measures with: paired rounds, memory, figures.
 
-Cases run in turns, every other round in the opposite order, so that what the machine does meanwhile
-falls on all; ratios are taken round by round. All figures of a subject have one JSON form.
+Cases run in turns, every other round in the opposite order, so that a disturbance of the machine
+falls on all of them; ratios are taken round by round. All figures of a subject have one JSON form.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ import os
 import platform
 import re
 import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,6 +36,9 @@ FLIP = 1e-3  # a pixel off by more lies on the other side of a cut-off
 PACKAGES = ("climategs", "numpy", "torch", "triton", "numba", "llvmlite", "tbb", "gsplat")
 
 
+# ---- figures and their one JSON form ------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Table:
     """Figures as people read them. rows: as long as columns; None is an empty cell."""
@@ -47,13 +49,11 @@ class Table:
     note: str = ""
 
 
-def figures(
-    name: str, tables: Sequence[Table], *, machine: Mapping[str, Any] | None = None, **facts: Any
-) -> Figures:
-    """The JSON form of what a subject measured. machine: `machine_facts()` of before it began."""
+def figures(name: str, tables: Sequence[Table], *, machine: Figures, **facts: Any) -> Figures:
+    """The JSON form of a subject's figures. machine: `machine_facts()` from before it began."""
     return {
         "bench": name,
-        "machine": dict(machine or machine_facts()),
+        "machine": machine,
         "load_after": load_average(),
         "tables": [
             {**dataclasses.asdict(t), "columns": [*t.columns], "rows": [[*row] for row in t.rows]}
@@ -64,7 +64,7 @@ def figures(
 
 
 def print_figures(result: Figures) -> None:
-    """Tables in columns: words to the left, numbers to the right, to 3 significant digits."""
+    """Tables in columns: text to the left, numbers to the right, to 3 significant digits."""
     print(f"{result['bench']}: {machine_line(result)}")
     for table in result["tables"]:
         print(f"\n{table['title']}")
@@ -82,16 +82,17 @@ def markdown(result: Figures) -> str:
     """The machine and all tables, each under its title."""
     lines = [f"{machine_line(result)}."]
     for table in result["tables"]:
-        lines += ["", f"**{table['title']}**", "", *markdown_table(table)]
+        marks = ["---:" if numeric else "---" for numeric in _numeric_columns(table)]
+        rows = [[format_cell(cell) for cell in row] for row in table["rows"]]
+        lines += ["", f"**{table['title']}**", "", *markdown_lines(table["columns"], marks, rows)]
         lines += ["", table["note"]] if table["note"] else []
     return "\n".join(lines) + "\n"
 
 
-def markdown_table(table: Mapping[str, Any]) -> list[str]:
-    """Lines of one of a result's tables."""
-    rows = [[format_cell(cell) for cell in row] for row in table["rows"]]
-    marks = ["---:" if numeric else "---" for numeric in _numeric_columns(table)]
-    return [f"| {' | '.join(line)} |" for line in (table["columns"], marks, *rows)]
+def markdown_lines(
+    header: Sequence[str], marks: Sequence[str], rows: Sequence[Sequence[str]]
+) -> list[str]:
+    return [f"| {' | '.join(line)} |" for line in (header, marks, *rows)]
 
 
 def replace_marked(text: str, start: str, end: str, content: str) -> str:
@@ -130,43 +131,43 @@ def _numeric_columns(table: Mapping[str, Any]) -> list[bool]:
 # ---- time ---------------------------------------------------------------------------------------
 
 
-class Clock(Protocol):
-    """mark: the moment when what was asked for until now is done."""
-
-    def mark(self) -> Any: ...
-
-    def wait(self) -> None: ...
-
-    def seconds(self, first: Any, then: Any) -> float: ...
-
-
 class WallClock:
-    """The host's, for work that is done when its call returns."""
+    """The host's, for work that is done when its call returns. A mark is a moment on the clock."""
 
-    def mark(self) -> float:
+    def mark(self) -> Any:
         return time.perf_counter()
 
     def wait(self) -> None:
-        pass
+        """Until all work that was asked for is done."""
 
-    def seconds(self, first: float, then: float) -> float:
+    def seconds(self, first: Any, then: Any) -> float:
         return then - first
 
 
+class EventClock(WallClock):
+    """The GPU's: marks are events among its work, so that nothing waits while they are set."""
+
+    def mark(self) -> torch.cuda.Event:
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+    def wait(self) -> None:
+        torch.cuda.synchronize()
+
+    def seconds(self, first: torch.cuda.Event, then: torch.cuda.Event) -> float:
+        return first.elapsed_time(then) / 1e3
+
+
 def rounds(
-    cases: Mapping[str, Action],
-    repeats: int,
-    *,
-    warm_up: int = 1,
-    clock: Clock | None = None,
-    progress: bool = True,
+    cases: Mapping[str, Action], repeats: int, *, warm_up: int = 1, clock: WallClock | None = None
 ) -> dict[str, list[float]]:
     """Seconds of each case, one number a round. warm_up: rounds before the first that counts."""
     if repeats < 1 or not cases:
         raise ValueError(f"need repeats >= 1 and a case; got {repeats} and {list(cases)}")
     clock = clock or WallClock()
     marks: dict[str, list[tuple[Any, Any]]] = {name: [] for name in cases}
-    for repeat in tqdm(range(warm_up + repeats), unit="round", leave=False, disable=not progress):
+    for repeat in tqdm(range(warm_up + repeats), unit="round", leave=False):
         if repeat == warm_up:
             clock.wait()
         for name in in_turns(cases, repeat):
@@ -177,19 +178,18 @@ def rounds(
     return {name: [clock.seconds(*p) for p in each[warm_up:]] for name, each in marks.items()}
 
 
-def in_turns(names: Mapping[str, Any] | Sequence[str], repeat: int) -> list[str]:
+def in_turns(names: Mapping[str, Any], repeat: int) -> list[str]:
     """The names in order, and every other time in the opposite one."""
     return [*names] if repeat % 2 else [*names][::-1]
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """What nine of ten measurements stay below, beside the median and the least."""
+    """In the order in which tables list them; p90: nine of ten values are below."""
     low, middle, high = np.quantile(values, [0, 0.5, 0.9])
-    return {"min": float(low), "median": float(middle), "p90": float(high)}
+    return {"median": float(middle), "min": float(low), "p90": float(high)}
 
 
 def spread_ms(seconds: Sequence[float]) -> dict[str, float]:
-    """Of seconds, in milliseconds."""
     return spread([1e3 * s for s in seconds])
 
 
@@ -198,18 +198,13 @@ def spread_ratio(over: Sequence[float], under: Sequence[float]) -> dict[str, flo
     return spread([o / u for o, u in zip(over, under, strict=True)])
 
 
-def spread_row(spread: Mapping[str, float]) -> tuple[float, float, float]:
-    """Median, least and 90 %, as tables list them."""
-    return spread["median"], spread["min"], spread["p90"]
-
-
 def median_ms(seconds: Sequence[float]) -> float:
     return 1e3 * float(np.median(seconds))
 
 
 def image_difference(own: torch.Tensor, expected: torch.Tensor) -> dict[str, float]:
-    """Of rgb [H, W, 3], the channel of each pixel that is farthest off: what 99.9 % stay below, the
-    most, and how many pixels are off by more than FLIP.
+    """Of rgb [H, W, 3], by each pixel's worst channel: the 99.9 % quantile, the maximum, and how
+    many pixels are off by more than FLIP.
     """
     error = (own.detach().cpu() - expected.detach().cpu()).abs().amax(-1).numpy()
     return {
@@ -223,7 +218,6 @@ def image_difference(own: torch.Tensor, expected: torch.Tensor) -> dict[str, flo
 # ---- memory and processes -----------------------------------------------------------------------
 
 _STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_SAMPLE_EVERY_S = 0.1
 
 
 def status_mib(field: str) -> float:
@@ -234,21 +228,28 @@ def status_mib(field: str) -> float:
     return int(match[1]) / 1024
 
 
-def return_free_memory() -> None:
-    """Give freed heap back, which would hide what is taken next; glibc keeps up to 64 MiB."""
+def begin_peak() -> float | None:
+    """Resident MiB now, from where `VmHWM` counts on; None where the system cannot tell. Freed heap
+    is given back first, of which glibc keeps up to 64 MiB.
+    """
+    if not RESET_PEAK.is_file():
+        return None
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
-
-
-def extra_mib(action: Action) -> float:
-    """MiB that this process takes at the highest moment of an action, what it returns included,
-    above what it holds before.
-    """
-    return_free_memory()
     before = status_mib("VmRSS")
     RESET_PEAK.write_text("5")
+    return before
+
+
+def extra_mib(action: Action) -> float | None:
+    """MiB that this process takes at the highest moment of an action, its result included, above
+    what it holds before; None where the system cannot tell.
+    """
+    before = begin_peak()
+    if before is None:
+        return None
     kept = action()
     highest = status_mib("VmHWM")
     del kept  # alive until the mark was read
@@ -259,13 +260,11 @@ def peak_mib_in_subprocess(
     work: Callable[..., Action], arguments: tuple[Any, ...], within_s: float = 600
 ) -> float | None:
     """`extra_mib` of the action that work returns, in a fresh process: one that has rendered before
-    holds scratch memory. None where the system cannot tell.
+    holds scratch memory.
 
     Raises:
         RuntimeError: the process failed or took too long.
     """
-    if not RESET_PEAK.is_file():
-        return None
     found = run_in_subprocess(_extra_mib_of, (work, arguments), within_s)
     if "mib" not in found:
         raise RuntimeError(f"measuring the memory of {work.__name__}{arguments} failed: {found}")
@@ -319,34 +318,6 @@ def _send_result(
     sending.send(guarded(work, arguments))
 
 
-class MemorySampler:
-    """Resident MiB of this process while entered, on a thread of its own; Linux only."""
-
-    def __init__(self) -> None:
-        self.mib: list[float] = []
-
-    def _run(self, stop: threading.Event) -> None:
-        while not stop.wait(_SAMPLE_EVERY_S):
-            self.mib.append(status_mib("VmRSS"))
-
-    @contextlib.contextmanager
-    def sampling(self) -> Iterator[MemorySampler]:
-        stop = threading.Event()
-        thread = threading.Thread(target=self._run, args=(stop,), daemon=True)
-        thread.start()
-        try:
-            yield self
-        finally:
-            stop.set()
-            thread.join()
-
-    def at_share(self, share: float) -> float:
-        """MiB when that share of the time had passed, smoothed over a twentieth of it."""
-        middle, reach = share * len(self.mib), max(1, len(self.mib) // 20)
-        near = self.mib[max(0, int(middle) - reach) : int(middle) + reach] or self.mib[-1:]
-        return sum(near) / len(near)
-
-
 # ---- the machine --------------------------------------------------------------------------------
 
 
@@ -380,7 +351,6 @@ def load_average() -> float | None:
 
 
 def version_of(package: str) -> str | None:
-    """Of an installed package."""
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(package)
 
@@ -398,3 +368,52 @@ def _proc_field(path: str, name: str) -> str | None:
     with contextlib.suppress(OSError):
         found = re.search(rf"^{name}\s*:\s*(.*)$", Path(path).read_text(), re.MULTILINE)
         return found[1] if found else None
+
+
+# ---- the GPU ------------------------------------------------------------------------------------
+
+
+def check_gpu() -> None:
+    """Raises BackendUnavailable where there is no GPU to measure."""
+    from augment.errors import BackendUnavailable
+    from augment.render.buffers import available_backends
+    from augment.render.cuda.runtime import has_gpu
+
+    if not has_gpu():
+        why = available_backends()["cuda"] or (
+            f"torch {torch.__version__} sees no GPU, or TRITON_INTERPRET is set"
+        )
+        raise BackendUnavailable(f"there is no GPU to measure here: {why}")
+
+
+def gpu_facts() -> Figures | None:
+    """Of the current GPU; None where torch sees none."""
+    if not torch.cuda.is_available():
+        return None
+    found = torch.cuda.get_device_properties(torch.cuda.current_device())
+    return {
+        "name": found.name,
+        "memory_gib": round(found.total_memory / 2**30, 1),
+        "processors": found.multi_processor_count,
+        "capability": f"{found.major}.{found.minor}",
+        "cuda": torch.version.cuda,
+        "triton": version_of("triton"),
+    }
+
+
+def peak_gpu_mib(action: Action) -> tuple[float, float] | tuple[None, None]:
+    """MiB of tensors on the GPU at the action's highest moment: all of them, and above what lay
+    there before. None without a GPU. What torch holds free is not counted.
+    """
+    if not torch.cuda.is_available():
+        return None, None
+    gc.collect()
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    kept = action()
+    torch.cuda.synchronize()
+    highest = torch.cuda.max_memory_allocated()
+    del kept
+    return highest / 2**20, (highest - before) / 2**20

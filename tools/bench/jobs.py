@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ import torch
 
 from adapters.base import open_scene
 from augment.cameras import Camera, Frame
-from augment.effects.smog import SmogMedium
 from augment.files.export import export_ply
 from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import WorkSetup
@@ -43,27 +43,28 @@ from recipes.template import RecipeTemplate
 from tools.bench.harness import (
     Action,
     Figures,
-    MemorySampler,
     Table,
     figures,
     machine_facts,
     median_ms,
     peak_mib_in_subprocess,
     rounds,
-    spread,
+    status_mib,
 )
-from tools.bench.scenes import RasterCase, random_scene, street_scene
+from tools.bench.scenes import RasterCase, random_scene, street_uri
 
 # Labels and LiDAR are left out of the comparison: they are work that bare rendering does not do.
-_PLAIN = "output: {labels: false, lidar: false}\n"
-_BLOCK_IMAGES = 12  # several variants in small blocks: both workers have work to the end
+PLAIN = "output: {labels: false, lidar: false}\n"
+BLOCK_IMAGES = 12  # several variants in small blocks: both workers have work to the end
 BARE = "a loop: render, encode, write"
+TINY_CAMERAS, TINY_PERIOD_NS = ("front", "rear"), 100_000_000
 
 
 @dataclass(frozen=True)
 class JobsCase:
     """scene, scale, variants: of the images in fog that are compared. images: of the long job.
-    gaussians: of the scene that is opened, SH of degree 3.
+    gaussians: of the scene that is opened, SH of degree 3. workers: processes of the jobs that are
+    compared. memory: whether it is measured.
     """
 
     scene: str = "procedural:street?seed=3&frames=4&width=1600&height=1066"
@@ -71,28 +72,24 @@ class JobsCase:
     variants: int = 3
     images: int = 10_000
     gaussians: int = 1_000_000
+    workers: tuple[int, ...] = (1, 2)
+    memory: bool = True
 
 
 WHOLE = JobsCase()
 QUICK = JobsCase("procedural:street?seed=3&frames=4", 0.1, images=500, gaussians=50_000)
 
 
-def bench_jobs(
-    case: JobsCase = WHOLE,
-    *,
-    scene_uri: str | None = None,
-    repeats: int = 3,
-    workers: tuple[int, ...] = (1, 2),
-    memory: bool = True,
-    progress: bool = True,
+def measure(
+    quick: bool = False, scene: str | None = None, repeats: int = 3, case: JobsCase | None = None
 ) -> Figures:
-    """scene_uri: another scene that is opened. workers: processes of the jobs that are compared."""
-    machine = machine_facts()
+    """scene: another scene that is opened."""
+    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         folder = Path(name)
-        compared = _compare(case, folder, repeats, workers, progress)
-        long = _long_job(case.images, folder / "long")
-        opened = _opening(case.gaussians, scene_uri, folder, repeats, memory, progress)
+        compared = _compare(case, folder, repeats)
+        long = _run_long_job(case.images, folder / "long")
+        opened = _open_files(case, scene, folder, repeats)
     tables = [
         Table(
             "Images of a job beside bare rendering, PNG and depth",
@@ -113,26 +110,24 @@ def bench_jobs(
 # ---- beside bare rendering ----------------------------------------------------------------------
 
 
-def _compare(
-    case: JobsCase, folder: Path, repeats: int, workers: tuple[int, ...], progress: bool
-) -> list[tuple]:
-    recipes = _recipes_of(case)
-    job = _job(case.scene, recipes, folder)
+def _compare(case: JobsCase, folder: Path, repeats: int) -> list[tuple]:
+    template = load_recipe("dense-fog")
+    values = (*template.values, *parse_recipe(PLAIN, source="bench", name="bench").values)
+    template = dataclasses.replace(template, values=values, variants=case.variants)
+    job = _job(case.scene, template, folder, scale=case.scale, block_images=BLOCK_IMAGES)
     ways: dict[str, Callable[[Path], float]] = {
-        BARE: lambda out: _bare(case.scene, recipes, out),
-        "generate, this process": lambda out: _generate(job, out, "serial", 1),
+        BARE: partial(_bare, case.scene, job.recipes),
+        "generate, this process": partial(_generate, job, "serial", 1),
     } | {
-        f"generate, {count} processes of their own": (
-            lambda out, count=count: _generate(job, out, "processes", count)
-        )
-        for count in workers
+        f"generate, {count} processes of their own": partial(_generate, job, "processes", count)
+        for count in case.workers
     }
     took: dict[str, list[float]] = {name: [] for name in ways}
 
     def run(name: str) -> None:
         took[name].append(ways[name](folder / f"{[*ways].index(name)}-{len(took[name])}"))
 
-    rounds({name: lambda name=name: run(name) for name in ways}, repeats, progress=progress)
+    rounds({name: partial(run, name) for name in ways}, repeats)
     bare = median_ms(took[BARE][1:])
     return [
         (name, ms, 1e3 * (max(own) - min(own)), 1e3 / ms, ms / bare)
@@ -145,17 +140,15 @@ def _bare(uri: str, recipes: JobRecipes, out: Path) -> float:
     """Seconds an image of a loop: nothing is durable, nothing remembered."""
     scene = open_scene(uri)
     views = [
-        (recipe, frame, name, camera)
+        (recipe, camera, out / variant_name(recipe) / f"{name.replace('/', '_')}-{frame.index}")
         for recipe in recipes.of_scene(recipes.job.scenes[0], scene.name)
         for frame in scene.frames
         for name, camera in frame.cameras.items()
     ]
-    render_view(scene, views[0][-1], views[0][0])
+    render_view(scene, views[0][1], views[0][0])
     pump, started = WritePump(), time.perf_counter()
-    for recipe, frame, name, camera in views:
-        view = render_view(scene, camera, recipe)
-        path = out / variant_name(recipe) / f"{name.replace('/', '_')}-{frame.index}"
-        pump.submit(lambda view=view, path=path, recipe=recipe: _write(view, path, recipe))
+    for recipe, camera, path in views:
+        pump.submit(partial(_write, render_view(scene, camera, recipe), path, recipe))
     pump.close()
     return (time.perf_counter() - started) / len(views)
 
@@ -167,7 +160,7 @@ def _write(view: WeatheredView, path: Path, recipe: Recipe) -> None:
     path.with_suffix(".png").write_bytes(encode_image(view.rgb, recipe.output))
 
 
-def _generate(job: GenerateJob, out: Path, executor: str, workers: int) -> float:
+def _generate(job: GenerateJob, executor: str, workers: int, out: Path) -> float:
     """Seconds an image of a job once all its workers have the scene and their kernels."""
     setup = dataclasses.replace(job.setup, store_uri=str(out))
     run = dataclasses.replace(job, setup=setup, executor=executor, workers=workers)
@@ -189,42 +182,34 @@ def _refuse_failure(block: Block, message: str) -> None:
     raise RuntimeError(f"{block.key}: {message}")
 
 
-def _recipes_of(case: JobsCase) -> JobRecipes:
-    template = load_recipe("dense-fog")
-    plain = parse_recipe(_PLAIN, source="bench", name="bench").values
-    values = (*template.values, *plain)
-    template = dataclasses.replace(template, values=values, variants=case.variants)
-    return _job_recipes(template, case.scale, _BLOCK_IMAGES)
-
-
-def _job_recipes(
-    template: RecipeTemplate, scale: float = 1.0, block_images: int = 64
-) -> JobRecipes:
+def _job(
+    uri: str,
+    template: RecipeTemplate,
+    out: Path,
+    *,
+    scale: float = 1.0,
+    block_images: int = 64,
+    **setup: Any,
+) -> GenerateJob:
     fields = {"scenes": ["-"], "recipes": [template.name], "scale": scale}
     job = Job.model_validate({**fields, "block_images": block_images})
-    return JobRecipes(job, {template.name: template})
-
-
-def _job(uri: str, recipes: JobRecipes, out: Path, **setup: Any) -> GenerateJob:
     given = WorkSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
-    return GenerateJob(recipes, [recipes.job.scenes[0].model_copy(update={"uri": uri})], given)
+    scenes = [job.scenes[0].model_copy(update={"uri": uri})]
+    return GenerateJob(JobRecipes(job, {template.name: template}), scenes, given)
 
 
 # ---- a long job of tiny images ------------------------------------------------------------------
 
-_CAMERAS, _WIDTH, _HEIGHT, _PERIOD_NS = ("front", "rear"), 32, 18, 100_000_000
 
-
-def _long_job(images: int, out: Path) -> Mapping[str, float]:
-    frames = -(-images // len(_CAMERAS))
-    template = parse_recipe("weather: {smog: {visibility_m: 100}}\n", source="tiny", name="tiny")
-    tiny = {"open_scene": open_tiny, "renderer": render_tiny}
-    job = _job(f"tiny:{frames}", _job_recipes(template), out, **tiny)
+def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
+    frames = -(-images // len(TINY_CAMERAS))
+    template = parse_recipe(PLAIN, source="tiny", name="tiny")
+    job = _job(f"tiny:{frames}", template, out, open_scene=open_tiny, renderer=render_tiny)
     job = dataclasses.replace(job, executor="serial")
-    with MemorySampler().sampling() as memory:
-        result = run_generate(job, progress=False)
+    result = run_generate(job, progress=False)
+    resident = status_mib("VmRSS")
     again = run_generate(job, progress=False)
-    if (result.written, again.skipped) != (frames * len(_CAMERAS),) * 2:
+    if (result.written, again.skipped) != (frames * len(TINY_CAMERAS),) * 2:
         raise RuntimeError(f"the job did not do what is measured: {result}, {again}")
     started = time.perf_counter()
     (status,) = read_status(open_store(out))
@@ -237,67 +222,38 @@ def _long_job(images: int, out: Path) -> Mapping[str, float]:
         "an image, ms": 1e3 * result.timings["render_wall"] / result.written,
         "resume when all is done, s": again.timings["plan"] + again.timings["scan"],
         "--status, s": status_s,
-        "resident after a fifth, MiB": memory.at_share(0.2),
-        "resident at the end, MiB": memory.at_share(1.0),
+        "resident at the end, MiB": resident,
         "resident at most, MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
 
 
-@dataclass(frozen=True)
-class _TinySmog:
-    medium: SmogMedium | None = None
-    surface_depth_m: np.ndarray | None = None
-    water_level_z_m: float | None = None
-
-
-@dataclass(frozen=True)
-class _TinyView:
-    rgb: np.ndarray
-    depth_m: np.ndarray | None
-    semantic: None = None
-    instance: None = None
-    water: None = None
-    flood: None = None
-    snow: None = None
-    snowy: None = None
-    smoggy: _TinySmog | None = None
-    surface: None = None
-
-
 def open_tiny(uri: str) -> Scene:
     """`tiny:N`: N frames of two cameras and one splat."""
-    one = torch.zeros(1, 3)
-    turn = torch.tensor([[1.0, 0, 0, 0]])
+    one, turn = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])
     splat = Gaussians(one, turn, one + 0.1, torch.ones(1), torch.zeros(1, 1, 3))
     frames = tuple(map(_tiny_frame, range(int(uri.removeprefix("tiny:")))))
     return Scene(uri, uri, splat, (), ConstantSky(one[0]), frames)
 
 
 def _tiny_frame(index: int) -> Frame:
-    pose, time_ns = torch.eye(4, dtype=torch.float64), index * _PERIOD_NS
-    size = (_WIDTH, _HEIGHT, 20.0, 20.0, _WIDTH / 2, _HEIGHT / 2)
-    return Frame(
-        index, time_ns, pose, {name: Camera(name, *size, pose, time_ns) for name in _CAMERAS}
-    )
+    pose, time_ns = torch.eye(4, dtype=torch.float64), index * TINY_PERIOD_NS
+    cameras = {n: Camera(n, 32, 18, 20.0, 20.0, 16.0, 9.0, pose, time_ns) for n in TINY_CAMERAS}
+    return Frame(index, time_ns, pose, cameras)
 
 
-def render_tiny(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> _TinyView:
+def render_tiny(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> WeatheredView:
     """An image of one colour, another for every time."""
-    shade = camera.timestamp_ns // _PERIOD_NS % 256
+    shade = camera.timestamp_ns // TINY_PERIOD_NS % 256
     rgb = np.full((camera.height, camera.width, 3), shade, np.uint8)
-    smoggy = _TinySmog() if recipe.weather.smog is not None else None
-    return _TinyView(rgb, np.full(rgb.shape[:2], 4.0, np.float32), smoggy=smoggy)
+    return WeatheredView(camera, rgb, np.full(rgb.shape[:2], 4.0, np.float32), None, None)
 
 
 # ---- opening scenes -----------------------------------------------------------------------------
 
 
-def _opening(
-    gaussians: int, uri: str | None, folder: Path, repeats: int, memory: bool, progress: bool
-) -> list[tuple]:
-    scene = street_scene(gaussians=60_000)
-    own, _ = random_scene(RasterCase(gaussians, 1600, 1066))
-    scene = dataclasses.replace(scene, background=own)
+def _open_files(case: JobsCase, uri: str | None, folder: Path, repeats: int) -> list[tuple]:
+    gaussians, _ = random_scene(RasterCase(case.gaussians, 1600, 1066))
+    scene = dataclasses.replace(open_scene(street_uri(gaussians=60_000)), background=gaussians)
     save_scene(scene, folder / "scene")
     save_scene_file(scene, folder / "scene.climategs")
     save_scene_file(scene, folder / "half.climategs", half=True)
@@ -308,20 +264,18 @@ def _opening(
         "scene: file": f"scene:{folder / 'scene.climategs'}",
         "scene: file, half precision": f"scene:{folder / 'half.climategs'}",
     } | ({} if uri is None else {uri: uri})
-    cases = {name: lambda uri=uri: open_scene(uri) for name, uri in ways.items()}
-    seconds = rounds(cases, repeats, progress=progress)
+    seconds = rounds({name: partial(open_scene, own) for name, own in ways.items()}, repeats)
     rows = []
-    for name, uri in ways.items():
-        mib = open_scene(uri).gaussian_bytes / 2**20
-        peak = peak_mib_in_subprocess(_opening_of, (uri,)) if memory else None
-        ms = spread([1e3 * each for each in seconds[name]])["median"]
-        rows.append((name, ms, mib, None if peak is None else peak / mib))
+    for name, own in ways.items():
+        mib = open_scene(own).gaussian_bytes / 2**20
+        peak = peak_mib_in_subprocess(_opening_of, (own,)) if case.memory else None
+        rows.append((name, median_ms(seconds[name]), mib, None if peak is None else peak / mib))
     return rows
 
 
 def _opening_of(uri: str) -> Action:
     """A long-lived process imports what opening needs once."""
-    open_scene("procedural:street?seed=3&frames=1&gaussians=60000")
+    open_scene(street_uri(gaussians=60_000))
     with contextlib.suppress(Exception):
         open_scene(f"{uri.partition(':')[0]}:/nowhere")
     return lambda: open_scene(uri)

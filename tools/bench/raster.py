@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
@@ -25,7 +26,6 @@ from tools.bench.harness import (
     rounds,
     spread_ms,
     spread_ratio,
-    spread_row,
 )
 from tools.bench.scenes import LARGE_CASE, SMALL_CASE, RasterCase, random_scene
 
@@ -33,64 +33,59 @@ STAGES = ("project", "sort", "bin", "raster")
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
 SMOG = SmogMedium(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
+           "scene MiB", "frame MiB")  # fmt: skip
+REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",
+                     "pixels")  # fmt: skip
 REFERENCE_CASE = RasterCase(5_000, 320, 240)  # what the torch reference draws within a second
 
 
-def bench_raster(
-    cases: Sequence[RasterCase] = (SMALL_CASE, LARGE_CASE),
-    *,
-    repeats: int = 7,
-    quick: bool = False,
-    memory: bool = True,
-    reference_case: RasterCase = REFERENCE_CASE,
-    progress: bool = True,
-) -> Figures:
-    """repeats: timed rounds of a clear and a smoggy frame a scene. quick: the first case only.
-    memory: also start a process a case that measures peak memory.
-    """
-    machine, warm_up_s = machine_facts(), warm_up()
-    stages, work, facts = [], [], []
-    for case in cases[:1] if quick else cases:
-        found = _measure(case, repeats, memory, progress)
+@dataclass(frozen=True)
+class RasterCases:
+    """reference: of the torch reference beside ours. memory: whether it is measured."""
+
+    scenes: Sequence[RasterCase] = (SMALL_CASE, LARGE_CASE)
+    reference: RasterCase = REFERENCE_CASE
+    memory: bool = True
+
+
+WHOLE, QUICK = RasterCases(), RasterCases((SMALL_CASE,))
+
+
+def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = None) -> Figures:
+    """repeats: timed rounds of a clear and a smoggy frame a scene."""
+    machine, cases = machine_facts(), cases or (QUICK if quick else WHOLE)
+    warm_up_s, stages, work, facts = warm_up(), [], [], []
+    for case in cases.scenes:
+        found = _measure(case, repeats, cases.memory)
         facts.append(found)
         timed = {**found["stages_ms"], "frame": found["ms"], "with smog": found["smog_ms"]}
-        stages += [(case.name, name, *spread_row(ms)) for name, ms in timed.items()]
-        work.append(
-            (
-                case.name,
-                found["smog_over_clear"]["median"],
-                found["visible"],
-                found["pairs"],
-                found["listed_pairs"],
-                found["pairs"] / found["ms"]["median"] / 1e3,
-                found["scene_mib"],
-                found["frame_mib"],
-            )
-        )
-    beside = _beside_reference(reference_case, min(repeats, 3))
-    columns = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
-               "scene MiB", "frame MiB")  # fmt: skip
+        stages += [(case.name, name, *ms.values()) for name, ms in timed.items()]
+        rate = found["pairs"] / found["ms"]["median"] / 1e3
+        counts = (found["visible"], found["pairs"], found["listed_pairs"], rate)
+        memory = (found["scene_mib"], found["frame_mib"])
+        work.append((case.name, found["smog_over_clear"]["median"], *counts, *memory))
+    beside = _beside_reference(cases.reference, min(repeats, 3))
     tables = [
         Table("Frames", ("scene", "stage", "ms", "min", "p90"), stages),
-        Table("What a frame takes", columns, work, "pairs: of splats and 16x16 tiles"),
+        Table("What a frame takes", COLUMNS, work, "pairs: of splats and 16x16 tiles"),
         Table(
-            f"Beside the torch reference, {reference_case.name}",
-            ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped", "pixels"),
+            f"Beside the torch reference, {cases.reference.name}",
+            REFERENCE_COLUMNS,
             [[*beside.values()]],
             "difference of rgb; flipped: pixels off by more than 0.001",
         ),
     ]
-    return figures(
-        "raster", tables, machine=machine, warm_up_s=warm_up_s, cases=facts, reference=beside
-    )
+    extra = {"warm_up_s": warm_up_s, "cases": facts, "reference": beside}
+    return figures("raster", tables, machine=machine, **extra)
 
 
-def _measure(case: RasterCase, repeats: int, memory: bool, progress: bool) -> Figures:
+def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
     """stages_ms, ms, smog_ms: spreads, the frame's from call to images. visible: splats that touch
     a tile which nearer ones have not filled. pairs: of splats and 16x16 tiles that their boxes
     touch; listed_pairs: those of open tiles, which were blended.
     """
-    frame_mib = peak_mib_in_subprocess(_frame_of, (case,)) if memory else None
+    frame_mib = peak_mib_in_subprocess(frame_of, (case,)) if memory else None
     gaussians, camera = random_scene(case)
     parts, stages = [PosedGaussians(gaussians)], []
 
@@ -98,8 +93,7 @@ def _measure(case: RasterCase, repeats: int, memory: bool, progress: bool) -> Fi
         stages.append({})
         rasterize_cpu(parts, camera, BUFFERS, SETTINGS, None, stage_times=stages[-1])
 
-    frames = {"clear": clear, "smog": lambda: _draw(parts, camera, SMOG)}
-    seconds = rounds(frames, repeats, progress=progress)
+    seconds = rounds({"clear": clear, "smog": lambda: _draw(parts, camera, SMOG)}, repeats)
     tiles = bin_to_tiles(project_parts(parts, camera, SETTINGS), camera)
     return {
         "case": case.name,
@@ -121,7 +115,7 @@ def _draw(
     return rasterize_cpu(parts, camera, BUFFERS, SETTINGS, smog)
 
 
-def _frame_of(case: RasterCase) -> Action:
+def frame_of(case: RasterCase) -> Action:
     """A clear frame of a process that has compiled its kernels and holds the scene."""
     warm_up()
     gaussians, camera = random_scene(case)
@@ -137,14 +131,9 @@ def _beside_reference(case: RasterCase, repeats: int) -> Figures:
     def reference() -> RenderOutput:
         return rasterize_reference(parts, camera, BUFFERS, SETTINGS, None)
 
-    frames = {"reference": reference, "cpu": lambda: _draw(parts, camera)}
-    seconds = rounds(frames, repeats, progress=False)
-    ms = {name: median_ms(each) for name, each in seconds.items()}
+    seconds = rounds({"reference": reference, "cpu": lambda: _draw(parts, camera)}, repeats)
+    reference_ms, cpu_ms = median_ms(seconds["reference"]), median_ms(seconds["cpu"])
     actual, expected = _draw(parts, camera).rgb, reference().rgb
     assert actual is not None and expected is not None
-    return {
-        "reference_ms": ms["reference"],
-        "cpu_ms": ms["cpu"],
-        "speed_up": ms["reference"] / ms["cpu"],
-        **image_difference(actual, expected),
-    }
+    times = {"reference_ms": reference_ms, "cpu_ms": cpu_ms, "speed_up": reference_ms / cpu_ms}
+    return {**times, **image_difference(actual, expected)}

@@ -30,7 +30,6 @@ from recipes.weather import Flood, Snow, Style, Waves
 ZOOMS = (1.0, 0.8, 1.25, 1.6, 2.0, 2.5)  # the first that is near is taken
 NEAR_SHARE = 0.05  # of the image; as much off is about a third, too
 FOCAL_PER_WIDTH = 0.8125  # 520 px at 640, 1300 px at 1600
-_MULTIPLES = {"M": 1_000_000, "k": 1_000, "": 1}
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,11 @@ class RasterCase:
     width: int
     height: int
 
-    def __post_init__(self) -> None:
-        if min(self.count, self.width, self.height) < 1:
-            raise ValueError(f"count, width and height must be >= 1; got {self}")
-
     @property
     def name(self) -> str:
-        suffix = next(s for s, multiple in _MULTIPLES.items() if self.count % multiple == 0)
-        return f"{self.count // _MULTIPLES[suffix]}{suffix}@{self.width}x{self.height}"
+        multiples = {"M": 1_000_000, "k": 1_000, "": 1}
+        suffix = next(s for s, multiple in multiples.items() if self.count % multiple == 0)
+        return f"{self.count // multiples[suffix]}{suffix}@{self.width}x{self.height}"
 
 
 SMALL_CASE, LARGE_CASE = RasterCase(100_000, 640, 480), RasterCase(1_000_000, 1600, 1066)
@@ -79,31 +75,25 @@ def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]
     }
     gaussians = Gaussians(**{k: torch.from_numpy(v.astype(np.float32)) for k, v in fields.items()})
     rotation = torch.tensor([[0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
-    camera = Camera(
-        name="bench",
-        width=case.width,
-        height=case.height,
-        fx=focal,
-        fy=focal,
-        cx=case.width / 2,
-        cy=case.height / 2,
-        camera_from_world=rigid(rotation, torch.zeros(3, dtype=torch.float64)),
-    )
-    return gaussians, camera
+    pose = rigid(rotation, torch.zeros(3, dtype=torch.float64))
+    centre = (case.width / 2, case.height / 2)
+    return gaussians, Camera("bench", case.width, case.height, focal, focal, *centre, pose)
 
 
-def street_scene(seed: int = 3, frames: int = 1, **parameters: int) -> Scene:
-    """The procedural street; parameters: its URI's, such as gaussians=1_000_000."""
-    query = {"seed": seed, "frames": frames, **parameters}
-    return open_scene("procedural:street?" + "&".join(f"{k}={v}" for k, v in query.items()))
+def street_uri(frames: int = 1, gaussians: int | None = None) -> str:
+    size = "" if gaussians is None else f"&gaussians={gaussians}"
+    return f"procedural:street?seed=3&frames={frames}{size}"
+
+
+def front_name(names: Sequence[str]) -> str:
+    """The shortest with `front` in it, or the first."""
+    return min((name for name in names if "front" in name), key=len, default=names[0])
 
 
 def front_camera(scene: Scene, width: int | None = None) -> Camera:
     """That of the middle frame, by default of its own size."""
     cameras = scene.frames[len(scene.frames) // 2].cameras
-    camera = cameras[
-        min((n for n in cameras if "front" in n), key=len, default=next(iter(cameras)))
-    ]
+    camera = cameras[front_name([*cameras])]
     return camera if width is None else camera.scaled(width / camera.width)
 
 
@@ -113,15 +103,12 @@ def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
     plan = make_plan(flood_recipe("sky"), scene)
     for zoom in ZOOMS:
         scale = zoom * width / own.width
-        camera = dataclasses.replace(
-            own,
-            width=width,
-            height=height,
-            fx=own.fx * scale,
-            fy=own.fy * scale,
-            cx=width / 2 + scale * (own.cx - own.width / 2),
-            cy=height / 2 + scale * (own.cy - own.height / 2),
+        cx, cy = (
+            size / 2 + scale * off
+            for size, off in ((width, own.cx - own.width / 2), (height, own.cy - own.height / 2))
         )
+        size = {"width": width, "height": height, "cx": cx, "cy": cy}
+        camera = dataclasses.replace(own, fx=own.fx * scale, fy=own.fy * scale, **size)
         water = render_buffers(scene, camera.scaled(0.125), plan, backend=backend).water
         off = abs((0.0 if water is None else float(water.float().mean())) - 1 / 3)
         if off <= NEAR_SHARE:
@@ -147,15 +134,17 @@ def flood_recipe(
 
 
 def snow_recipe(
-    shading: str = "per_splat",
+    shading: str | None = "per_splat",
     *,
     cell_m: float = 0.05,
     output: Output = PICTURE_ONLY,
     **weather: Any,
 ) -> Recipe:
-    """10 cm of snow. weather: what else the recipe has."""
-    snow = Snow.model_validate({"depth_m": 0.1, "shading": shading, "cell_m": cell_m})
-    return Recipe(weather=Weather(snow=snow, **weather), output=output)
+    """10 cm of snow; shading: None for none. weather: what else the recipe has."""
+    if shading is not None:
+        fields = {"depth_m": 0.1, "shading": shading, "cell_m": cell_m}
+        weather["snow"] = Snow.model_validate(fields)
+    return Recipe(weather=Weather(**weather), output=output)
 
 
 def smog_recipe(visibility_m: float = 200) -> Recipe:
@@ -172,10 +161,11 @@ def record_street(
     *,
     scale: float = 1.0,
     cameras: Sequence[str] | None = None,
-    **street: int,
+    frames: int,
+    gaussians: int,
 ) -> tuple[Scene, Path]:
     """The procedural street, and the folder of one variant of it that a job has written."""
-    scene = street_scene(**street)
+    scene = open_scene(street_uri(frames, gaussians))
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": scale})})
     job = RenderJob(scene.source, [recipe], folder, cameras=cameras)
     run_job(job, scene_loader=lambda _: scene)
