@@ -10,7 +10,6 @@ import signal
 import time
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,21 +26,15 @@ from augment.errors import ClimateGSError
 from augment.geometry import rigid
 from augment.ground import ground_of
 from augment.jobs.block_worker import WorkSetup
-from augment.jobs.blocks import JobStatus, Plan, read_status, shard_of
+from augment.jobs.blocks import JobStatus, read_status, shard_of
 from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
-from augment.jobs.generate import (
-    GenerateJob,
-    GenerateResult,
-    default_scratch,
-    plan_job,
-    run_generate,
-)
+from augment.jobs.generate import GenerateJob, default_scratch, plan_job, run_generate
 from augment.jobs.layout import STATE_FOLDER, variant_name
 from augment.jobs.manifest import lidar_notes
 from augment.jobs.processes import choose_backend, renders_on_gpu
 from augment.jobs.quality import recipes_to_try, resolve_quality_for
-from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.store import Store, open_store
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.store import open_store
 from augment.jobs.worker import shares_of
 from augment.labels import Boxes, LidarSweep
 from augment.plan import make_plan
@@ -54,14 +47,19 @@ from augment.sky import CubemapSky
 from augment.views import render_view
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe
-from recipes.schema import FramePattern, Recipe, free_knobs, parse_frames
+from recipes.schema import Recipe, free_knobs, parse_frames
 from recipes.weather import found
 from tools.drawing import draw_sheet, draw_video
 from tools.export import mirror_outputs, recipes_for_source
-from tools.output import print_images, print_note
+from tools.output import fill, print_images, print_note
 
-# ---- Compiling what a job's recipes need before it starts, so that no image waits for it ---------
+if TYPE_CHECKING:
+    from tools.cli import GenerateOptions, RenderOptions
 
+DEMO_RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow", "evening")
+DEMO_CAMERA = "front"  # the one that is shown as a video
+_MAX_LINES = 20  # of scenes and recipes
+# Of the scene that kernels are compiled with.
 SIZE = 32  # pixels a side
 ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
@@ -94,7 +92,7 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
     return time.perf_counter() - started
 
 
-@contextmanager
+@contextlib.contextmanager
 def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
     """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
 
@@ -192,15 +190,6 @@ def _camera(z_m: float) -> Camera:
     return Camera("warm-up", SIZE, SIZE, 20.0, 20.0, SIZE / 2, SIZE / 2, pose)
 
 
-# ---- `climategs generate`: a job file becomes a plan, and the plan a dataset ---------------------
-
-if TYPE_CHECKING:
-    from recipes.schema import Recipe
-    from tools.cli import GenerateOptions
-
-_MAX_LINES = 20
-
-
 def generate_dataset(options: GenerateOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
     job, out, backend = options.job, options.out, options.backend
@@ -227,10 +216,20 @@ def generate_dataset(options: GenerateOptions) -> int:
     )
     if options.dry_run:
         return _dry_run(task)
-    _check_writable(store)
+    # Learn that an output cannot be written before scenes are opened, which may take hours.
+    probe = f"{STATE_FOLDER}/probe-{uuid.uuid4().hex}"
+    store.write(probe, b"")
+    store.delete([probe])
     with ended_by_sigterm():
-        result = run_generate(task, prepare=lambda recipes: _warm_up(recipes, backend))
-    _report(result, out)
+        result = run_generate(
+            task, prepare=lambda recipes: _note_compiled(warm_up_for_workers(recipes, backend))
+        )
+    print_images(result, _duration(result.seconds))
+    if shares := shares_of(result.timings):
+        print(shares.sentence)
+    for uri, why in result.unusable.items():
+        print_note(f"cannot be used: {uri}: {why}")
+    print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
     return 1 if result.failed or result.unusable else 0
 
 
@@ -244,7 +243,7 @@ def show_status(out: str) -> int:
     if not found:
         raise ClimateGSError(f"{out}: no job has been started there (no .climategs/jobs)")
     for status in found:
-        _print_status(status)
+        print(_status_text(status))
     return 0 if all(_is_done(status) for status in found) else 1
 
 
@@ -261,19 +260,20 @@ def parse_shard(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
-def _check_writable(store: Store) -> None:
-    """Learn that an output cannot be written before scenes are opened, which may take hours."""
-    name = f"{STATE_FOLDER}/probe-{uuid.uuid4().hex}"
-    store.write(name, b"")
-    store.delete([name])
-
-
 def _dry_run(job: GenerateJob) -> int:
     from augment.jobs.generate import estimate
 
     plan = plan_job(job)
-    blocks = shard_of(plan.blocks, *job.shard)
-    _print_plan(plan, len(blocks), job)
+    page = fill(
+        "plan.txt",
+        plan=plan,
+        recipes=len({block.recipe.name for block in plan.blocks}),
+        variants=len({(block.scene, block.variant) for block in plan.blocks}),
+        shard=job.shard,
+        blocks=shard_of(plan.blocks, *job.shard),
+        max_lines=_MAX_LINES,
+    )
+    print(page)
     guess = estimate(plan, open_scene, each=lambda name: print_note(f"trying {name}"))
     for name, sample in guess.samples.items():
         print(
@@ -289,60 +289,13 @@ def _dry_run(job: GenerateJob) -> int:
     return 1 if plan.unusable else 0
 
 
-def _print_plan(plan: Plan, blocks: int, job: GenerateJob) -> None:
-    recipes = dict.fromkeys(block.recipe.name for block in plan.blocks)
-    variants = len({(block.scene, block.variant) for block in plan.blocks})
-    print(
-        f"{plan.job}: {len(plan.records)} scenes, {len(recipes)} recipes, {variants} variants, "
-        f"{plan.images} images in {len(plan.blocks)} blocks"
-    )
-    number, count = job.shard
-    if count > 1:
-        images = sum(block.images for block in shard_of(plan.blocks, number, count))
-        print(f"shard {number}/{count}: {images} images in {blocks} blocks")
-    for name, record in list(plan.records.items())[:_MAX_LINES]:
-        images = sum(block.images for block in plan.blocks if block.scene == name)
-        print(f"  {name}: {images} images, opened in {record.open_s:.1f} s")
-    if len(plan.records) > _MAX_LINES:
-        print(f"  ... and {len(plan.records) - _MAX_LINES} more")
-    for uri, why in plan.unusable.items():
-        print(f"  cannot be used: {uri}: {why}")
-
-
-def _report(result: GenerateResult, out: str) -> None:
-    print_images(result, _duration(result.seconds))
-    if shares := shares_of(result.timings):
-        print(shares.sentence)
-    for uri, why in result.unusable.items():
-        print_note(f"cannot be used: {uri}: {why}")
-    print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
-
-
-def _print_status(status: JobStatus) -> None:
-    total = status.total
-    share = 100 * total.published / max(total.planned, 1)
-    print(
-        f"{status.job}: {total.published} of {total.planned} images published ({share:.1f} %), "
-        f"{status.blocks_published} of {status.blocks} blocks"
-    )
-    if status.staged:
-        print(f"  {status.staged} more are finished in blocks that are not")
-    if status.claims:
-        print(f"  {status.claims} blocks are being worked on")
-    if status.left_s and not _is_done(status):
-        print(f"  {status.images_per_s:.1f} images/s; about {_duration(status.left_s)} left")
-    for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe)):
-        open_ones = {n: g for n, g in groups.items() if g.published < g.planned}
-        for name, group in list(open_ones.items())[:_MAX_LINES]:
-            print(f"  {kind} {name}: {group.published} of {group.planned}")
-        if len(open_ones) > _MAX_LINES:
-            print(f"  ... and {len(open_ones) - _MAX_LINES} more {kind}s")
-    if total.in_failed_blocks:
-        print(
-            f"  with failures: blocks of {total.in_failed_blocks} images; start it again to retry"
-        )
-    for uri, why in status.unusable.items():
-        print(f"  cannot be used: {uri}: {why}")
+def _status_text(status: JobStatus) -> str:
+    unfinished = {
+        kind: [(name, g) for name, g in groups.items() if g.published < g.planned]
+        for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe))
+    }
+    left = _duration(status.left_s) if status.left_s and not _is_done(status) else ""
+    return fill("status.txt", status=status, left=left, unfinished=unfinished, max_lines=_MAX_LINES)
 
 
 def _is_done(status: JobStatus) -> bool:
@@ -350,9 +303,7 @@ def _is_done(status: JobStatus) -> bool:
     return total.published == total.planned and not total.in_failed_blocks and not status.unusable
 
 
-def _warm_up(recipes: list[Recipe], backend: str) -> None:
-
-    seconds = warm_up_for_workers(recipes, backend)
+def _note_compiled(seconds: float) -> None:
     if seconds > 1:
         print_note(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
 
@@ -385,30 +336,23 @@ def _size(count: float) -> str:
     return f"{count / 1000**step:.1f} {steps[step]}"
 
 
-# ---- render --------------------------------------------------------------------------------------
-
-if TYPE_CHECKING:
-    from tools.cli import RenderOptions
-
-DEMO_RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow", "evening")
-DEMO_CAMERA = "front"  # the one that is shown as a video
-
-
 def render_recipe(options: RenderOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
     out, backend = options.out, options.backend
     recipes = resolve_variants(options.recipe, options.variants, options.scale)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
-    seconds = warm_up(tried, backend)
-    if seconds > 1:
-        print_note(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+    _note_compiled(warm_up(tried, backend))
     scene = open_scene(options.scene)
     if options.camera_path is None:
         check_frames(scene)
     for problem in scene.problems:
         print_note(f"note: {problem}")
     if options.layout == "source":
-        _check_no_path(options.camera_path)
+        if options.camera_path is not None:
+            raise ClimateGSError(
+                f"--camera-path {options.camera_path} shows frames that the dataset does not have: "
+                f"--layout source is for the scene's own frames"
+            )
         recipes = recipes_for_source(scene, out, recipes, overwrite=options.overwrite)
     if any(resolved.weather.flood is not None for resolved in recipes):
         scene = replace(scene, ground=ground_of(scene))  # looked for once, not by every worker
@@ -418,7 +362,11 @@ def render_recipe(options: RenderOptions) -> int:
     recipes = [_with_quality(resolved, scene, options, path) for resolved in recipes]
     for resolved in recipes:
         make_plan(resolved, scene)  # refuse once, not for every image
-    chosen = _pattern(options.frames).select([frame.index for frame in scene.frames])
+    try:
+        pattern = parse_frames(options.frames)
+    except ValueError as error:
+        raise ClimateGSError(f"--frames {error}") from None
+    chosen = pattern.select([frame.index for frame in scene.frames])
     notes = lidar_notes(recipes)
     labelled = SceneIndex.of(scene, path).labelled
     asked = labelled if chosen is None else labelled.intersection(chosen)
@@ -437,7 +385,14 @@ def render_recipe(options: RenderOptions) -> int:
         overwrite=options.overwrite,
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
-    _render_report(result, options.workers)
+    print_images(result, f"{result.seconds:.1f} s")
+    if result.written:
+        kinds = ("render", "encode", "write")
+        each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
+        print(f"per image: {', '.join(each)} (on threads that overlap)")
+    if shares := shares_of(result.timings, held_up=options.workers):
+        print(shares.sentence)
+    print(f"manifest: {result.manifest}")
     if options.layout == "source":
         names = [variant_name(resolved) for resolved in recipes]
         for sentence in mirror_outputs(scene, out, variants=names, links=options.links):
@@ -481,32 +436,6 @@ def _with_quality(
         f"{variant_name(recipe)}: quality {recipe.quality.words} chose {', '.join(settings)}"
     )
     return resolved
-
-
-def _pattern(text: str) -> FramePattern:
-    try:
-        return parse_frames(text)
-    except ValueError as error:
-        raise ClimateGSError(f"--frames {error}") from None
-
-
-def _check_no_path(camera_path: Path | None) -> None:
-    if camera_path is not None:
-        raise ClimateGSError(
-            f"--camera-path {camera_path} shows frames that the dataset does not have: "
-            f"--layout source is for the scene's own frames"
-        )
-
-
-def _render_report(result: JobResult, workers: int) -> None:
-    print_images(result, f"{result.seconds:.1f} s")
-    if result.written:
-        kinds = ("render", "encode", "write")
-        each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
-        print(f"per image: {', '.join(each)} (on threads that overlap)")
-    if shares := shares_of(result.timings, held_up=workers):
-        print(shares.sentence)
-    print(f"manifest: {result.manifest}")
 
 
 def run_demo(out: Path, frames: int) -> int:
