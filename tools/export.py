@@ -37,7 +37,6 @@ from augment.jobs.manifest import OK, read_manifest, rows_of
 from augment.jobs.mirror import (
     MIRROR_FOLDER,
     Links,
-    Mirrored,
     SourceTree,
     Survey,
     Weathered,
@@ -56,7 +55,7 @@ from augment.jobs.processes import OutputLock
 from augment.scene import Scene
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from tools.output import print_note
+from tools.output import fill, print_note
 
 # ------------------------------------------------------------------------------------------------
 # `--layout source` and `climategs mirror`: a variant as a copy of the dataset it was made from
@@ -182,7 +181,9 @@ def _mirror_rows(
         links=links,
         progress=progress,
     )
-    return [*_sentences(done, tree, links), *(f"  {note}" for note in [*notes, *unplaced, *more])]
+    sweeps = sum(tree.is_sweep(place) for place in done.weathered)
+    page = fill("mirror.txt", done=done, sweeps=sweeps, root=tree.root, links=links)
+    return [*page.split("\n"), *(f"  {note}" for note in [*notes, *unplaced, *more])]
 
 
 def _of_other_scenes(
@@ -297,55 +298,6 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
             f"{written_as} for the dataset's copy: `climategs mirror {out} --scene URI` makes it "
             f"from the images there; or choose another output folder, or add --overwrite"
         )
-
-
-def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
-    replaced = len(done.replaced)
-    state = f"{done.changed} files put in place" if done.changed else "up to date"
-    lines = [f"dataset: {done.folder} ({state})"]
-    clear = f"; {done.images - replaced} stay clear, as recorded" if done.images > replaced else ""
-    lines.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
-    if done.sweeps:
-        count = sum(tree.is_sweep(place) for place in done.weathered)
-        clear = f"; {done.sweeps - count} stay clear, as recorded" if done.sweeps > count else ""
-        lines.append(
-            f"  {count} of {done.sweeps} LiDAR sweeps are weathered"
-            + (", lost returns left out" if count else "")
-            + clear
-        )
-    if done.resized:
-        (rendered, recorded) = done.resized[0]
-        lines.append(
-            f"  {len(done.resized)} were rendered at another size and resized, such as "
-            f"{rendered[0]}x{rendered[1]} to {recorded[0]}x{recorded[1]} pixels"
-        )
-    if done.linked:
-        lines.append(
-            f"  {done.linked} files are shared with {tree.root} ({_megabytes(done.linked_size)}): "
-            f"changed in place, they change there too; --links copy shares nothing"
-        )
-    if done.copied:
-        why = ", made by --links copy or where the system cannot link" if links == "hard" else ""
-        lines.append(f"  {done.copied} files are copies ({_megabytes(done.copied_size)}){why}")
-    if done.new:
-        lines.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
-    for names, what in (
-        (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
-        (done.missing, "recorded images are no longer in the source: nothing stands for them"),
-        (
-            done.outdated,
-            "files of LiDAR of other scenes are out of date: the source's own stand "
-            "there until their scenes are mirrored",
-        ),
-        (done.others, "files in the copy are not the source's: they are left"),
-    ):
-        if names:
-            lines.append(f"  {len(names)} {what}; the first is {names[0]}")
-    return lines
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB"
 
 
 # ---- export --------------------------------------------------------------------------------------

@@ -51,7 +51,7 @@ from augment.semantics import SemanticClass
 from recipes.weather import Style, no_such_style, style_preset_names
 from tools.drawing import captioned, strip, write_rgb
 from tools.options import StyleTrainOptions, uri_text
-from tools.output import check_scene_out, path_beside, print_note
+from tools.output import check_scene_out, fill, path_beside, print_note
 from tools.training import (
     CHECKPOINT_S,
     PLAN_FILE,
@@ -388,43 +388,7 @@ def picture_path(out: Path) -> Path:
 
 def style_text(facts: Mapping[str, Any]) -> str:
     """The facts for people."""
-    lines = []
-    for name, one in facts["maps"].items():
-        rows = "   ".join(" ".join(f"{value:7.3f}" for value in row) for row in one["map"])
-        gains = ", ".join(f"{value:.2f}" for value in one["gains"])
-        lines.append(f"{name:8}  {rows}")
-        lines.append(f"          gains {gains}; condition {one['condition']:.1f}")
-    clamped = facts["clamped"]
-    for what in ("Gaussians", "pixels"):
-        if what in clamped:
-            below, above = clamped[what]["below 0"], clamped[what]["above 1"]
-            lines.append(
-                f"{what:9} with a colour below 0: {_percent(below)}; above 1: {_percent(above)}"
-            )
-    if (off := clamped.get("pixels off a render under the style")) is not None:
-        lines.append(
-            f"pixels where that makes more than 1/255 of difference to rendering the scene under "
-            f"the style: {100 * off:.2f} %"
-        )
-    seconds, applied = facts["seconds"], facts["apply"]
-    lines.append(
-        f"scene colours {1e3 * seconds['content']:.0f} ms, image to map "
-        f"{1e3 * seconds['image to map']:.0f} ms; {applied['gaussians']} Gaussians mapped in "
-        f"{1e3 * applied['in_place_s']:.1f} ms ({applied['in_place_gbps']:.1f} GB/s) in place, "
-        f"{1e3 * applied['new_memory_s']:.1f} ms into new memory; written in "
-        f"{seconds['write']:.1f} s"
-    )
-    if "picture" in facts:
-        lines.append(f"picture: {facts['picture']}")
-    lines.append(f"scene: {facts['out']}")
-    lines.append(
-        f"render it: climategs render clear --scene 'scene:{facts['out']}' --out out/styled"
-    )
-    return "\n".join(lines)
-
-
-def _percent(change: list[float]) -> str:
-    return f"{100 * change[0]:.2f} % before, {100 * change[1]:.2f} % after"
+    return fill("style.txt", **facts)
 
 
 def _style(
