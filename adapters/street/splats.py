@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,18 +33,6 @@ BLEND_LEAD = 0.62
 BACKED_BLEND_LEAD = 0.41
 
 
-@dataclass(frozen=True, eq=False)
-class Spacing:
-    """Per shape: spacing along [P, 2] both axes in metres per unit of coarseness; sink [P]: how far
-    below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]: no
-    camera sees it, so that its splats may be few but must keep clear of rims.
-    """
-
-    along: np.ndarray
-    sink: np.ndarray
-    hidden: np.ndarray
-
-
 def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
     """The same surfaces, long parallelograms halved until one spacing suits all of each."""
     done = []
@@ -73,8 +61,16 @@ def _halved(shapes: Shapes, axis: np.ndarray) -> Shapes:
     return join([first, second])
 
 
-def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
-    """Spacings of shapes seen from eyes [E, 3], in the shapes' frame; tree: what may hide them."""
+def plan_spacing(
+    shapes: Shapes, tree: Tree, eyes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How densely shapes seen from eyes [E, 3], in the shapes' frame, are to be covered. tree: what
+    may hide them.
+
+    Returns spacing along [P, 2] both axes, metres per unit of coarseness; how far below its surface
+    splats lie, in spacings, so that their blend is seen on it [P]; and hidden [P]: no camera sees
+    it, so that its splats may be few but must keep clear of rims.
+    """
     distance, view = _sightings(shapes, eyes)
     unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
     cosine = np.einsum("epk,pak->epa", view, unit)
@@ -88,7 +84,7 @@ def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
     along[hidden & flat] *= HIDDEN_STRETCH
     along *= shapes.spacing[:, None]
     sink = np.where(flat, _sink(distance, slant, facing, cosine, along, shapes.backed), 0.25)
-    return Spacing(along, sink, hidden)
+    return along, sink, hidden
 
 
 def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
@@ -449,32 +445,34 @@ SHADOW_HEIGHT_M = 0.035
 
 @dataclass(frozen=True, eq=False)
 class SplatPlan:
-    """Surfaces of one body, ready to be sampled at any coarseness."""
+    """Surfaces of one body, ready to be sampled at any coarseness; see plan_spacing."""
 
     body: Body
     shapes: Shapes
-    spacing: Spacing
+    spacing: np.ndarray
+    sink: np.ndarray
+    hidden: np.ndarray
 
     def counts(self, coarseness: float) -> np.ndarray:
         """Cells of the first layer along both axes, [P, 2]."""
-        along = np.maximum(self.spacing.along * coarseness, MIN_M)
-        return cell_counts(self.shapes, along, self.spacing.hidden)
+        along = np.maximum(self.spacing * coarseness, MIN_M)
+        return cell_counts(self.shapes, along, self.hidden)
 
     def backing(self, counts: np.ndarray) -> np.ndarray:
         """Cells of the second layer, [P, 2]; none where there is no such layer."""
-        is_backed = self.shapes.backed & ~self.spacing.hidden & (counts.min(1) >= BACKED_FROM)
+        is_backed = self.shapes.backed & ~self.hidden & (counts.min(1) >= BACKED_FROM)
         return np.where(is_backed[:, None], -(-counts // BACKING), 0)
 
     def total(self, coarseness: float) -> int:
         counts = self.counts(coarseness)
-        first = total_cells(self.shapes, counts, self.spacing.hidden)
+        first = total_cells(self.shapes, counts, self.hidden)
         return first + int(self.backing(counts).prod(1).sum())
 
 
 def plan_splats(body: Body, eyes: np.ndarray) -> SplatPlan:
     """How a body seen from eyes [E, 3] (its frame) is to be sampled."""
     shapes = split_long(body.shapes, eyes)
-    return SplatPlan(body, shapes, plan_spacing(shapes, body.tree, eyes))
+    return SplatPlan(body, shapes, *plan_spacing(shapes, body.tree, eyes))
 
 
 def coarseness_for(plans: list[SplatPlan], target: int) -> float:
@@ -493,10 +491,10 @@ def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
     """The Gaussians of a body."""
     counts = plan.counts(coarseness)
     backing = plan.backing(counts)
-    cells = make_cells(plan.shapes, counts, plan.spacing.hidden)
+    cells = make_cells(plan.shapes, counts, plan.hidden)
     cells = _uncovered(plan, cells)
     share = _sigma_per_side(plan, counts, backing)[cells.shape]
-    first = _gaussians(plan, cells, share, plan.spacing.sink[cells.shape])
+    first = _gaussians(plan, cells, share, plan.sink[cells.shape])
     # Under the ground the second layer may run on past an edge; behind a wall's it would be seen.
     upright = plan.shapes.semantic == SemanticClass.BUILDING
     below = make_cells(plan.shapes, backing, upright & (backing[:, 0] > 0))
@@ -509,18 +507,14 @@ def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
 
 def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) -> np.ndarray:
     """Standard deviation per cell side of each shape's first layer, along both axes, [P, 2]."""
-    kind, hidden = plan.shapes.kind, plan.spacing.hidden
+    kind, hidden = plan.shapes.kind, plan.hidden
     share = np.where(backing[:, 0] > 0, BACKED_SIGMA_PER_SIDE, SIGMA_PER_SIDE)
     share = np.where(kind == Kind.TRIANGLE, MESH_SIGMA_PER_SIDE, share)
     share = np.where(kind == Kind.ELLIPSOID, BLOB_SIGMA_PER_SIDE, share)
     share = np.where(hidden & (kind == Kind.PARALLELOGRAM), NARROW_SIGMA_PER_SIDE, share)
-    single = [
-        (counts[:, i] == 1) & ((plan.shapes.edges & bits) == bits) for i, bits in enumerate(_ENDS)
-    ]
-    return np.where(np.stack(single, 1), NARROW_SIGMA_PER_SIDE, share[:, None])
-
-
-_ENDS = (U0 | U1, V0 | V1)
+    ends = np.array([U0 | U1, V0 | V1], np.uint8)
+    single = (counts == 1) & ((plan.shapes.edges[:, None] & ends) == ends)
+    return np.where(single, NARROW_SIGMA_PER_SIDE, share[:, None])
 
 
 def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
@@ -541,11 +535,10 @@ def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
 def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarray) -> Gaussians:
     """Splats of cells; share [N, 2]: sigma per cell side; sink [N]: depth in longer cell sides."""
     shapes, shape = plan.shapes, cells.shape
-    body = Body(shapes, plan.body.tree, plan.body.lighting)
     places = cells.places()
     curved = shapes.kind[shape] >= Kind.DISC
     places[:, curved] = cells.local[curved]
-    rgb = body.colors(shape, places)
+    rgb = replace(plan.body, shapes=shapes).colors(shape, places)
     normals = shapes.normals(shape, cells.local)
     frames, sigmas = _flat_covariance(cells.edges * share[:, :, None], normals)
     sides = np.linalg.norm(cells.edges, axis=2)

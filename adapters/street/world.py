@@ -63,7 +63,10 @@ from augment.semantics import SemanticClass as Class
 # y = 0, seen from y < 0.
 
 REVEAL_M = 0.14  # how deep windows stand in the wall
+SURROUND_M = 0.13
 GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
+SHOP_GLASS = replace(GLASS, material=Material.SHOP)
+_FRONT = ("-y", "+x", "-x", "+z", "-z")
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,6 @@ class Style:
     ground_m: float
     has_surround: bool
     has_shop: bool
-
-
-SHOP_GLASS = replace(GLASS, material=Material.SHOP)
 
 
 def panels(
@@ -147,10 +147,6 @@ def window(size_m: tuple[float, float], style: Style, fine: bool) -> Shapes:
         high = [(0.0, 0, height), (width + band, 0, height), (width + band, 0, height + 0.2)]
         parts.append(boxes(low, high, style.trim, faces=_FRONT))
     return join(parts)
-
-
-SURROUND_M = 0.13
-_FRONT = ("-y", "+x", "-x", "+z", "-z")
 
 
 def window_hole(corner: tuple[float, float], style: Style) -> list[Rectangle]:
@@ -222,16 +218,13 @@ def _lettering(x0: float, x1: float, z: float, style: Style) -> Shapes:
 def _awning(x0: float, x1: float, z: float, style: Style) -> Shapes:
     """Striped cloth, sloping out over the pavement, with a hem."""
     count = max(4, round((x1 - x0) / 0.45))
-    edges = np.linspace(x0, x1, count + 1)
+    edges = np.linspace(x0, x1, count + 1)[:-1]
+    slope, hem = np.array([0.0, 1.2, 0.55]), np.array([0.0, 0.0, -0.2])
     parts = []
     for start, look in ((0, style.accent), (1, style.trim)):
-        x = edges[:-1][start::2]
-        width = np.full(len(x), (x1 - x0) / count)
-        zero = np.zeros_like(x)
-        u = np.stack([width, zero, zero], 1)
-        top = np.stack([x, zero - 1.25, zero + z - 0.55], 1)
-        slope = np.array([0.0, 1.2, 0.55])
-        hem = np.array([0.0, 0.0, -0.2])
+        x = edges[start::2]
+        u = ((x1 - x0) / count, 0.0, 0.0)
+        top = np.stack([x, np.full_like(x, -1.25), np.full_like(x, z - 0.55)], 1)
         parts.append(parallelograms(top, u, slope, look))
         parts.append(parallelograms(top + hem, u, -hem, look))
     return join(parts)
@@ -258,6 +251,8 @@ ACCENTS = (
     (0.03, 0.03, 0.035),
     (0.30, 0.17, 0.03),
 )
+_PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)
+_LEDGE = ("-y", "+z", "-z", "+x", "-x")
 ROOFS = ((0.24, 0.10, 0.065), (0.13, 0.12, 0.125), (0.19, 0.09, 0.06))
 
 
@@ -320,15 +315,12 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
     holes: list[Rectangle] = []
     parts = [_ground_floor(rng, style, width, count, holes, fine)]
 
-    corners = [
-        ((i + 0.5) * pitch - style.window_m[0] / 2, style.ground_m + j * style.floor_m + 0.75)
-        for j in range(floors)
-        for i in range(count)
-    ]
-    for corner in corners:
-        holes += window_hole(corner, style)
-    places = np.array([(x, 0.0, z) for x, z in corners])
-    parts.append(window(style.window_m, style, fine).repeated(places))
+    places = []
+    for j, i in itertools.product(range(floors), range(count)):
+        x, z = (i + 0.5) * pitch - style.window_m[0] / 2, style.ground_m + j * style.floor_m + 0.75
+        holes += window_hole((x, z), style)
+        places.append((x, 0.0, z))
+    parts.append(window(style.window_m, style, fine).repeated(np.array(places)))
 
     for z0, z1, reach in (
         (style.ground_m + 0.12, style.ground_m + 0.3, 0.09),
@@ -347,9 +339,6 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
     zinc = Look((0.22, 0.22, 0.215), Class.BUILDING)
     parts.append(tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, zinc))  # a rainpipe
     return join(parts)
-
-
-_LEDGE = ("-y", "+z", "-z", "+x", "-x")
 
 
 def _ground_floor(
@@ -473,9 +462,6 @@ def _second_row(layout: Layout) -> Shapes:
             parts.append(built.moved(corner, 0.0 if side > 0 else np.pi))
             x += width + rng.uniform(4, 12)
     return join(parts)
-
-
-_PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)
 
 
 # ---- The ground: carriageway and markings, kerbs, pavements, cross streets, the land around ------
@@ -916,15 +902,13 @@ def _glasshouse(model: CarModel, paint: Look) -> Shapes:
     panes = list(itertools.product(range(len(cuts) - 1), range(len(levels) - 1)))
     for look, is_clear in ((CAR_GLASS, True), (paint, False)):
         corners = []
-        for i, j in panes:
-            if ((i, j) in clear) != is_clear:
-                continue
-            a, b, c, d = cuts[i], cuts[i + 1], levels[j], levels[j + 1]
-            for sign in (1, -1):
+        for (i, j), sign in itertools.product(panes, (1, -1)):
+            if ((i, j) in clear) == is_clear:
+                a, b, c, d = cuts[i], cuts[i + 1], levels[j], levels[j + 1]
                 loop = [side_point(*q, sign) for q in ((a, c), (b, c), (b, d), (a, d))]
-                corners.append(loop[::-1] if sign > 0 else loop)
+                corners.append(loop[::-sign])
         parts.append(quads(np.array(corners), look))
-    for s, steps, sign in ((1.0, levels, 1), (0.0, levels, -1)):  # windscreen, rear window
+    for s, sign in ((1.0, 1), (0.0, -1)):  # windscreen, rear window
         for look, (u0, u1), chosen in (
             (CAR_GLASS, (0.06, 0.94), (1, 2)),
             (paint, (0.06, 0.94), (0, 3)),
@@ -935,9 +919,9 @@ def _glasshouse(model: CarModel, paint: Look) -> Shapes:
             for j in chosen:
                 loop = []
                 for u, k in ((u0, 0), (u1, 0), (u1, 1), (u0, 1)):
-                    left, right = (side_point(s, steps[j + k], side) for side in (-1, 1))
+                    left, right = (side_point(s, levels[j + k], side) for side in (-1, 1))
                     loop.append(left + (right - left) * u)
-                corners.append(loop if sign > 0 else loop[::-1])
+                corners.append(loop[::sign])
             parts.append(quads(np.array(corners), look))
     parts.append(_car_roof(model, paint, top))
     return join(parts)
@@ -1179,7 +1163,6 @@ def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -
     motion = motion_of(mover, layout, size[2], ground)
     turn = 1.0 if motion.yaw == 0 else -1.0  # the heading is along +x or -x
     flip = np.array([turn, turn, 1.0])
-    eyes = camera_path(layout.parameters, ends)
     centre = motion.centres[0]
     walls = sorted(turn * (side * FACADE_M - centre[1]) for side in (-1, 1))
     directions = static.lighting.sun_directions()
@@ -1187,7 +1170,7 @@ def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -
     shaded = static.tree.occluded(origins, np.tile(directions, (len(motion.centres), 1)))
     lighting = Lighting(
         to_sun=static.lighting.to_sun * flip,
-        eye_path=(eyes - motion.at(ends)[0]) * flip,
+        eye_path=(static.lighting.eye_path - motion.at(ends)[0]) * flip,
         canyon=(walls[0], walls[1], ROOF_Z_M - centre[2]),
         ground_z=-size[2] / 2,
         sunlit=1 - float(shaded.mean()),
