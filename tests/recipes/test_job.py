@@ -103,16 +103,6 @@ def test_files_that_are_no_jobs(tmp_path: Path) -> None:
     assert load_job(path).name == "winter"
 
 
-@pytest.mark.parametrize("name", ["my job.yaml", ".job.yaml", "новый.yaml", "j" * 90 + ".yaml"])
-def test_a_file_whose_name_is_none_for_a_job(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.write_text(SCENES + RECIPES)
-    with pytest.raises(RecipeError, match="give it a name"):
-        load_job(path)
-    path.write_text("name: winter\n" + SCENES + RECIPES)
-    assert load_job(path).name == "winter"
-
-
 @given(st.text(alphabet="abn:{}[],-*&!?|>'\"# \n\t0.9", max_size=60))
 @settings(max_examples=150, deadline=None)
 def test_any_text_is_a_job_or_a_recipe_error(text: str) -> None:

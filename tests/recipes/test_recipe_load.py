@@ -24,22 +24,6 @@ def test_a_file_gives_its_name_and_source(tmp_path: Path) -> None:
     assert load_recipe(path).name == "other"
 
 
-def test_line_ends_of_every_kind(tmp_path: Path) -> None:
-    path = tmp_path / "crlf.yaml"
-    path.write_bytes(b"\xef\xbb\xbfseed: 1\r\nrender:\r\n  scale: 9\r\n")
-    with pytest.raises(RecipeError, match=r":3: render.scale = 9: must be > 0 and <= 4$"):
-        load_recipe(path)
-
-
-def test_a_name_from_a_file_name_that_cannot_be_one(tmp_path: Path) -> None:
-    path = tmp_path / "my fog.yaml"
-    path.write_text(TEXT)
-    with pytest.raises(RecipeError, match=r"my fog.yaml:1: name: the file's name, 'my fog', cann"):
-        load_recipe(path)
-    path.write_text("name: fog\n" + TEXT)
-    assert load_recipe(path).name == "fog"
-
-
 @pytest.mark.parametrize(
     ("data", "message"),
     [

@@ -10,9 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
-from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import Recipe
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
 from recipes.weather import Style, style_preset_names, style_preset_text
 
@@ -39,11 +37,6 @@ def test_a_preset_is_enough() -> None:
     style = Style(preset="dusk")
     assert recipe.style == style and style.changes and (style.name, style.files) == ("dusk", {})
     assert not Style(preset="dusk", strength=0).changes
-
-
-def test_a_style_may_be_left_empty() -> None:
-    assert template("style:\n").resolve(0).style is None
-    assert template("seed: 1").resolve(0).style is None
 
 
 @pytest.mark.parametrize(
@@ -154,15 +147,6 @@ def test_names_are_taken_as_they_are_written(folder: Path) -> None:
     for digest in ("1e" + "5" * 62, "12" * 32):
         with pytest.raises(RecipeError, match=digest):
             template(f"style: {{image: a.jpg, digest: {digest}}}", folder).resolve(0)
-
-
-def test_a_preset_reads_back_equal() -> None:
-    recipe = template("style: {preset: dusk, strength: {uniform: [0, 2]}}").resolve(4)
-    text = dump_recipe(recipe)
-    assert "\nstyle:\n  image: null\n  preset: dusk\n" in text
-    again = template(text).resolve(0)
-    assert again == recipe and again.hash == recipe.hash
-    assert template(dump_recipe(Recipe())).resolve(0) == Recipe()
 
 
 def test_the_presets_hold_statistics_of_land_and_of_sky() -> None:

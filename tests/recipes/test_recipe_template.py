@@ -77,12 +77,6 @@ def test_a_first_variant_continues_the_series() -> None:
     assert [later.resolve(i) for i in range(2)] == [template().resolve(i) for i in (3, 4)]
 
 
-def test_variants_count_from_zero() -> None:
-    for variant in (-1, 2**31):
-        with pytest.raises(RecipeError, match=rf"^foggy.yaml: variant = {variant}: must be >= 0 a"):
-            template().resolve(variant)
-
-
 @pytest.mark.parametrize("probability", [0, 0.25, 1])
 def test_probability_is_the_share_of_variants_with_the_effect(probability: float) -> None:
     text = f"""
@@ -196,21 +190,6 @@ def test_a_flood_that_is_absent_takes_its_waves_along() -> None:
     kept = [(a, b) for a, b in pairs if b.weather.flood is not None]
     assert 0 < len(kept) < 12
     assert all(a == b for a, b in kept)
-
-
-def test_an_empty_list_is_a_list() -> None:
-    text = "weather: {flood: {level_m: 1, waves: {components: []}}}"
-    assert flood_of(template(text).resolve(0)).waves.components == ()
-    assert flood_of(read_back(template(text).resolve(0))).waves.components == ()
-    for absent in ("null", ""):
-        none = template(text.replace("[]", absent)).resolve(0)
-        assert flood_of(none).waves.components is None
-
-
-def test_waves_and_rates_are_dumped_to_be_read() -> None:
-    text = dump_recipe(template(FLOODED).resolve(0))
-    assert "      - direction_deg: 0.0\n        amplitude_m: " in text, "a wave a paragraph"
-    assert "    absorption_per_m: [" in text, "rates on one line"
 
 
 finite = {"allow_nan": False, "allow_infinity": False}

@@ -77,13 +77,6 @@ def test_discrete_draws_have_their_shares(value: Value, shares: dict) -> None:
         assert abs(counts[key] / COUNT - share) < 4 * math.sqrt(share * (1 - share) / COUNT), key
 
 
-@pytest.mark.parametrize(
-    "value", [Uniform(1, 4, True), Uniform(1, 4, True, log=True), Normal(2.2, 1.0, 1, 4, True)]
-)
-def test_whole_draws_are_ints(value: Value) -> None:
-    assert {type(x) for x in many(value, 0, 50)} == {int}
-
-
 class Ends(Draws):
     """Draws that give the ends of [0, 1) in turn."""
 
@@ -115,14 +108,6 @@ def test_extreme_random_numbers_stay_inside_the_ends(value: Value) -> None:
         assert isinstance(drawn, int | float) and low <= drawn <= high
 
 
-def test_extreme_random_numbers_choose_the_outer_options() -> None:
-    choice = Choice(tuple(Fixed(k) for k in "abcd"), (0.0, 1.0, 2.0, 0.0))
-    assert [choice.draw(Ends(0, end), "x") for end in (0, 1)] == ["b", "c"]
-    # these weights, taken off one by one, round to a little less than their sum
-    uneven = Choice(tuple(Fixed(k) for k in "abcde"), (0.16, 0.22, 0.45, 0.71, 0.0))
-    assert uneven.draw(Ends(0, 1), "x") == "d"
-
-
 def test_a_colour_line_draws_between_its_ends_with_one_number() -> None:
     start, end = (0.2, 0.9, 0.5), (0.6, 0.1, 0.5)
     for red, green, blue in many(TripleLine(start, end), 5, 200):
@@ -138,18 +123,6 @@ def test_channels_are_independent() -> None:
     assert set(blues) == {0.5}
     covariance = sum(r * g for r, g, _ in colours) / 1000 - sum(reds) * sum(greens) / 1e6
     assert abs(covariance * 12) < 4 / math.sqrt(1000)  # a correlation's four standard deviations
-
-
-def test_a_choice_may_hold_ranges() -> None:
-    drawn = many(Choice((Fixed(None), Uniform(10.0, 20.0)), (1.0, 1.0)), 5, 400)
-    ranged = [x for x in drawn if x is not None]
-    assert 150 < len(ranged) < 250 and len(set(ranged)) == len(ranged)
-    assert kolmogorov_distance(ranged, lambda x: (x - 10) / 10) < 1.95 / math.sqrt(len(ranged))
-
-
-def test_floats_have_ten_digits() -> None:
-    for x in many(Uniform(0.0, 1.0), 0, 50):
-        assert float(f"{x:.10g}") == x
 
 
 def test_random_numbers_are_pinned() -> None:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from recipes.errors import RecipeError
 from recipes.parse import parse_recipe
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
-from recipes.weather import MAX_WAVES, PURE_WATER_PER_M, Flood, Snow, Wave, Waves
+from recipes.weather import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -37,13 +37,6 @@ def waves(*items: str) -> str:
     """A recipe with wave i on line 6 + i."""
     lines = "".join(f"        - {{{item}}}\n" for item in items)
     return f"weather:\n  flood:\n    level_m: 0.2\n    waves:\n      components:\n{lines}"
-
-
-def test_a_level_or_a_depth_is_enough() -> None:
-    weather = template("weather: {flood: {level_m: 0.2}, snow: {depth_m: 0.1}}").resolve(0).weather
-    assert weather.flood == Flood(level_m=0.2) and weather.snow == Snow(depth_m=0.1)
-    assert template(snow("light:")).resolve(0).weather.snow == Snow(depth_m=0.1)
-    assert template("weather:\n  snow:\n").resolve(0).weather.snow is None
 
 
 WRONG = {
@@ -199,12 +192,6 @@ def test_steepness_may_add_up_to_one() -> None:
         Waves(components=(*ten, ten[0]))
 
 
-def test_pure_water_takes_red_first() -> None:
-    assert Flood(level_m=0, turbidity_ntu=0).extinction_per_m_rgb == PURE_WATER_PER_M
-    red, green, blue = PURE_WATER_PER_M
-    assert red > green > blue > 0
-
-
 def test_particles_add_the_same_to_every_channel_and_in_proportion() -> None:
     one, ten = (Flood(level_m=0, turbidity_ntu=t).extinction_per_m_rgb for t in (1.0, 10.0))
     added = [a - b for a, b in zip(one, PURE_WATER_PER_M, strict=True)]
@@ -219,31 +206,6 @@ def test_clarity_is_that_of_rivers() -> None:
     """A black disc is seen as far as 4.8 / extinction: 0.2 m at 50 NTU, within a factor two."""
     green = Flood(level_m=0, turbidity_ntu=50).extinction_per_m_rgb[1]
     assert 0.1 < 4.8 / green < 0.4
-
-
-def test_what_the_water_is_drawn_with() -> None:
-    assert Flood(level_m=0).effective_turbidity_ntu == 50
-    assert Flood(level_m=0).extinction_per_m_rgb == pytest.approx((25.34, 25.0565, 25.00922))
-    given = Flood(level_m=0, absorption_per_m=(3.0, 2.0, 0.0))
-    assert given.extinction_per_m_rgb == (3.0, 2.0, 0.0) and given.effective_turbidity_ntu is None
-    assert Flood(level_m=0, turbidity_ntu=7.0).effective_turbidity_ntu == 7
-
-
-@pytest.mark.parametrize("depth", ["10cm", "10 cm", "-0.1", "11", "null", "true", "[0.1]", "'1'"])
-def test_a_depth_that_is_none(depth: str) -> None:
-    (problem,) = problems(f"weather:\n  snow:\n    depth_m: {depth}")
-    assert problem.startswith("r.yaml:3: weather.snow.depth_m = ")
-    assert ">= 0 and <= 10 (metres)" in problem
-    assert problem.endswith("; write the number alone") == depth.endswith("cm")
-
-
-def test_snow_without_a_depth() -> None:
-    missing = "weather.snow.depth_m: must be given, a number >= 0 and <= 10 (metres)"
-    assert problems("seed: 1\nweather:\n  snow: {}") == (f"r.yaml:3: {missing}",)
-    assert problems("weather: {snow: {coverage: 2}}") == (
-        "r.yaml:1: weather.snow.coverage = 2: must be >= 0 and <= 1",
-        f"r.yaml:1: {missing}",
-    )
 
 
 RANGED = """

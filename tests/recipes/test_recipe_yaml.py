@@ -57,15 +57,6 @@ def test_plain_scalars_follow_yaml_1_2(text: str, value: object) -> None:
     assert got == value and type(got) is type(value)
 
 
-def test_nan_is_a_number() -> None:
-    got = plain_value(".nan")
-    assert isinstance(got, float) and math.isnan(got)
-
-
-def test_quoted_scalars_are_text() -> None:
-    assert read("a: '1'\nb: \"true\"\nc: |\n  3\n") == {"a": "1", "b": "true", "c": "3\n"}
-
-
 def test_keys_are_text_whatever_they_look_like() -> None:
     assert read("on: 1\nyes: 2\n5: 3\nnull: 4\n") == {"on": 1, "yes": 2, "5": 3, "null": 4}
 
