@@ -219,9 +219,9 @@ def report(out: Positional[str], html: Path | None = None, images: int = 48) -> 
             where OUT is not on this machine.
         images: How many pictures the page has at most. It stays below 5 MB with any number.
     """
-    from tools.report import text_of, write_report
+    from tools.report import write_report
 
-    print(text_of(write_report(out, html, images)))
+    print(write_report(out, html, images).sentence)
     return 0
 
 

@@ -108,6 +108,13 @@ class Written(NamedTuple):
     size: int
     problems: int
 
+    @property
+    def sentence(self) -> str:
+        text = f"{self.path} ({self.size / 1e6:.2f} MB)"
+        if self.problems:
+            text += f"; {count(self.problems, 'file')} could not be read, see the page"
+        return text
+
 
 def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES) -> Written:
     """Write the page about an output folder, here or in an object store.
@@ -149,7 +156,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     gallery = Gallery(finished, draws, files, Shares.of(images), beside)
     some = evenly(with_images, MAX_RECIPES)
     found = spreads(finished, draws)
-    shown = [group.name for group in listed(recipes).rows]
+    shown = [group.name for group in listed(recipes)["rows"]]
     script = _asset("report.js")
     # Dictionaries keep their order: in this one files are read, and noted where they are damaged.
     facts = {
@@ -227,15 +234,6 @@ class Group(NamedTuple):
     cameras: int
 
 
-class Listed(NamedTuple):
-    """The groups that a table has room for, and how many others with how many images."""
-
-    rows: list[Group]
-    others: int
-    finished: int
-    failed: int
-
-
 class Failure(NamedTuple):
     """Failed images whose messages differ in numbers alone. message: of the first of them."""
 
@@ -289,14 +287,19 @@ def group_by(table: pa.Table, column: str) -> list[Group]:
     return sorted(groups, key=lambda group: group.name)
 
 
-def listed(groups: Sequence[Group]) -> Listed:
-    """At most MAX_ROWS: by name or, where not all fit, with failures first."""
-    if len(groups) <= MAX_ROWS:
-        return Listed(list(groups), 0, 0, 0)
-    order = sorted(groups, key=lambda group: (-group.failed, group.name))
-    rest = order[MAX_ROWS:]
-    finished, failed = sum(group.finished for group in rest), sum(group.failed for group in rest)
-    return Listed(order[:MAX_ROWS], len(rest), finished, failed)
+def listed(groups: Sequence[Group]) -> dict[str, Any]:
+    """The groups that a table has room for, with failures first where not all fit, and how many
+    others there are with how many images.
+    """
+    if len(groups) > MAX_ROWS:
+        groups = sorted(groups, key=lambda group: (-group.failed, group.name))
+    rest = groups[MAX_ROWS:]
+    return {
+        "rows": groups[:MAX_ROWS],
+        "others": len(rest),
+        "finished": sum(group.finished for group in rest),
+        "failed": sum(group.failed for group in rest),
+    }
 
 
 def group_failures(table: pa.Table) -> list[Failure]:
@@ -334,24 +337,16 @@ def _kind_of(path: str) -> str:
     return folder if folder in _KINDS and len(parts) > 2 else OTHER
 
 
-class Sample(NamedTuple):
-    """How much of what there is was looked at. files, of: numbers of files."""
-
-    files: int
-    of: int
-
-    @property
-    def text(self) -> str:
-        if self.files >= self.of:
-            return ""
-        return f"; from {self.files:,} of {count(self.of, 'file')}, evenly chosen"
+def sample_text(files: int, of: int) -> str:
+    """How much of what there is was looked at."""
+    return "" if files >= of else f"; from {files:,} of {count(of, 'file')}, evenly chosen"
 
 
 class Classes(NamedTuple):
     """Boxes by class, the most frequent first: (class, boxes, tracks)."""
 
     rows: list[tuple[str, int, int]]
-    sample: Sample
+    sample: str
 
 
 class Bars(NamedTuple):
@@ -360,7 +355,7 @@ class Bars(NamedTuple):
     """
 
     rows: list[tuple[str, list[int]]]
-    sample: Sample
+    sample: str
     noun: str
     keys: list[tuple[str, str]]
 
@@ -397,7 +392,7 @@ def count_classes(table: pa.Table, files: ReportFiles) -> Classes | None:
     tracked = Counter(label for label, *_ in tracks)
     order = sorted(boxes, key=lambda label: (-boxes[label], label))
     counted = [(label, boxes[label], tracked[label]) for label in order]
-    return Classes(counted, Sample(read, len(rows))) if counted else None
+    return Classes(counted, sample_text(read, len(rows))) if counted else None
 
 
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars | None:
@@ -426,7 +421,7 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Ba
             rows.append((recipe, counts.tolist()))
     bounds = [f"{100 * step:.0f}" for step in VISIBILITY_STEPS] + ["100"]
     keys = [(f"{a}–{b} %", f"s{i}") for i, (a, b) in enumerate(itertools.pairwise(bounds))]
-    return Bars(rows, Sample(read, there), "box", keys) if rows else None
+    return Bars(rows, sample_text(read, there), "box", keys) if rows else None
 
 
 def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars | None:
@@ -455,7 +450,7 @@ def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars
     known = sorted({code for _, found in counted for code in found})
     rows = [(recipe, [found[code] for code in known]) for recipe, found in counted]
     keys = [(_CODES.get(code, f"code {code}"), f"c{i % 8}") for i, code in enumerate(known)]
-    return Bars(rows, Sample(read, there), "point", keys) if rows else None
+    return Bars(rows, sample_text(read, there), "point", keys) if rows else None
 
 
 def _visible(paths: dict[str, str | None], files: ReportFiles) -> np.ndarray | None:
@@ -486,7 +481,6 @@ def _visible(paths: dict[str, str | None], files: ReportFiles) -> np.ndarray | N
 
 def _facts(table: pa.Table) -> list[tuple[str, list[Any]]]:
     """What all images share, or the few values that they have, the most frequent first."""
-    size = _joined(table, ("width", "height"), "?", "×")
     titles = {
         "size": "Image size",
         "camera": "Cameras",
@@ -496,16 +490,14 @@ def _facts(table: pa.Table) -> list[tuple[str, list[Any]]]:
         "version": "Version",
         "backend": "Backend",
     }
-    table = table.append_column("size", size)
-    found = [(title, _distinct(table, column)) for column, title in titles.items()]
+    table = table.append_column("size", _joined(table, ("width", "height"), "?", "×"))
+    found = []
+    for column, title in titles.items():
+        counted = pc.value_counts(table[column].combine_chunks()).to_pylist()
+        known = [entry for entry in counted if entry["values"] is not None]
+        known.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
+        found.append((title, [entry["values"] for entry in known[:6]]))
     return [(title, values) for title, values in found if values]
-
-
-def _distinct(table: pa.Table, column: str, most: int = 6) -> list[Any]:
-    counted = pc.value_counts(table[column].combine_chunks()).to_pylist()
-    known = [entry for entry in counted if entry["values"] is not None]
-    known.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
-    return [entry["values"] for entry in known[:most]]
 
 
 def _codes(table: pa.Table, names: Sequence[str], null: str) -> pa.Array:
@@ -534,11 +526,3 @@ def _beside(store: Store, html: Path) -> tuple[bool, list[str]]:
     inside = target.is_relative_to(root)
     own = [REPORT, target.relative_to(root).as_posix()] if inside else [REPORT]
     return target.parent == root, own
-
-
-def text_of(written: Written) -> str:
-    """One line for the terminal."""
-    text = f"{written.path} ({written.size / 1e6:.2f} MB)"
-    if written.problems:
-        text += f"; {count(written.problems, 'file')} could not be read, see the page"
-    return text

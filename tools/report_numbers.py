@@ -53,7 +53,6 @@ class Quantity:
 
     @property
     def formula(self) -> str:
-        """How it comes from the manifest."""
         return f"{KOSCHMIEDER} / {self.column}" if self.inverted else self.column
 
     def shown(self, values: np.ndarray) -> np.ndarray:
@@ -128,16 +127,21 @@ class Spread:
     absent_images: int
 
     @property
+    def bounds(self) -> tuple[float, float]:
+        return float(self.values.min()), float(self.values.max())
+
+    @property
     def is_constant(self) -> bool:
         """All values are one, but for rounding."""
-        low, high = float(self.values.min()), float(self.values.max())
+        low, high = self.bounds
         return not high - low > 1e-9 * max(abs(low), abs(high))
 
     @property
     def range_text(self) -> str:
-        low, high = float(self.values.min()), float(self.values.max())
-        first = "" if self.is_constant else f"{short(low)} to "
-        return first + with_unit(low if self.is_constant else high, self.quantity.unit)
+        low, high = self.bounds
+        if self.is_constant:
+            return with_unit(low, self.quantity.unit)
+        return f"{short(low)} to {with_unit(high, self.quantity.unit)}"
 
     @property
     def where_text(self) -> str:
@@ -224,19 +228,13 @@ def _is_clear(rows: pa.Table) -> np.ndarray:
     return clear
 
 
-@dataclass(frozen=True)
-class Histogram:
-    """Counts [n] of values between edges [n + 1], spaced evenly or in the logarithm."""
+def histogram(
+    values: np.ndarray, weights: np.ndarray, *, linear: bool = False
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Edges [n + 1], counts [n], and whether edges are spaced evenly in the logarithm.
 
-    edges: np.ndarray
-    counts: np.ndarray
-    log: bool
-
-
-def histogram(values: np.ndarray, weights: np.ndarray, *, linear: bool = False) -> Histogram:
-    """Of finite values [n], two of them unlike, each counted as often as its whole weight says.
-
-    linear: not logarithmic, however far the values are spread.
+    values: finite [v], two of them unlike, each counted as often as its whole weight says. linear:
+    not logarithmic, however far the values are spread.
     """
     low, high = float(values.min()), float(values.max())
     log = not linear and low > 0 and high / low > LOG_RATIO
@@ -244,7 +242,7 @@ def histogram(values: np.ndarray, weights: np.ndarray, *, linear: bool = False) 
     edges = np.geomspace(low, high, bins + 1) if log else np.linspace(low, high, bins + 1)
     edges[0], edges[-1] = min(edges[0], low), max(edges[-1], high)
     counts, _ = np.histogram(values, edges, weights=weights)
-    return Histogram(edges, counts, log)
+    return edges, counts, log
 
 
 class Chart(NamedTuple):
@@ -264,34 +262,34 @@ class Chart(NamedTuple):
 
 def chart(spread: Spread) -> Chart:
     """Bars count images; of the ticks beneath MAX_MARKS are drawn at most, evenly chosen."""
-    shape = histogram(spread.values, spread.images, linear=spread.quantity.linear)
+    edges, counts, log = histogram(spread.values, spread.images, linear=spread.quantity.linear)
     unit = spread.quantity.unit
-    edges = np.log(shape.edges) if shape.log else shape.edges
-    span = float(edges[-1] - edges[0]) or 1.0
+    places = np.log(edges) if log else edges
+    span = float(places[-1] - places[0]) or 1.0
     right = _WIDTH - _RIGHT
 
     def x_of(value: float) -> float:
-        place = math.log(value) if shape.log else value
-        return _LEFT + (right - _LEFT) * min(1.0, max(0.0, (place - edges[0]) / span))
+        place = math.log(value) if log else value
+        return _LEFT + (right - _LEFT) * min(1.0, max(0.0, (place - places[0]) / span))
 
-    tallest = max(float(shape.counts.max()), 1.0)
+    tallest = max(float(counts.max()), 1.0)
     bars = []
-    for a, b, n in zip(shape.edges[:-1], shape.edges[1:], shape.counts, strict=True):
+    for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True):
         if n > 0:
             # One of a million still shows.
             y, x, end = min(_FLOOR - (_FLOOR - _TOP) * n / tallest, _FLOOR - 1.5), x_of(a), x_of(b)
-            places = (x + 0.5, y, max(end - x - 1, 1), _FLOOR - y)
+            box = (x + 0.5, y, max(end - x - 1, 1), _FLOOR - y)
             title = f"{with_unit(a, unit)} to {with_unit(b, unit)}: {count(int(n), 'image')}"
-            bars.append((*(f"{place:.1f}" for place in places), title))
+            bars.append((*(f"{number:.1f}" for number in box), title))
     marks = np.sort(spread.values)
     marks = marks[np.linspace(0, len(marks) - 1, min(len(marks), MAX_MARKS)).astype(int)]
     stems = "".join(f"M{x:.1f} {_FLOOR + 4}v8" for x in sorted({x_of(float(v)) for v in marks}))
     labels = []
-    for value in ticks(float(shape.edges[0]), float(shape.edges[-1]), shape.log):
+    for value in ticks(float(edges[0]), float(edges[-1]), log):
         x = x_of(value)
         anchor = "start" if x < _LEFT + 16 else "end" if x > right - 16 else "middle"
         labels.append((f"{x:.1f}", anchor, short(value)))
-    scale = f"{unit}{', log scale' if shape.log else ''}".lstrip(", ")
+    scale = f"{unit}{', log scale' if log else ''}".lstrip(", ")
     return Chart(spread, bars, Markup(stems), labels, scale, count(int(tallest)))
 
 

@@ -264,8 +264,8 @@ def test_the_command_says_what_it_wrote(street, tmp_path, capsys) -> None:
         write_report(street, images=-1)
 
 
-def test_the_template_and_what_it_includes_are_installed() -> None:
+def test_templates_are_installed() -> None:
     root = Path(report.__file__).parent
     patterns = tomllib.loads((root.parent / "pyproject.toml").read_text())["tool"]["setuptools"]
     found = {path for glob in patterns["package-data"]["tools"] for path in root.glob(glob)}
-    assert found == {*(root / "templates").iterdir()} and len(found) == 3
+    assert found == {*(root / "templates").iterdir()}
