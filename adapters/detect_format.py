@@ -25,12 +25,7 @@ _KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 
 
 def source_tree(scene: Scene) -> SourceTree:
-    """The dataset that the scene was made from: the one it was opened from, or recorded in.
-
-    Raises:
-        AdapterError: the scene is of no dataset, has a camera path's frames, or the dataset is not
-            where it was.
-    """
+    """The dataset that the scene was made from: the one it was opened from, or recorded in."""
     uri = scene.recorded_source or scene.source
     for part in (scene.source, uri):
         if CAMERA_PATH_KEY in parse_uri(part)[2]:

@@ -14,11 +14,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import BeforeValidator, Field, field_validator
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -26,7 +29,6 @@ from adapters.camera_files.camera_files import PosedView, ViewSet, find_camera_f
 from adapters.camera_files.paths import (
     BULK_REACH,
     NO_CAMERAS,
-    PATH_KINDS,
     PathKind,
     frames_from_views,
     ground_under,
@@ -36,7 +38,7 @@ from adapters.camera_files.paths import (
     road_heights,
     solid_points,
 )
-from adapters.uri import check_query, choice_of, format_uri, whole_number_of
+from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
@@ -45,72 +47,51 @@ from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 
-# ---- What may be asked of a splat file in its URI ------------------------------------------------
-
-QUERY_KEYS = {
-    "up": "the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': their mean; "
-    "estimated without it",
-    "scale": "metres per unit of the file; 1 says that it is in metres; estimated without it",
-    "cameras": "a camera file or COLMAP folder in the file's world, or 'none'",
-    "path": "without cameras: auto, drive or orbit",
-    "iteration": "which iteration_N of a trained model; the newest by default",
-    "sky": "colour behind the Gaussians: overcast (a light grey), black, white, or three numbers "
-    "0 to 1",
-}
+Part = Annotated[float, Field(ge=0, le=1)]
 COLOURS = {"overcast": (0.85, 0.85, 0.85), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
-@dataclass(frozen=True)
-class GaussianOptions:
-    """The query, parsed. up: None, 'cameras', or what parse_up takes."""
-
-    up: str | None = None
-    scale: float | None = None
-    cameras: str | None = None
-    path: PathKind = "auto"
-    iteration: int | None = None
-    sky: tuple[float, float, float] | None = None
-
-    @staticmethod
-    def from_query(query: dict[str, str]) -> GaussianOptions:
-        """The options of a URI's query."""
-        check_query("gaussians", query, QUERY_KEYS)
-        if query.get("up", "cameras") != "cameras":
-            parse_up(query["up"])  # a mistake here must not wait for a large file to load
-        choice_of("gaussians", query, "path", PATH_KINDS)
-        return GaussianOptions(
-            up=query.get("up"),
-            scale=_parse_scale(query["scale"]) if "scale" in query else None,
-            cameras=query.get("cameras"),
-            path=PATH_KINDS[query.get("path", "auto")],
-            iteration=whole_number_of("gaussians", query, "iteration"),
-            sky=_parse_colour(query["sky"]) if "sky" in query else None,
-        )
+def _colour(text: str) -> Sequence[object]:
+    return COLOURS.get(text) or text.split(",")
 
 
-def _parse_scale(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1e-6 <= value <= 1e6:  # NaN compares false; beyond, float32 runs out for real scenes
-        raise AdapterError(
-            f"gaussians: scale must be metres per unit, a number from 1e-6 to 1e6; got {text!r}"
-        )
-    return value
+class GaussianOptions(UriOptions):
+    """What may be asked of a splat file in its URI."""
 
+    up: str | None = Field(
+        None,
+        description="the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': "
+        "their mean; estimated without it",
+    )
+    scale: float | None = Field(
+        None,
+        ge=1e-6,  # beyond, float32 runs out for real scenes
+        le=1e6,
+        description="metres per unit of the file, a number from 1e-6 to 1e6; 1 says that it is in "
+        "metres; estimated without it",
+    )
+    cameras: str | None = Field(
+        None, description="a camera file or COLMAP folder in the file's world, or 'none'"
+    )
+    path: PathKind = Field("auto", description="auto, drive or orbit, where there are no cameras")
+    iteration: int | None = Field(
+        None,
+        ge=0,
+        lt=10**9,
+        description="the number N of a trained model's iteration_N; the newest by default",
+    )
+    sky: Annotated[tuple[Part, Part, Part], BeforeValidator(_colour)] | None = Field(
+        None,
+        description="the colour behind the Gaussians: overcast (a light grey), black, white, or "
+        "three numbers 0 to 1 such as 0.7,0.8,0.9",
+    )
 
-def _parse_colour(text: str) -> tuple[float, float, float]:
-    try:
-        red, green, blue = COLOURS.get(text) or [float(part) for part in text.split(",")]
-    except ValueError:
-        red = green = blue = math.nan
-    if not all(0 <= value <= 1 for value in (red, green, blue)):
-        raise AdapterError(
-            f"gaussians: sky must be {', '.join(COLOURS)}, or three numbers 0 to 1 such as "
-            f"0.7,0.8,0.9; got {text!r}"
-        )
-    return red, green, blue
+    @field_validator("up")
+    @classmethod
+    def _is_axis(cls, up: str) -> str:
+        if up != "cameras":
+            parse_up(up)  # a mistake here must not wait for a large file to load
+        return up
 
 
 # ---- Which way is up in a splat file and how long its unit is, where nothing in it says so -------
@@ -144,8 +125,7 @@ _MIN_POINTS = 100
 class GroundFound:
     """up: unit [3], in the file's world. share, below, above: parts of the scene's surface in the
     ground's plane, under it, and in the fullest parallel plane over it. lead: how many times better
-    than the best plane of another direction it is.
-    """
+    than the best plane of another direction it is."""
 
     up: np.ndarray
     share: float
@@ -171,8 +151,7 @@ class GroundFound:
 def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundFound | None:
     """The plane that is most like a ground; None where nothing is flat.
 
-    near: a unit vector within 45 degrees of which up must be, such as the cameras' mean.
-    """
+    near: a unit vector within 45 degrees of which up must be, such as the cameras' mean."""
     points = solid_points(gaussians)
     points = points[in_bulk(points, 3.0)]
     if len(points) < _MIN_POINTS:
@@ -202,8 +181,7 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
     """Metres per unit by the height of level cameras above the ground, and a sentence about it;
     None where they do not stand as on a car or in a hand.
 
-    points: [N, 3], and poses: world_from_camera [C, 4, 4], in a world whose +z is up.
-    """
+    points: [N, 3], and poses: world_from_camera [C, 4, 4], in a world whose +z is up."""
     eyes, looks = poses[:, :3, 3], poses[:, 2, 2]
     if np.median(np.abs(looks)) > math.sin(math.radians(_STEEPEST_LOOK_DEG)):
         return None
@@ -334,17 +312,15 @@ _MIN_SEEN = 0.001
 
 
 def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
-    """A scene of a splat file or of a trained model's folder. The query's keys:
-    adapters.gaussian_files.QUERY_KEYS.
+    """A scene of a splat file or of a trained model's folder.
 
     has_metric_scale and has_known_gravity are True where URI or file say scale and up, where the
     cameras are upright, and where they could be estimated, which the scene's problems say.
 
     Raises:
         AdapterError: a query key or value, or a camera file, that cannot be used.
-        SceneError: the splat file is missing, damaged, or something else.
-    """
-    options = GaussianOptions.from_query(query)
+        SceneError: the splat file is missing, damaged, or something else."""
+    options = GaussianOptions.from_query("gaussians", query)
     file = find_splat_file(Path(path), options.iteration)
     splats = read_splats(file)
     problems = list(splats.problems)

@@ -24,11 +24,7 @@ _FROM_DATASET = "copy it from the dataset"
 
 
 def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
-    """A UTF-8 file. if_missing: what to do then, for the message.
-
-    Raises:
-        AdapterError: missing, unreadable, or not UTF-8.
-    """
+    """A UTF-8 file. if_missing: what to do then, for the message."""
     try:
         with open_file(path) as file:
             data = file.read(_MAX_BYTES + 1)
@@ -43,11 +39,7 @@ def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
 
 def read_yaml(path: Path, *, if_missing: str = _FROM_DATASET) -> dict[str, Any]:
     """The mapping in a YAML file, read as recipes are (see recipes.yaml_tree): without tags and
-    merge keys, and with a bound on what aliases multiply.
-
-    Raises:
-        AdapterError: missing, too large, no such YAML, or something else at the top.
-    """
+    merge keys, and with a bound on what aliases multiply."""
     text = read_text(path, if_missing=if_missing)
     if len(text) > _MAX_YAML:
         raise AdapterError(f"{path} must have at most {_MAX_YAML} characters; it has {len(text)}")
@@ -64,12 +56,7 @@ def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET)
     """The contents of a JSON file, a `kind` (dict, list, or object for either) at its top.
 
     Python reads NaN, Infinity and whole numbers of any length from JSON; `number_of` and `array_of`
-    tell them apart.
-
-    Raises:
-        AdapterError: missing, no JSON, something else at the top, two values under one key, lists
-            in lists without end, or a text that is not Unicode.
-    """
+    tell them apart."""
     text = read_text(path, if_missing=if_missing)
     try:
         content = json.loads(text, object_pairs_hook=_unique)
@@ -110,11 +97,7 @@ def _is_nested(value: object) -> bool:
 
 
 def number_of(value: object, where: str, *, largest: float = LARGEST) -> float:
-    """A value from JSON as a number of at most `largest`, whatever its sign.
-
-    Raises:
-        AdapterError: it is none: NaN, infinite, larger, a text, true, false.
-    """
+    """A value from JSON as a number of at most `largest`, whatever its sign."""
     if type(value) not in (int, float) or not -largest <= value <= largest:  # type: ignore[operator]
         raise AdapterError(
             f"{where} must be a number from {-largest:g} to {largest:g}; got {value!r:.80}"
@@ -195,11 +178,7 @@ def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
 
 
 def parse_numbers(text: str, where: str, shape: Sequence[int] | None = None) -> np.ndarray:
-    """The finite numbers of a text, float64 in that shape, or flat.
-
-    Raises:
-        AdapterError: something that is no finite number, or another count.
-    """
+    """The finite numbers of a text, float64 in that shape, or flat."""
     try:
         values = np.array([float(word) for word in text.split()], np.float64)
     except ValueError as error:
@@ -215,11 +194,7 @@ def parse_numbers(text: str, where: str, shape: Sequence[int] | None = None) -> 
 
 
 def read_pose(path: Path) -> np.ndarray:
-    """A rigid transform from a file of 4 x 4 or 3 x 4 numbers, float64 [4, 4].
-
-    Raises:
-        AdapterError: as for read_numbers, or no rotation and translation.
-    """
+    """A rigid transform from a file of 4 x 4 or 3 x 4 numbers, float64 [4, 4]."""
     values = read_numbers(path)
     if values.size not in (12, 16):
         raise AdapterError(f"{path} must hold 4 x 4 numbers, a pose; it holds {values.size}")
@@ -227,11 +202,7 @@ def read_pose(path: Path) -> np.ndarray:
 
 
 def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
-    """A matrix [3, 4] or [4, 4] as float64 [4, 4] with an exactly orthonormal rotation.
-
-    Raises:
-        AdapterError: not finite, or more than 1e-3 off a rotation and a translation.
-    """
+    """A matrix [3, 4] or [4, 4] as float64 [4, 4] with an exactly orthonormal rotation."""
     pose = np.eye(4)
     pose[: len(matrix)] = matrix
     rotation = pose[:3, :3]
@@ -255,11 +226,7 @@ def inside(root: Path, name: str, where: str) -> Path:
     Links inside the folder are followed as long as they stay in it; so are the folder's own
     entries, which people link to where their disks are.
 
-    where: the table and row, for messages.
-
-    Raises:
-        AdapterError: the name is absolute, holds '..' or leads outside through a link.
-    """
+    where: the table and row, for messages."""
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
         raise AdapterError(

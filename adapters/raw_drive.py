@@ -4,21 +4,23 @@ sweeps, boxes, class tables, and weathered sweeps in the form of the dataset's f
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from pydantic import BeforeValidator, Field
 
+from adapters.uri import UriOptions
 from augment.cameras import Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, MOVED, SCATTERED
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass
-from recipes.errors import nearest_word
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
 MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatever its label says
@@ -26,22 +28,6 @@ MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatev
 _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
-
-
-@dataclass(frozen=True)
-class FrameRange:
-    """Frame numbers `first`, `first + step`, ... below `stop` (None: to the end), as `range`."""
-
-    first: int = 0
-    stop: int | None = None
-    step: int = 1
-
-    def __contains__(self, frame: int) -> bool:
-        inside = frame >= self.first and (self.stop is None or frame < self.stop)
-        return inside and (frame - self.first) % self.step == 0
-
-    def __str__(self) -> str:
-        return f"{self.first}:{'' if self.stop is None else self.stop}:{self.step}"
 
 
 @dataclass(frozen=True)
@@ -58,107 +44,70 @@ class DriveFrames:
         return tuple(number for number in self.numbers if number not in self.held_out)
 
 
-@dataclass(frozen=True)
-class DriveOptions:
+def _frame_range(text: object, max_parts: int) -> range:
+    if isinstance(text, range):
+        return text
+    parts = str(text).split(":")
+    if not 2 <= len(parts) <= max_parts:
+        raise ValueError(text)
+    first, stop, step = (int(part) if part else None for part in (*parts, "")[:3])
+    found = range(first or 0, sys.maxsize if stop is None else stop, 1 if step is None else step)
+    if found.start < 0 or found.step < 1 or found.stop <= found.start:
+        raise ValueError(text)
+    return found
+
+
+def _shown(frames: range) -> str:
+    return f"{frames.start}:{'' if frames.stop == sys.maxsize else frames.stop}"
+
+
+class DriveOptions(UriOptions):
     """Options of one opening, as in `pandaset:<path>?voxel_m=0.05&frames=0:10`.
 
-    voxel_m: edge of a voxel near the ego path, metres; it grows with the distance from it.
-    max_gaussians: voxels are enlarged until the scene holds no more than about this many.
-    image_scale: resolution that images are decoded at for colours and sky. sky_size: texels along
-    an edge of the sky's cube map. held_out: frames whose images and sweeps the Gaussians, their
-    colours and the sky are made without; they stay in the scene, with cameras, images and labels,
-    and their boxes still make tracks."""
+    voxel_m: edge of a voxel near the ego path; it grows with the distance from it. max_gaussians:
+    voxels are enlarged until the scene holds no more than about this many. image_scale: resolution
+    that images are decoded at for colours and sky, as JPEGs can be without a second resize.
+    sky_size: texels along an edge of the sky's cube map. held_out: frames that the Gaussians, their
+    colours and the sky are made without; they stay in the scene, and their boxes still make
+    tracks."""
 
-    frames: FrameRange = FrameRange()
-    voxel_m: float = 0.04
-    max_gaussians: int = 500_000
-    image_scale: float = 0.5
-    sky_size: int = 768
-    held_out: FrameRange | None = None
-
-    @staticmethod
-    def from_query(
-        scheme: str, query: Mapping[str, str], own: Mapping[str, str] | None = None
-    ) -> DriveOptions:
-        """The options of a URI's query. own: keys that the scheme has besides and reads itself,
-        with what their values may be."""
-        kinds = {key: kind for key, (_, kind) in _KEYS.items()} | dict(own or {})
-        unknown = sorted(set(query) - set(kinds))
-        if unknown:
-            allowed = "; ".join(f"{key}: {kind}" for key, kind in kinds.items())
-            near = nearest_word(unknown[0], tuple(kinds))
-            guess = "" if near is None else f"did you mean {near!r}? "
-            raise AdapterError(
-                f"{scheme}: unknown option {unknown[0]!r}; {guess}allowed are {allowed}"
-            )
-        fields: dict[str, Any] = {}
-        for key, text in query.items():
-            try:
-                if key in _KEYS:
-                    fields[key] = _KEYS[key][0](text)
-            except ValueError:
-                raise AdapterError(f"{scheme}: {key} must be {kinds[key]}; got {text!r}") from None
-        return DriveOptions(**fields)
+    frames: Annotated[range, BeforeValidator(lambda text: _frame_range(text, 2))] = Field(
+        range(sys.maxsize),
+        description="first:stop, frame numbers with stop excluded, either side may be empty",
+    )
+    voxel_m: float = Field(0.04, ge=0.01, le=2, description="a number of metres from 0.01 to 2")
+    max_gaussians: int = Field(
+        500_000, ge=1_000, le=20_000_000, description="an integer from 1000 to 20000000"
+    )
+    image_scale: Annotated[Literal[1, 0.5, 0.25, 0.125], BeforeValidator(float)] = Field(
+        0.5, description="one of 1, 0.5, 0.25, 0.125"
+    )
+    sky_size: int = Field(768, ge=8, le=4096, description="an integer from 8 to 4096")
+    held_out: Annotated[range, BeforeValidator(lambda text: _frame_range(text, 3))] | None = Field(
+        None,
+        description="first:stop:step, frame numbers with stop excluded, such as 1::2 for every "
+        "other one",
+    )
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
         """Which of the dataset's frames, ascending, the scene has. where: for messages."""
         kept = tuple(number for number in numbers if number in self.frames)
         if not kept:
-            stop = "" if self.frames.stop is None else self.frames.stop
             raise AdapterError(
-                f"{where}: frames={self.frames.first}:{stop} selects none of the {len(numbers)} "
+                f"{where}: frames={_shown(self.frames)} selects none of the {len(numbers)} "
                 f"frames ({numbers[0]} to {numbers[-1]})"
             )
         if self.held_out is None:
             return DriveFrames(kept, frozenset())
         held = frozenset(number for number in kept if number in self.held_out)
+        stated = f"held_out={_shown(self.held_out)}:{self.held_out.step} holds out"
         if len(held) == len(kept):
             raise AdapterError(
-                f"{where}: held_out={self.held_out} holds out all {len(kept)} frames ({kept[0]} to "
-                f"{kept[-1]}); leave some to build the scene from, as 1::2 does"
+                f"{where}: {stated} all {len(kept)} frames ({kept[0]} to {kept[-1]}); leave some "
+                f"to build the scene from, as 1::2 does"
             )
-        problem = f"held_out={self.held_out} holds out none of frames {kept[0]} to {kept[-1]}"
+        problem = f"{stated} none of frames {kept[0]} to {kept[-1]}"
         return DriveFrames(kept, held, () if held else (problem,))
-
-
-def _frame_range(text: str, *, max_parts: int) -> FrameRange:
-    parts = text.split(":")
-    if not 2 <= len(parts) <= max_parts:
-        raise ValueError(text)
-    first, stop, step = (int(part) if part else None for part in (*parts, "")[:3])
-    found = FrameRange(first or 0, stop, 1 if step is None else step)
-    if found.first < 0 or found.step < 1 or (stop is not None and stop <= found.first):
-        raise ValueError(text)
-    return found
-
-
-def _number(parse: type, low: float, high: float) -> Callable[[str], Any]:
-    def parsed(text: str) -> Any:
-        if not low <= parse(text) <= high:
-            raise ValueError(text)
-        return parse(text)
-
-    return parsed
-
-
-_IMAGE_SCALES = (1.0, 0.5, 0.25, 0.125)  # what a JPEG decodes to without a second resize
-_KEYS: dict[str, tuple[Callable[[str], Any], str]] = {
-    "frames": (
-        lambda text: _frame_range(text, max_parts=2),
-        "first:stop, frame numbers with stop excluded, either side may be empty",
-    ),
-    "voxel_m": (_number(float, 0.01, 2), "a number of metres from 0.01 to 2"),
-    "max_gaussians": (_number(int, 1_000, 20_000_000), "an integer from 1000 to 20000000"),
-    "image_scale": (
-        lambda text: _IMAGE_SCALES[_IMAGE_SCALES.index(float(text))],
-        "one of 1, 0.5, 0.25, 0.125",
-    ),
-    "sky_size": (_number(int, 8, 4096), "an integer from 8 to 4096"),
-    "held_out": (
-        lambda text: _frame_range(text, max_parts=3),
-        "first:stop:step, frame numbers with stop excluded, such as 1::2 for every other one",
-    ),
-}
 
 
 def drive_origin(positions_m: np.ndarray) -> np.ndarray:

@@ -40,8 +40,7 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
 
     Raises:
         AdapterError: the file is missing, truncated, larger than max_bytes when unpacked, asks for
-            anything but tables and arrays, or holds no table.
-    """
+            anything but tables and arrays, or holds no table."""
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         found = Pickle(_TABLE_NAMES).read(stream)
@@ -57,11 +56,7 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
 
 
 def read_array(path: Path, *, max_bytes: int = MAX_BYTES) -> np.ndarray:
-    """The numbers of a .npy file.
-
-    Raises:
-        AdapterError: the file is missing, truncated, too large, or holds no plain numbers.
-    """
+    """The numbers of a .npy file."""
     try:
         return read_npy(io.BytesIO(_read_bounded(path, max_bytes)))
     except PickleError as error:
@@ -69,12 +64,7 @@ def read_array(path: Path, *, max_bytes: int = MAX_BYTES) -> np.ndarray:
 
 
 def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
-    """The arrays by name that `np.save` wrote as one dictionary into a .npy file.
-
-    Raises:
-        AdapterError: the file is missing, truncated, too large, asks for anything but arrays, or
-            holds something else.
-    """
+    """The arrays by name that `np.save` wrote as one dictionary into a .npy file."""
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         check_holds_object(stream)
@@ -112,8 +102,7 @@ def stream_arrays(file: BufferedIOBase) -> Iterator[tuple[int, np.ndarray]]:
     forgotten before the next is read: a file of many gigabytes passes through little memory.
 
     Raises:
-        PickleError: anything else is in it, or it is cut short.
-    """
+        PickleError: anything else is in it, or it is cut short."""
     pickle = Pickle(ARRAY_NAMES, is_streamed=True)
     count = 0
     for record in pickle.steps(file):

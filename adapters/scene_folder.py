@@ -48,8 +48,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
 
     Raises:
         AdapterError: an unknown key, or nothing where `data` says. SceneError: a file is missing or
-            damaged. A recording that is gone is a sentence in Scene.problems.
-    """
+            damaged. A recording that is gone is a sentence in Scene.problems."""
     unknown = sorted(set(query) - {_DATA_KEY})
     if unknown:
         raise AdapterError(
@@ -95,11 +94,7 @@ def storable(scene: Scene) -> Scene:
 
 def recorded_labels(recording: Recording) -> LabelSource | None:
     """The labels of a recording without its Gaussians, which take long to build; None where a scene
-    of this URI has none.
-
-    Raises:
-        AdapterError: a query that cannot be used, or calibration that the labels need is missing.
-    """
+    of this URI has none."""
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
     query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}

@@ -11,10 +11,13 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote, unquote
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from augment.errors import AdapterError
+from recipes.errors import nearest_word
 
 if TYPE_CHECKING:  # torch would be loaded with them
     from augment.labels import LabelSource
@@ -96,11 +99,7 @@ SCHEMES = {
 
 
 def parse_uri(uri: str) -> tuple[str | None, str, dict[str, str]]:
-    """Scheme (None where there is none), path and query of a scene's URI, decoded.
-
-    Raises:
-        AdapterError: an empty path, or a query that is not key=value&key=value.
-    """
+    """Scheme (None where there is none), path and query of a scene's URI, decoded."""
     if Path(uri).exists() and uri:
         return None, uri, {}
     match = _SCHEME.match(uri)
@@ -133,11 +132,30 @@ def known_schemes() -> str:
     return ", ".join(f"{name} ({entry.example})" for name, entry in SCHEMES.items())
 
 
+class UriOptions(BaseModel):
+    """Options of one opening, from a URI's query. A field's description says what it must be."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    @classmethod
+    def from_query(cls, scheme: str, query: Mapping[str, str]) -> Self:
+        known = {name: field.description or "" for name, field in cls.model_fields.items()}
+        check_query(scheme, query, known)
+        try:
+            return cls.model_validate(dict(query))
+        except ValidationError as error:
+            key = str(error.errors()[0]["loc"][0])
+            message = f"{scheme}: {key} must be {known[key]}; got {query[key]!r}"
+            raise AdapterError(message) from None
+
+
 def check_query(scheme: str, query: Mapping[str, str], known: Mapping[str, str]) -> None:
     """Refuse options that are not among the known ones, which are given with their meaning."""
     if unknown := sorted(set(query) - set(known)):
-        meanings = "; ".join(f"{key}: {meaning}" for key, meaning in known.items())
-        raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; known are {meanings}")
+        near = nearest_word(unknown[0], tuple(known))
+        guess = "" if near is None else f"did you mean {near!r}? "
+        allowed = "; ".join(f"{key}: {meaning}" for key, meaning in known.items())
+        raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; {guess}allowed are {allowed}")
 
 
 def whole_number_of(

@@ -41,8 +41,7 @@ class WorldChange:
     """scene = scale * rotation @ source - origin_m, in float64.
 
     rotation: [3, 3], proper. scale: metres per unit of the source. origin_m: [3], metres along the
-    scene's axes.
-    """
+    scene's axes."""
 
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     scale: float = 1.0
@@ -62,8 +61,7 @@ class WorldChange:
     def gaussians(self, gaussians: Gaussians, source_origin: np.ndarray) -> Gaussians:
         """Gaussians of the scene: means, quats, scales, and SH of degree 1 and above are turned.
 
-        source_origin: [3], what was already subtracted from their means, in the source's world.
-        """
+        source_origin: [3], what was already subtracted from their means, in the source's world."""
         shift = self.points(source_origin[None])[0]
         turned = not np.array_equal(self.rotation, np.eye(3))
         if not turned and self.scale == 1.0 and not shift.any():
@@ -73,11 +71,7 @@ class WorldChange:
 
 
 def parse_up(text: str) -> np.ndarray:
-    """Unit vector of `up`: an axis such as +z, -y or x, or three numbers such as 0.1,-0.9,0.2.
-
-    Raises:
-        AdapterError: neither.
-    """
+    """Unit vector of `up`: an axis such as +z, -y or x, or three numbers such as 0.1,-0.9,0.2."""
     name = text.strip().lower()
     if name.lstrip("+-") in _AXES and len(name) <= 2:
         axis = np.array(_AXES[name[-1]])

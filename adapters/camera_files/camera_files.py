@@ -392,7 +392,7 @@ _JSON_NAMES = ("cameras.json", "transforms.json")
 
 
 def read_views(path: Path) -> ViewSet:
-    """Views of a camera file, or of a folder that holds a COLMAP model or a JSON of a known name."""
+    """Views of a camera file, or of a folder with a COLMAP model or a JSON of a known name."""
     if not path.exists():
         raise AdapterError(
             f"{path}: no such file; expected an INRIA cameras.json, a nerfstudio transforms.json, "

@@ -48,8 +48,7 @@ _MIN_KNOWN = 6  # of 25 cells: ground is not spread beyond the content's edge
 def solid_points(gaussians: Gaussians) -> np.ndarray:
     """Centres [N, 3] of solid Gaussians, or of all where hardly any is solid; float64.
 
-    Large scenes are thinned evenly to a few hundred thousand.
-    """
+    Large scenes are thinned evenly to a few hundred thousand."""
     return gaussians.means[_solid(gaussians)].double().numpy()
 
 
@@ -88,8 +87,7 @@ def ground_under(
     """Ground heights [P'] under positions [P, 3], and the positions [P', 3] they belong to.
 
     Points within `radius` horizontally and below the position count. Positions with too few of
-    them are left out; long paths are thinned evenly.
-    """
+    them are left out; long paths are thinned evenly."""
     kept, heights = [], []
     for position in positions[:: 1 + len(positions) // _MAX_PLACES]:
         offset = points[:, :2] - position[:2]
@@ -108,8 +106,7 @@ def road_heights(
 
     low: [P], heights of what lies low there, which a road may lie above: files have foundations,
     and strays below the ground. Coarse splats lie under fine ones, so none counts for many.
-    unit: a metre's length.
-    """
+    unit: a metre's length."""
     layer = unit * _ROAD_LAYER_M
     heights, areas = np.full(len(places), np.nan), np.minimum(areas, np.median(areas))
     for number, (place, least) in enumerate(zip(places, low, strict=True)):
@@ -137,8 +134,7 @@ def lowest_ground(points: np.ndarray, positions: np.ndarray, *, radius: float) -
 class GroundGrid:
     """Ground heights on square cells. height: [X, Y], NaN where nothing is near.
 
-    corner: x, y of the first cell's corner. cell: side length.
-    """
+    corner: x, y of the first cell's corner. cell: side length."""
 
     corner: np.ndarray
     cell: float
@@ -162,8 +158,7 @@ def ground_grid(points: np.ndarray, *, cell: float) -> GroundGrid:
     """Ground heights over the bulk of the points: the low quantile of each cell, then the third
     lowest tenth of the 5x5 cells around it, which a car, a bush or a canopy alone does not lift.
 
-    cell: metres; larger where the scene would need more than _CELLS_A_SIDE cells.
-    """
+    cell: metres; larger where the scene would need more than _CELLS_A_SIDE cells."""
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0)
     cell = max(cell, float((high - low).max()) / _CELLS_A_SIDE)
     shape = np.floor((high - low) / cell).astype(int) + 1
@@ -194,7 +189,6 @@ def _smooth(height: np.ndarray) -> np.ndarray:
 # orbited.
 
 PathKind = Literal["auto", "drive", "orbit"]
-PATH_KINDS: dict[str, PathKind] = {"auto": "auto", "drive": "drive", "orbit": "orbit"}
 
 NO_CAMERAS = "no cameras came with the scene"  # how every note begins
 CAMERA_HEIGHT_M = 1.6
@@ -254,8 +248,7 @@ def _longest_free_line(
 
     Every half metre of a line (more in scenes of more than half a kilometre) counts +1 over known
     ground, -1 elsewhere, and less by the share of a car's front that Gaussians there hide; of every
-    line the best stretch is taken.
-    """
+    line the best stretch is taken."""
     worth, cell = _worth_of_cells(points, areas, grid)
     middle = grid.corner + 0.5 * grid.cell * np.array(grid.height.shape)
     reach = 0.5 * grid.cell * float(np.hypot(*grid.height.shape))
@@ -455,8 +448,7 @@ def frames_from_views(
 
     change: from the views' world to the scene's. start_ns: what times in the views count from, and
     the time of the first frame where they have none. world_from_ego stands at the front camera,
-    level, x along its optical axis.
-    """
+    level, x along its optical axis."""
     keys, problems = _keys_of_views(views)
     order = sorted(set(frame for _, frame in keys), key=_natural)
     numbers = _frame_numbers(order)
@@ -587,11 +579,7 @@ def _camera(name: str, view: PosedView, change: WorldChange, timestamp_ns: int) 
 
 
 def frames_from_path_file(path: str | Path, scene: Scene) -> tuple[Frame, ...]:
-    """The frames of a path file, in the scene's recentred world.
-
-    Raises:
-        AdapterError: no such file, or one that cannot be used; names the field.
-    """
+    """The frames of a path file, in the scene's recentred world."""
     return _frames_and_problems(Path(path), scene)[0]
 
 
@@ -600,8 +588,7 @@ def with_camera_path(scene: Scene, path: str | Path) -> Scene:
     belong to the frames it had. Its `source` opens it again, path included.
 
     Raises:
-        AdapterError: as for frames_from_path_file.
-    """
+        AdapterError: as for frames_from_path_file."""
     frames, problems = _frames_and_problems(Path(path), scene)
     return dataclasses.replace(
         scene,

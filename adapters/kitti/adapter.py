@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import Field
 from tqdm import tqdm
 
 from adapters.kitti.files import (
@@ -365,34 +366,17 @@ _LIDAR_TOP_DEG = 2.0  # the HDL-64E's uppermost channel
 # neighbour made.
 _EGO_LOW_M, _EGO_HIGH_M = np.array([-2.0, -1.35, -1.5]), np.array([2.6, 1.35, 0.5])
 _READERS = 4  # threads that decode; decoding releases the interpreter
-_OWN = {
-    "poses": "icp, or a file with a line of 12 numbers a frame (raw drives)",
-    "frame": "a frame's number (object folders)",
-}
 
 
-@dataclass(frozen=True)
-class KittiOptions:
-    """drive: the options of every drive. poses: "icp", a file's name, or None for the drive's own
-    GPS/IMU. frame: which frame of an object folder; None: the only one."""
+class KittiOptions(DriveOptions):
+    """poses: the drive's own GPS/IMU without it. frame: of an object folder; else its only one."""
 
-    drive: DriveOptions
-    poses: str | None = None
-    frame: int | None = None
-
-    @staticmethod
-    def from_query(query: dict[str, str], *, is_object: bool) -> KittiOptions:
-        drive = DriveOptions.from_query("kitti", query, _OWN)
-        poses, frame = query.get("poses"), query.get("frame")
-        wrong = "poses" if is_object else "frame"
-        if wrong in query:
-            what = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
-            raise AdapterError(f"kitti: {wrong}= means nothing for {what}; it is {_OWN[wrong]}")
-        if frame is not None and not re.fullmatch("[0-9]{1,9}", frame):
-            raise AdapterError(f"kitti: frame must be a frame's number; got {frame!r}")
-        if poses == "":
-            raise AdapterError("kitti: poses must be icp or the name of a file; got nothing")
-        return KittiOptions(drive, poses, None if frame is None else int(frame))
+    poses: str | None = Field(
+        None,
+        min_length=1,
+        description="icp, or a file with a line of 12 numbers a frame (raw drives)",
+    )
+    frame: int | None = Field(None, ge=0, lt=10**9, description="a frame's number (object folders)")
 
 
 def open_kitti(path: str, query: dict[str, str]) -> Scene:
@@ -405,8 +389,7 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
 
     Raises:
         AdapterError: a wrong option; missing or damaged calibration, poses, times or labels; no
-            usable sweep or image. What single frames lack is in Scene.problems.
-    """
+            usable sweep or image. What single frames lack is in Scene.problems."""
     source, options = find_source(path, query)
     numbers, held_out = source.chosen.numbers, source.chosen.held_out
     images, image_problems = {}, []
@@ -429,7 +412,7 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
         sweeps,
         join_tracks(objects.moving),
         views_of(used),
-        options.drive,
+        options,
         lidar_top_deg=_LIDAR_TOP_DEG,
         name=source.name,
         source=format_uri("kitti", path, query),
@@ -573,7 +556,11 @@ def find_source(path: str, query: dict[str, str]) -> tuple[Source, KittiOptions]
     """What the URI names, and its options."""
     root, calibration = kitti_root(path)
     is_object = is_object_folder(root)
-    options = KittiOptions.from_query(query, is_object=is_object)
+    options = KittiOptions.from_query("kitti", query)
+    if (wrong := "poses" if is_object else "frame") in query:
+        what = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
+        meaning = KittiOptions.model_fields[wrong].description
+        raise AdapterError(f"kitti: {wrong}= means nothing for {what}; it is {meaning}")
     return (_object_source if is_object else _raw_source)(root, calibration, options), options
 
 
@@ -586,7 +573,7 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
             f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin; a scene cannot be built "
             f"without them, unpack the drive again"
         )
-    chosen = options.drive.select(numbers, where=f"kitti:{root}")
+    chosen = options.select(numbers, where=f"kitti:{root}")
     calibration = read_raw_calibration(calibration_folder, tuple(images))
     image_times = {name: read_times(root, name) for name in images}
     known = read_times(root, VELODYNE) or next(filter(None, image_times.values()), {})
@@ -696,7 +683,7 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
             f"{root / 'image_2' / digits}.png does not exist, nor in image_3/; colours cannot be "
             f"had without an image"
         )
-    chosen = options.drive.select([number], where=f"kitti:{root}, frame {number}")
+    chosen = options.select([number], where=f"kitti:{root}, frame {number}")
     calibration = read_object_calibration(calibration_folder, digits, tuple(images))
     labels = KittiLabels(
         root,

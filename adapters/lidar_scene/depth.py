@@ -25,8 +25,7 @@ def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
     frame_ns: the frame's timestamp.
 
     Raises:
-        ValueError: timestamp_ns holds anything but whole numbers or dates.
-    """
+        ValueError: timestamp_ns holds anything but whole numbers or dates."""
     times = sweep.columns.get("timestamp_ns")
     if times is None:
         seconds = sweep.columns.get("t")
@@ -43,8 +42,7 @@ def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
     """A column of whole numbers, or of dates (nanoseconds since 1970), as int64.
 
     Raises:
-        ValueError: it holds anything else, or gaps.
-    """
+        ValueError: it holds anything else, or gaps."""
     if len(column) == 0:  # Arrow's type of an empty column may be anything
         return np.zeros(0, np.int64)
     if column.dtype.kind == "M" and not np.isnat(column).any():

@@ -64,8 +64,7 @@ class Motion:
     def into_actor(self, points: np.ndarray, timestamps_ns: np.ndarray) -> np.ndarray:
         """World points [N, 3], each seen at its own time, in the actor's frame; float64 [N, 3].
 
-        Callers leave out times at which the actor does not exist.
-        """
+        Callers leave out times at which the actor does not exist."""
         out = np.empty((len(points), 3))
         _into(self.knots_ns, self.quats, self.centres, points, timestamps_ns, out)
         return out

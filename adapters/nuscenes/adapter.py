@@ -123,8 +123,7 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
 
     Raises:
         SweepFault: no file, or not of whole records.
-        AdapterError: the file's name leads outside of the dataset.
-    """
+        AdapterError: the file's name leads outside of the dataset."""
     content = _bytes(inside(tables.root, sweep.filename, f"sample_data {sweep.token!r}"))
     if len(content) == 0 or len(content) % RECORD_BYTES:
         raise SweepFault(
@@ -331,9 +330,9 @@ def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
 
 def nuscenes_labels(path: str, query: dict[str, str]) -> NuScenesLabels:
     """The labels of a scene; whatever frames= says, they are those of all its frames."""
-    options = NuScenesOptions.from_query(query)
+    options = NuScenesOptions.from_query("nuscenes", query)
     tables = read_tables(Path(path), options.version, options.scene)
-    return NuScenesLabels(tables, scene_frames(tables, sweeps=options.sweeps)[0])
+    return NuScenesLabels(tables, scene_frames(tables, sweeps=options.sweeps == "1")[0])
 
 
 def boxes_of_sweep(tables: SceneTables, sweep: SensorFile) -> Boxes:
@@ -414,15 +413,14 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
     Raises:
         AdapterError: a wrong option, tables that are missing, damaged or contradict each other, no
             LiDAR, no image, or a camera all of whose images are damaged. Single images and sweeps
-            that are missing or damaged are Scene.problems.
-    """
-    options = NuScenesOptions.from_query(query)
+            that are missing or damaged are Scene.problems."""
+    options = NuScenesOptions.from_query("nuscenes", query)
     tables = read_tables(Path(path), options.version, options.scene)
-    files, unused = scene_frames(tables, sweeps=options.sweeps)
+    files, unused = scene_frames(tables, sweeps=options.sweeps == "1")
     where = f"nuscenes:{path}, scene {tables.name}"
     if not files:
         raise AdapterError(f"{where} has no keyframe of LIDAR_TOP; sweeps=1 takes its sweeps")
-    chosen = options.drive.select(range(len(files)), where=where)
+    chosen = options.select(range(len(files)), where=where)
     used = [files[number] for number in chosen.numbers]
     origin = drive_origin(np.array([file.sweep.world_from_ego[:3, 3] for file in files]))
     sweeps, lidar_problems = read_sweeps(tables, used, origin, held_out=chosen.held_out)
@@ -444,7 +442,7 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
         sweeps,
         read_tracks(tables, used, origin),
         views,
-        options.drive,
+        options,
         lidar_top_deg=_LIDAR_TOP_DEG,
         name=tables.name,
         source=format_uri("nuscenes", path, query),

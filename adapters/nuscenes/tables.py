@@ -26,9 +26,10 @@ import re
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from adapters.plain_files import LARGEST, array_of, inside
@@ -47,11 +48,6 @@ _TWO_PI = 2 * np.pi
 _MAX_SPREAD_RAD = np.radians(20)
 # The LiDAR turns in 50 ms; further from a sweep than two turns an image belongs to none.
 _NEAR_NS = 100_000_000
-_OWN = {
-    "version": "a folder of tables such as v1.0-mini",
-    "scene": "a scene's name or token",
-    "sweeps": "1 for keyframes and the sweeps between them, 0 for keyframes only",
-}
 LIDAR = "LIDAR_TOP"
 _MAX_NAMES = 10  # that a message lists
 
@@ -254,8 +250,7 @@ class Turn:
     def before_ns(self, directions: np.ndarray) -> np.ndarray:
         """How long before the sweep's time the LiDAR looked there, int64 [N].
 
-        directions: [N, 2 or 3] from the sensor, in the car's axes; no numbers count as forward.
-        """
+        directions: [N, 2 or 3] from the sensor, in the car's axes; no numbers count as forward."""
         if self.end_rad is None:
             return np.zeros(len(directions), np.int64)
         bearings = np.arctan2(directions[:, 1], directions[:, 0])
@@ -263,23 +258,14 @@ class Turn:
         return np.round(past * TURN_NS).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class NuScenesOptions:
-    """version, scene: None for the only one there is. sweeps: whether the LiDAR's sweeps between
-    keyframes are frames too. drive: the options that all raw drives have."""
+class NuScenesOptions(DriveOptions):
+    """version, scene: the only one there is without them."""
 
-    version: str | None
-    scene: str | None
-    sweeps: bool
-    drive: DriveOptions
-
-    @staticmethod
-    def from_query(query: dict[str, str]) -> NuScenesOptions:
-        sweeps = query.get("sweeps", "1")
-        if sweeps not in ("0", "1"):
-            raise AdapterError(f"nuscenes: sweeps must be {_OWN['sweeps']}; got {sweeps!r}")
-        drive = DriveOptions.from_query("nuscenes", query, _OWN)
-        return NuScenesOptions(query.get("version"), query.get("scene"), sweeps == "1", drive)
+    version: str | None = Field(None, description="a folder of tables such as v1.0-mini")
+    scene: str | None = Field(None, description="a scene's name or token")
+    sweeps: Literal["1", "0"] = Field(
+        "1", description="1 for keyframes and the sweeps between them, 0 for keyframes only"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -610,9 +596,9 @@ def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameT
     """What every frame of a scene is in the dataset's tables: frame number (Frame.index) to channel
     (LIDAR_TOP among them) to row of sample_data. Frames that frames= leaves out are there too, and
     so are files that the tables name but that are missing."""
-    options = NuScenesOptions.from_query(query)
+    options = NuScenesOptions.from_query("nuscenes", query)
     tables = read_tables(Path(path), options.version, options.scene)
-    frames, _ = scene_frames(tables, sweeps=options.sweeps)
+    frames, _ = scene_frames(tables, sweeps=options.sweeps == "1")
     return {
         frame.index: {
             file.channel: FrameToken(file.token, file.filename, file.is_key_frame)

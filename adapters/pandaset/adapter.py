@@ -66,8 +66,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
 
     Raises:
         AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
-            Missing LiDAR or annotation files and images of single frames are Scene.problems.
-    """
+            Missing LiDAR or annotation files and images of single frames are Scene.problems."""
     options = DriveOptions.from_query("pandaset", query)
     sequence = read_sequence(Path(path))
     chosen = options.select(range(len(sequence)), where=f"pandaset:{path}")

@@ -51,8 +51,7 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
     size may differ from the camera's by less than the reduction of the decoder (8 pixels at most).
 
     Raises:
-        ImageFault: missing, cut short, not decodable, or not of the camera's size.
-    """
+        ImageFault: missing, cut short, not decodable, or not of the camera's size."""
     is_jpeg = is_whole_jpeg(path)
     step = 1
     while is_jpeg and step < 8 and _can_be_reduced(full, scaled, 2 * step):
@@ -90,8 +89,7 @@ class Images:
         """Decode an image for the first time, and keep it while there is room for all so far.
 
         Raises:
-            ImageFault: it is unusable, and was not added.
-        """
+            ImageFault: it is unusable, and was not added."""
         image = read_scaled(path, full, scaled)
         self._sources[key] = (path, full, scaled)
         if self._cache.has_room(image.nbytes):
@@ -99,11 +97,7 @@ class Images:
         return image
 
     def load(self, key: ViewKey) -> np.ndarray:
-        """uint8 [H, W, 3]; callers do not write into it.
-
-        Raises:
-            AdapterError: the file has changed since it was added.
-        """
+        """uint8 [H, W, 3]; callers do not write into it."""
         image = self._cache.get(key)
         if image is not None:
             return image
@@ -120,11 +114,7 @@ class Images:
 
 
 def holdout_step(holdout: str) -> int | None:
-    """N of "every-Nth", None of "none".
-
-    Raises:
-        AdapterError: anything else, or N below 2.
-    """
+    """N of "every-Nth", None of "none"."""
     if holdout == NONE:
         return None
     match = _EVERY.fullmatch(holdout)
@@ -165,11 +155,7 @@ class RecordedViews:
         not fit is read again. reference_depth: what relative depth maps are brought to metres by
         where there is no LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the
         recording car; a camera without a file does not see it. By default such pixels are found by
-        their standing still. mask_ego: do not learn from them.
-
-        Raises:
-            AdapterError: an unknown camera or holdout, or no usable image.
-        """
+        their standing still. mask_ego: do not learn from them."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
         names = _camera_names(scene, cameras)

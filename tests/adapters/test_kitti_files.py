@@ -93,7 +93,7 @@ def test_folders_that_are_no_drive(drive, tmp_path):
     [
         ({"voxels": "1"}, r"unknown option 'voxels'.*poses: icp"),
         ({"frame": "1"}, r"frame= means nothing for a raw drive"),
-        ({"poses": ""}, r"poses must be icp or the name of a file"),
+        ({"poses": ""}, r"poses must be icp, or a file"),
         ({"frames": "7:9"}, r"frames=7:9 selects none of the 3 frames"),
     ],
 )

@@ -255,7 +255,7 @@ def test_no_dataset_is_an_error(folder, tmp_path):
 )
 def test_wrong_options_say_what_is_allowed(query, message):
     with pytest.raises(AdapterError, match=message):
-        NuScenesOptions.from_query(query)
+        NuScenesOptions.from_query("nuscenes", query)
 
 
 IMAGE = files.data_token(0, "CAM_FRONT", 1)
