@@ -62,6 +62,13 @@ def ground_points(ranges_m: np.ndarray, z_m: float = 0.0) -> np.ndarray:
     return np.stack([distances, np.zeros_like(distances), np.full_like(distances, z_m)], 1)
 
 
+def beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(origins, unit directions, lengths) of the beams to points [N, 3]."""
+    offsets = points - SENSOR_M
+    ranges = np.linalg.norm(offsets, axis=1)
+    return np.tile(SENSOR_M, (len(points), 1)), offsets / ranges[:, None], ranges
+
+
 def some_points(count: int = 400, *, seed: int = 0) -> np.ndarray:
     """Points around the sensor, on the ground and above it, [N, 3]."""
     rng = np.random.default_rng(seed)

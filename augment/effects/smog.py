@@ -31,10 +31,8 @@ MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; smog that dense has t
 
 @dataclass(frozen=True)
 class SmogMedium:
-    """Smog placed in a scene: numbers only, so that kernels can take it apart.
-
-    sigma_per_m: extinction at height base_z_m, 1/metre. rgb: airlight, display-encoded.
-    scale_height_m: None for uniform. base_z_m: scene world, metres.
+    """Smog placed in a scene. sigma_per_m: extinction at height base_z_m (scene world). rgb:
+    airlight, display-encoded. scale_height_m: None for uniform.
     """
 
     sigma_per_m: float
@@ -119,8 +117,8 @@ def fog_buffers(
 ) -> Float[Tensor, "H W 3"]:
     """Deferred smog (the paper's way) on premultiplied colour, sky not included.
 
-    ray_distance must come from depth that was divided by alpha. Exact for one surface a pixel;
-    where translucent layers mix it fogs them all at their mean distance.
+    ray_distance: of depth divided by alpha. Exact for one surface a pixel; translucent layers are
+    all fogged at their mean distance.
     """
     tau = optical_depth(medium, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]
@@ -182,31 +180,30 @@ def box_transmittance(
     placed = PlacedBoxes.of(boxes, world_origin_m)
     pixels = np.full(len(placed), NOT_COUNTED)
     transmittance = np.ones(len(placed))
-    if medium is not None:
-        smog = _SmogFromEye(medium, camera.centre.numpy(), water_level_z_m)
-        transmittance = _estimate(placed, smog)
-        if surface_depth_m is not None:
-            pixels[:] = 0
-            for number, rows, columns in shown_pixels(placed, camera, surface_depth_m):
-                z = surface_depth_m[rows, columns].astype(np.float64)
-                pixels[number] = len(rows)
-                transmittance[number] = _mean_over_pixels(rows, columns, z, camera, smog)
+    if medium is None:
+        return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
+    eye_m = camera.centre.numpy()
+    is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
+
+    def transmittance_to(distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
+        t = np.exp(-optical_depth_of_arrays(medium, distance_m, eye_m[2], point_z_m))
+        return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
+
+    points = np.concatenate([placed.corners_m, placed.centres_m[:, None]], axis=1)  # [B, 9, 3]
+    distance = np.linalg.norm(points - eye_m, axis=-1)
+    transmittance = transmittance_to(distance, points[..., 2]).mean(axis=1)
+    if surface_depth_m is not None:
+        pixels[:] = 0
+        upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
+        for number, rows, columns in shown_pixels(placed, camera, surface_depth_m):
+            z = surface_depth_m[rows, columns].astype(np.float64)
+            across = (columns + 0.5 - camera.cx) / camera.fx
+            down = (rows + 0.5 - camera.cy) / camera.fy
+            point_z = eye_m[2] + z * (across * upwards[0] + down * upwards[1] + upwards[2])
+            distance = z * np.sqrt(1 + across**2 + down**2)
+            pixels[number] = len(rows)
+            transmittance[number] = float(transmittance_to(distance, point_z).mean())
     return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
-
-
-@dataclass(frozen=True, eq=False)
-class _SmogFromEye:
-    medium: SmogMedium
-    eye_m: np.ndarray  # float64 [3], scene world
-    water_level_z_m: float | None
-
-    def transmittance(self, distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
-        """Of the ways to points at a distance from the eye (float64, any shape)."""
-        tau = optical_depth_of_arrays(self.medium, distance_m, self.eye_m[2], point_z_m)
-        level = self.water_level_z_m
-        if level is None or self.eye_m[2] > level:
-            return np.exp(-tau)
-        return np.where(point_z_m <= level, 1.0, np.exp(-tau))
 
 
 def optical_depth_of_arrays(
@@ -228,21 +225,3 @@ def optical_depth_of_arrays(
     safe = np.where(small, 1.0, difference)
     mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
     return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean
-
-
-def _estimate(placed: PlacedBoxes, smog: _SmogFromEye) -> np.ndarray:
-    """float64 [B]: the mean over each box's corners and its centre."""
-    points = np.concatenate([placed.corners_m, placed.centres_m[:, None]], axis=1)  # [B, 9, 3]
-    distance = np.linalg.norm(points - smog.eye_m, axis=-1)
-    return smog.transmittance(distance, points[..., 2]).mean(axis=1)
-
-
-def _mean_over_pixels(
-    rows: np.ndarray, columns: np.ndarray, z: np.ndarray, camera: Camera, smog: _SmogFromEye
-) -> float:
-    """z: depth of what the pixels show, float64, metres."""
-    across = (columns + 0.5 - camera.cx) / camera.fx
-    down = (rows + 0.5 - camera.cy) / camera.fy
-    upwards = camera.world_from_camera[2, :3].numpy()  # the world's z along the camera's axes
-    point_z = smog.eye_m[2] + z * (across * upwards[0] + down * upwards[1] + upwards[2])
-    return float(smog.transmittance(z * np.sqrt(1 + across**2 + down**2), point_z).mean())

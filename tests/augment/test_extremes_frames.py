@@ -14,7 +14,7 @@ from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import support_of
 from augment.errors import SceneError
-from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
+from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.views import render_view
 from recipes.schema import Recipe
@@ -136,20 +136,6 @@ def test_actors_that_are_all_gone_leave_the_sky():
     assert view.semantic is not None and (view.semantic == SemanticClass.SKY).all()
     assert view.instance is not None and not view.instance.any()
     assert view.depth_m is not None and not view.depth_m.any()
-
-
-@pytest.mark.parametrize("quat", [(0.0, 0.0, 0.0, 0.0), (1e-30, 0.0, 0.0, 0.0), (1e20, 0, 0, 0.0)])
-def test_degenerate_quaternions(quat: tuple[float, ...]):
-    """Readers normalise them, or leave them out; what they let through is drawn."""
-    given_one = dataclasses.replace(one_gaussian(), quats=torch.tensor([quat]))
-    if not any(quat):
-        with pytest.raises(SceneError, match="zero quaternion"):
-            check_gaussians(given_one, where="extremes")
-        return
-    kept, problems = check_gaussians(given_one, where="extremes")
-    assert not problems and kept.quats.tolist() == [[1.0, 0.0, 0.0, 0.0]]
-    kept = dataclasses.replace(kept, semantic=torch.ones(1, dtype=torch.int16))
-    rendered(Place(kept, 0, on_street=False).scene(), camera_at((0.0, 0.0, 0.0)), weather())
 
 
 @pytest.mark.long

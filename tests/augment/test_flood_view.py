@@ -194,10 +194,9 @@ def test_one_colour_everywhere_stays_that_colour():
             assert np.abs(view.rgb.astype(int) - 128).max() <= 1, (reflection, waves.preset)
 
 
-@pytest.mark.parametrize("reflection", ["sky", "screen_space", "mirrored"])
-@pytest.mark.parametrize("waves", [STILL, Waves(preset="breeze")])
-def test_kernels_match_the_definition(scene, reflection, waves):
-    water = flood(reflection=reflection, waves=waves, turbidity_ntu=5)
+@pytest.mark.parametrize("reflection", ["screen_space", "mirrored"])
+def test_kernels_match_the_definition(scene, reflection):
+    water = flood(reflection=reflection, waves=Waves(preset="breeze"), turbidity_ntu=5)
     smog = Smog(extinction_per_m=0.02, scale_height_m=20)
     plan = make_plan(recipe_of(water, smog, depth="expected"), scene)
     fast, slow = (
@@ -250,13 +249,6 @@ def test_no_water_in_view_is_the_clean_frame_to_the_bit(scene):
         assert not wet.water.any()
 
 
-def test_water_behind_a_covering_front_is_not_seen(scene):
-    """The wall fills the picture: the plane is in view, the water is not."""
-    near = camera(position=(9.0, 0.0, 1.0), focal=400.0)
-    dry, wet = view_of(scene, None, near), view_of(scene, flood(), near)
-    assert np.abs(dry.rgb.astype(int) - wet.rgb).max() <= 1 and not wet.water.any()
-
-
 # ---- what is written beside the picture --------------------------------------------------------
 
 
@@ -302,65 +294,32 @@ def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene):
     assert unlabelled.flood.scene_depth_m is None
 
 
-def test_masks_of_two_cameras_agree(scene):
-    """Water points of one camera are water in another too, unless the car hides them."""
-    one, two = camera(), camera(position=(0.3, 0.8, 0.4))
-    first = view_of(scene, flood(), one, surface="first")
-    second = view_of(scene, flood(), two, surface="first")
-    points = one.centre + torch.from_numpy(first.depth_m).double()[..., None] * one.ray_directions(
-        torch.float64
-    )
-    points = points[torch.from_numpy(first.water == 255)]
-    local = (points - two.centre) @ two.camera_from_world[:3, :3].T
-    column = (two.fx * local[:, 0] / local[:, 2] + two.cx).floor().long()
-    row = (two.fy * local[:, 1] / local[:, 2] + two.cy).floor().long()
-    seen = (column >= 0) & (column < 80) & (row >= 0) & (row < 60) & (local[:, 2] > 0)
-    seen &= (points[:, 1] + 1.5).abs() > 1.5  # clear of the car
-    water = second.water[row[seen], column[seen]] == 255
-    assert int(seen.sum()) > 500 and water.mean() > 0.98
-
-
 # ---- extremes ----------------------------------------------------------------------------------
 
 DOWN, UP = camera(pitch=np.pi / 2), camera(pitch=-np.pi / 2)
 SURFACE = ROAD_Z + 0.4
 EXTREMES = {
-    "level below everything": (flood(-50.0), camera()),
     "level above the camera": (flood(3.0), camera()),
-    "level far above the camera": (flood(9999.0), camera()),
+    "level far above the camera": (flood(9999.0), UP),
     "level at the camera": (flood(0.4), camera(position=(0.0, 0.0, SURFACE))),
     "a hair above the water": (flood(0.4), camera(position=(0.0, 0.0, SURFACE + 1e-9))),
-    "a hair below the water": (flood(0.4), camera(position=(0.0, 0.0, SURFACE - 1e-9))),
     "straight down": (flood(), DOWN),
-    "straight up": (flood(), UP),
-    "straight up from below": (flood(3.0), UP),
-    "along the surface": (flood(0.4), camera(position=(0.0, 0.0, SURFACE + 1e-3))),
-    "amplitude 0": (flood(waves=Waves(height=0.0)), camera()),
-    "one wave": (flood(waves=Waves(preset="wind", count=1)), camera()),
-    "64 waves": (flood(waves=Waves(preset="wind", count=64)), camera()),
+    "straight up": (flood(-50.0), UP),
+    "64 waves, t = 1e9 s": (
+        flood(waves=Waves(preset="wind", count=64)),
+        dataclasses.replace(camera(), timestamp_ns=10**18),
+    ),
     "a wavelength of 1 mm": (
         flood(waves=Waves(components=(Wave(amplitude_m=1e-5, wavelength_m=1e-3),))),
-        camera(),
-    ),
-    "a wavelength of 1 km": (
-        flood(waves=Waves(components=(Wave(amplitude_m=5.0, wavelength_m=1e3),))),
-        camera(),
+        camera(37, 23),
     ),
     "the steepest wave": (
         flood(waves=Waves(components=(Wave(amplitude_m=0.15, wavelength_m=1.0, steepness=1.0),))),
         camera(),
     ),
-    "t = 1e9 s": (
-        flood(waves=Waves(preset="wind")),
-        dataclasses.replace(camera(), timestamp_ns=10**18),
-    ),
-    "turbidity 0": (flood(turbidity_ntu=0), camera()),
-    "turbidity without end": (flood(turbidity_ntu=1e6), camera()),
-    "refraction index 1": (flood(refraction_index=1.0), camera()),
-    "refraction index 3": (flood(refraction_index=3.0), camera()),
+    "clear, refraction index 1": (flood(turbidity_ntu=0, refraction_index=1.0), camera()),
+    "opaque, refraction index 3": (flood(turbidity_ntu=1e6, refraction_index=3.0), camera()),
     "1x1 pixel": (flood(), camera(1, 1, pitch=0.5)),
-    "1x1 pixel of sky": (flood(), camera(1, 1, pitch=-0.5)),
-    "odd sizes": (flood(waves=Waves(preset="breeze")), camera(37, 23)),
 }
 
 

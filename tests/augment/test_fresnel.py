@@ -22,10 +22,9 @@ def test_grazing_light_is_reflected_whole():
         assert float(exact(edge, index)) == 1 and float(schlick(edge, index)) == 1
 
 
-@pytest.mark.parametrize("cosine", [0.0, 1e-6, 0.3, 1.0])
-def test_an_index_of_one_reflects_nothing(cosine):
-    value = torch.tensor([cosine])
-    assert float(exact(value, 1.0)) == 0 and float(schlick(value, 1.0)) == 0
+def test_an_index_of_one_reflects_nothing():
+    cosine = torch.tensor([0.0, 1e-6, 0.3, 1.0])
+    assert not exact(cosine, 1.0).any() and not schlick(cosine, 1.0).any()
 
 
 def test_brewsters_angle_leaves_only_the_perpendicular_part():
@@ -66,15 +65,3 @@ def test_gradients_stay_finite_from_end_to_end():
     c = torch.linspace(0, 1, 11, dtype=torch.float64, requires_grad=True)
     exact(c, 1.333).sum().backward()
     assert torch.isfinite(c.grad).all()
-
-
-@pytest.mark.parametrize("index", [0.0, -1.0, math.inf, math.nan])
-def test_impossible_indices_are_refused(index):
-    for model in (exact, schlick):
-        with pytest.raises(ValueError, match="index"):
-            model(cosines(10.0), index)
-
-
-def test_schlick_refuses_to_look_out_of_the_water():
-    with pytest.raises(ValueError, match="total reflection"):
-        schlick(cosines(10.0), 0.75)

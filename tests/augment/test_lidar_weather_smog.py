@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -21,17 +20,9 @@ from augment.effects.lidar.beam import (
     wavelength_factor,
     weathered_sweep,
 )
-from augment.effects.smog import SmogMedium, optical_depth, optical_depth_of_arrays
+from augment.effects.smog import SmogMedium, optical_depth_of_arrays
 from recipes.schema import KOSCHMIEDER, Smog
-from tests.lidar_sweeps import (
-    SENSOR_M,
-    WORLD_ORIGIN_M,
-    ranges_of,
-    recipe,
-    some_points,
-    street,
-    sweep_of,
-)
+from tests.lidar_sweeps import ranges_of, recipe, some_points, street, sweep_of
 
 MODEL = LidarModel()
 
@@ -51,15 +42,6 @@ def test_extinction_rises_with_the_smogs_density_at_905_nm_too() -> None:
     sigma = np.geomspace(1e-6, 10, 4000)
     thinned = np.array([s * wavelength_factor(float(s)) for s in sigma])
     assert (np.diff(thinned) > 0).all()
-
-
-@pytest.mark.parametrize("scale_height_m", [None, 20.0])
-def test_optical_depth_is_the_images(scale_height_m: float | None) -> None:
-    medium = SmogMedium(0.02, (1.0, 1.0, 1.0), scale_height_m, -1.0)
-    distance, z = np.linspace(0, 80, 50), np.linspace(1.7, 30, 50)
-    ours = optical_depth_of_arrays(medium, distance, np.full(50, 1.7), z)
-    theirs = optical_depth(medium, torch.from_numpy(distance), 1.7, torch.from_numpy(z)).numpy()
-    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_intensities_fall_by_two_ways() -> None:
@@ -117,16 +99,6 @@ def test_dense_fog_shows_itself_and_hides_what_is_far() -> None:
     assert (out.columns["intensity"][scattered] < 0.05).all()
     lost = code == LOST
     assert np.isnan(out.points_m[lost]).all() and (out.columns["intensity"][lost] == 0).all()
-
-
-def test_scattered_returns_lie_on_their_beams() -> None:
-    sweep = sweep_of(some_points(500), intensity=0.2)
-    out = weathered_sweep(street(), recipe(smog=30), 0, sweep)
-    rows = out.columns["weather_code"] == SCATTERED
-    before = sweep.points_m[rows] - WORLD_ORIGIN_M - SENSOR_M
-    after = out.points_m[rows] - WORLD_ORIGIN_M - SENSOR_M
-    cross = np.linalg.norm(np.cross(before, after), axis=1) / np.linalg.norm(before, axis=1)
-    assert rows.any() and cross.max() < 1e-6  # nanometres of UTM coordinates are rounded off
 
 
 def test_denser_smog_leaves_less() -> None:

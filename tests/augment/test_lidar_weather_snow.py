@@ -19,6 +19,7 @@ from recipes.weather import Snow
 from tests.lidar_sweeps import (
     SENSOR_M,
     WORLD_ORIGIN_M,
+    beams,
     ground_points,
     ranges_of,
     recipe,
@@ -42,12 +43,6 @@ def scene():
         opened, placement_settings(SNOW), SnowSupport(ground=FLAT, actors={"car": roof})
     )
     return opened
-
-
-def beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    offsets = points - SENSOR_M
-    ranges = np.linalg.norm(offsets, axis=1)
-    return np.tile(SENSOR_M, (len(points), 1)), offsets / ranges[:, None], ranges
 
 
 def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:

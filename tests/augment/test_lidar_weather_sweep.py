@@ -22,7 +22,7 @@ from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
 from augment.scene import Scene
 from augment.views import WeatheredView, render_view
-from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.schema import Recipe, Smog, Weather
 from recipes.weather import Flood, Snow
 from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
 from tests.streets import LABELLED_STREET, open_street
@@ -136,28 +136,6 @@ def test_origins_by_default_and_wrong_ones() -> None:
         origins_of(street(labels=Wrong(None)), 0, sweep)
 
 
-def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
-    weather = Weather(smog=Smog(visibility_m=0.5))
-    wanted = Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
-    job = RenderJob("fake:street", [wanted], tmp_path / "one")
-    assert run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False).failed == 0
-    rows = read_manifest(tmp_path / "one").to_pylist()
-    paths = {row["lidar_path"] for row in rows} - {None}
-    assert len(paths) == 3
-    for path in paths:
-        sweep = read_lidar(tmp_path / "one" / path)
-        scene, frame = open_fake("fake:street"), int(Path(path).stem)
-        source = scene.lidar(frame)
-        assert len(sweep) == len(source) and set(sweep.columns) >= ADDED
-        assert sweep.columns["weather_code"].any()
-        again = weathered_sweep(scene, wanted, frame, source)
-        assert lidar_bytes(again) == (tmp_path / "one" / path).read_bytes()
-    off = make_recipe().model_copy(update={"output": Output(lidar=False)})
-    job = RenderJob("fake:street", [off], tmp_path / "off")
-    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
-    assert {row["lidar_path"] for row in read_manifest(tmp_path / "off").to_pylist()} == {None}
-
-
 def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarSweep) -> np.ndarray:
     """How far in front of or behind the depth image the returns on its snow pixels are, metres."""
     pose = camera.camera_from_world.numpy()
@@ -242,9 +220,3 @@ def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
     scene = open_fake("fake:street")
     assert has_lidar(scene, [3, 0]) and not has_lidar(scene, [3])
     assert not has_lidar(dataclasses.replace(scene, labels=None), [0])
-
-
-def test_recipes_hashes_stay() -> None:
-    assert Recipe().hash == "8553a2737c7b8e42"
-    hashes = {Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
-    assert len(hashes) == 3

@@ -19,7 +19,7 @@ from augment.effects.lidar.beam import (
     weathered_sweep,
 )
 from recipes.weather import Flood, Waves
-from tests.lidar_sweeps import SENSOR_M, ground_points, recipe, some_points, street, sweep_of
+from tests.lidar_sweeps import beams, ground_points, recipe, some_points, street, sweep_of
 
 CLEAR = Flood(level_m=0.02, reference="absolute", turbidity_ntu=0)
 
@@ -32,12 +32,6 @@ def medium(level_m: float = 0.02, extinction: float = 0.34, index: float = 1.333
         waves=make_waves(Waves(preset="still"), seed=0, depth_m=1.0),
         refraction_index=index,
     )
-
-
-def beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    offsets = points - SENSOR_M
-    ranges = np.linalg.norm(offsets, axis=1)
-    return np.tile(SENSOR_M, (len(points), 1)), offsets / ranges[:, None], ranges
 
 
 def test_a_shallow_bed_by_hand() -> None:

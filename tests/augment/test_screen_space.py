@@ -101,8 +101,7 @@ VIEWS = [(0, 0), (8, 0), (0, 25), (12, -40), (-10, 5), (35, 90)]
 
 
 @pytest.mark.parametrize(
-    ("backend", "view"),
-    [*itertools.product(["reference", "cpu"], VIEWS), ("cuda", VIEWS[1]), ("cuda", VIEWS[3])],
+    ("backend", "view"), [*itertools.product(["reference", "cpu"], VIEWS[1::2]), ("cuda", VIEWS[1])]
 )
 def test_rays_meet_a_wall_where_geometry_says(backend, view):
     pitch, roll = view
@@ -122,11 +121,10 @@ def test_rays_meet_a_wall_where_geometry_says(backend, view):
     assert (found.weight[middle] == 1).all()
 
 
-@pytest.mark.parametrize("stride", [2, 4])
-def test_a_wall_is_as_smooth_between_the_traced_pixels(stride):
+def test_a_wall_is_as_smooth_between_the_traced_pixels():
     camera = looking(8, 3)
     front = see(camera, WALL)
-    found = trace_screen(front, camera, LEVEL_M, stride=stride).distance
+    found = trace_screen(front, camera, LEVEL_M, stride=4).distance
     way, height = mirrored_way(camera, WALL_M)
     at = projected(camera, way)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
@@ -205,8 +203,9 @@ def test_rays_that_come_back_to_the_camera_are_not_known(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
-@pytest.mark.parametrize("stride", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4), ("cuda", 1)]
+)
 def test_nothing_stands_anywhere(backend, stride):
     camera = looking(0, height=65)
     front = see(camera)
@@ -228,8 +227,9 @@ def test_pixels_without_water_have_no_reflection(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 5), (63, 65), (129, 64)])
-@pytest.mark.parametrize("stride", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("size", "stride"), [((1, 1), 4), ((2, 3), 2), ((17, 5), 4), ((63, 65), 4), ((129, 64), 1)]
+)
 def test_every_size_of_image_and_window(size, stride):
     camera = looking(15, 4, *size, fx=0.6 * max(size))
     front = see(camera, CAR, WALL)
@@ -251,7 +251,7 @@ def test_every_size_of_image_and_window(size, stride):
 
 @pytest.mark.parametrize(
     ("backend", "pitch", "roll"),
-    [*(("cpu", *view) for view in (*VIEWS, (80, 20))), ("cuda", 12, -40), ("cuda", 35, 90)],
+    [*(("cpu", *view) for view in (*VIEWS[::2], (80, 20))), ("cuda", 12, -40)],
 )
 def test_the_kernel_matches_the_definition(backend, pitch, roll):
     camera = looking(pitch, roll, 131, 90, fx=80.0)
@@ -283,16 +283,6 @@ def test_only_needed_pixels_are_traced(backend, stride):
         assert torch.equal(part.weight[needed], whole.weight[needed])
 
 
-def test_gaps_narrower_than_the_stride_have_no_negative_weight():
-    camera = looking(10)
-    front = see(camera)
-    alpha = torch.ones_like(front.alpha)
-    alpha[41::4, 41::4] = 0  # rays of no other pixel are traced first
-    covered = dataclasses.replace(front, alpha=alpha, depth=torch.full_like(front.depth, 2.0))
-    found = trace_screen(covered, camera, LEVEL_M, stride=4)
-    assert (found.weight >= 0).all()
-
-
 def test_the_number_of_threads_changes_nothing():
     camera = looking(6, 10, 131, 90)
     front = see(camera, SIGN, CAR, WALL)
@@ -309,10 +299,5 @@ def test_the_number_of_threads_changes_nothing():
 
 def test_a_camera_that_is_no_window_is_named():
     camera = looking()
-    with pytest.raises(ValueError, match="must be a window of the front's"):
+    with pytest.raises(ValueError, match="windows of one image"):
         trace_screen(see(camera), camera.scaled(0.5), LEVEL_M)
-    with pytest.raises(ValueError, match="needed must be"):
-        needed = torch.ones(3, 4, dtype=torch.bool)
-        trace_screen(see(camera), camera, LEVEL_M, needed=needed)
-    with pytest.raises(ValueError, match="stride must be one of"):
-        trace_screen(see(camera), camera, LEVEL_M, stride=3)

@@ -43,26 +43,19 @@ def test_no_density_is_the_identity_to_the_bit():
         assert torch.equal(sky_optical_depth(medium, torch.linspace(-1, 1, 9), 1.0), torch.zeros(9))
 
 
-@pytest.mark.parametrize(
-    ("eye", "point", "distance"),
-    [
+def test_scale_height_against_quadrature():
+    medium = layered()
+    for eye, point, distance in (
         (1.6, 1.6, 50.0),
         (1.6, 1.6001, 50.0),
         (1.6, 40.0, 80.0),
         (60.0, 0.0, 90.0),
         (0.0, 300.0, 300.0),
-    ],
-)
-def test_scale_height_against_quadrature(eye, point, distance):
-    medium = layered()
-    tau = optical_depth(
-        medium,
-        torch.tensor(distance, dtype=torch.float64),
-        eye,
-        torch.tensor(point, dtype=torch.float64),
-    )
-    # The midpoint rule is off by (x / 20 000)^2 / 24 with x = 20 scale heights at most: 4e-8.
-    assert float(tau) == pytest.approx(quadrature(medium, distance, eye, point), rel=1e-7)
+    ):
+        way, z = torch.tensor([distance, point], dtype=torch.float64)
+        tau = float(optical_depth(medium, way, eye, z))
+        # The midpoint rule is off by (x / 20 000)^2 / 24 with x = 20 scale heights at most: 4e-8.
+        assert tau == pytest.approx(quadrature(medium, distance, eye, point), rel=1e-7)
 
 
 def test_optical_depths_add_up_along_a_ray():
@@ -109,8 +102,8 @@ def test_the_sky_behind_uniform_smog_or_below_the_horizon_is_airlight():
     assert torch.isinf(tau[slopes <= 0]).all() and torch.isfinite(tau[slopes > 0]).all()
 
 
-@pytest.mark.parametrize("sigma", [0.0, 1e-30, 1.0, 100.0])
-@pytest.mark.parametrize("height", [None, 1e-3, 1.0, 1e5])
+@pytest.mark.parametrize("sigma", [0.0, 1e-30, 100.0])
+@pytest.mark.parametrize("height", [None, 1e-3, 1e5])
 def test_extremes_stay_finite(sigma, height):
     medium = SmogMedium(sigma, GREY, scale_height_m=height, base_z_m=0.0)
     distance = torch.tensor([0.0, 1e-30, 1.0, 1e8])
@@ -149,9 +142,9 @@ def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky
     assert torch.equal(out[0, 1], torch.zeros(3))
 
 
-@pytest.mark.parametrize("sigma", [-0.1, math.nan, math.inf])
-def test_impossible_densities_are_refused(sigma):
-    with pytest.raises(ValueError, match="sigma_per_m must be finite and >= 0"):
-        SmogMedium(sigma, GREY)
+def test_impossible_densities_are_refused():
+    for sigma in (-0.1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="sigma_per_m must be finite and >= 0"):
+            SmogMedium(sigma, GREY)
     with pytest.raises(ValueError, match="scale_height_m must be finite and > 0; got 0"):
         SmogMedium(0.1, GREY, scale_height_m=0.0)

@@ -7,7 +7,7 @@ from adapters.procedural import open_truth
 from adapters.uri import parse_uri
 from recipes.schema import Smog
 from tests.streets import open_street
-from tools.bench.effects import away_from_silhouettes, smog_error, smog_model_recipe, truth_view
+from tools.bench.effects import smog_error, smog_model_recipe, truth_view
 
 STREET = "procedural:street?seed=3&frames=1&gaussians=150000&parked=4&moving=1&pedestrians=1"
 
@@ -32,5 +32,3 @@ def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_
     assert np.quantile(smooth, 0.99) <= 4.0
     # And it is smog that is measured: silhouettes, where two distances mix, do differ.
     assert np.quantile(error[view.regions["silhouette"]], 0.99) > 4.0
-
-

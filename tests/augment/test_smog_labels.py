@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 import torch
 from batch_scenes import ORIGIN_M
-from box_views import (
-    CAR_M,
-    UPRIGHT,
-    boxes_at_random,
-    count_by_hand,
-    make_boxes,
-    make_camera,
-    plane_depth,
-)
+from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera
 
 from augment.boxes import BOTTOM_M, NOT_COUNTED, SIDES_M
 from augment.effects import smog
@@ -93,20 +85,6 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: SmogMedium) 
     assert (got.pixels > 0).sum() > 30 and (got.pixels == 0).sum() > 5
 
 
-def test_smog_on_the_ground_hides_what_is_low() -> None:
-    """The integral of the density along the ray, by the midpoint rule."""
-    low, high = (30.0, 0, 0.2), (30.0, 0, 12.0)
-    boxes = make_boxes((low, POINT_M, UPRIGHT), (high, POINT_M, UPRIGHT))
-    got = measure(boxes, LAYERED).transmittance
-    steps = (np.arange(20_000) + 0.5) / 20_000
-    for place, through in zip((low, high), got, strict=True):
-        z = EYE_Z_M + steps * (place[2] - EYE_Z_M)
-        density = 0.08 * np.exp(-(z + 0.5) / 3.0)
-        tau = density.mean() * math.dist(place, (0, 0, EYE_Z_M))
-        assert through == pytest.approx(math.exp(-tau), rel=1e-7)  # of the rule and the origin
-    assert got[0] < got[1]
-
-
 @pytest.mark.parametrize("medium", [THICK, LAYERED, SmogMedium(100.0, GREY, 0.1, -50.0)])
 def test_the_optical_depth_is_that_of_the_image(medium: SmogMedium) -> None:
     rng = np.random.default_rng(1)
@@ -117,16 +95,6 @@ def test_the_optical_depth_is_that_of_the_image(medium: SmogMedium) -> None:
     expected = smog.optical_depth(medium, tensors[0], EYE_Z_M, tensors[1]).numpy()
     # The image's takes a straight line below 1e-4, which float32 does not tell from the curve.
     np.testing.assert_allclose(got, expected, rtol=2e-9)
-
-
-def test_what_stands_in_front_leaves_the_estimate() -> None:
-    boxes = make_boxes(((10, 0, EYE_Z_M), CAR_M, UPRIGHT))  # from 8 to 12 m
-    hidden, none = measure(boxes, depth_m=wall(5)), measure(boxes)
-    assert (hidden.pixels[0], none.pixels[0]) == (0, NOT_COUNTED)
-    assert hidden.transmittance[0] == none.transmittance[0]
-    seen = measure(boxes, depth_m=wall(8))
-    assert seen.pixels[0] > 0
-    assert math.exp(-0.05 * 13) < hidden.transmittance[0] < seen.transmittance[0]
 
 
 def test_boxes_behind_the_camera_around_it_and_of_no_number() -> None:
@@ -166,19 +134,3 @@ def test_smog_is_in_the_air_alone_for_an_eye_in_the_water() -> None:
         )
         np.testing.assert_array_equal(above.transmittance, dry.transmittance)
         assert below.transmittance[0] == 1 and below.transmittance[1] == dry.transmittance[1]
-
-
-def test_the_road_under_a_car_does_not_count() -> None:
-    camera = make_camera(pitch=0.2)
-    boxes = make_boxes(((8, 0, 0.72), CAR_M, UPRIGHT))
-    road = measure(boxes, depth_m=plane_depth(camera, 0.0), camera=camera)
-    sill = measure(boxes, depth_m=plane_depth(camera, 0.15), camera=camera)
-    assert road.pixels[0] == 0 < sill.pixels[0]
-    counted, _ = count_by_hand(
-        boxes,
-        [(np.array([-2.1, -1.1, -0.67]), np.array([2.1, 1.1, 0.85]))],
-        camera,
-        plane_depth(camera, 0.15),
-        np.zeros(SHAPE, np.uint8),
-    )
-    assert sill.pixels.tolist() == counted

@@ -160,10 +160,11 @@ VIEWS = [
 @pytest.mark.parametrize(
     ("backend", "smog", "tier", "view"),
     [
-        *itertools.product(["cpu"], SMOGS, TIERS, VIEWS),
-        *itertools.product(["cuda"], ["layered"], TIERS, VIEWS[:2]),
-        *itertools.product(["cuda"], ["uniform"], ["screen_space"], VIEWS[1:2]),
-        *itertools.product(["cuda"], ["layered"], ["mirrored"], VIEWS[2:]),
+        *itertools.product(["cpu"], ["layered"], TIERS, VIEWS[:2]),
+        *itertools.product(["cpu"], ["clear", "uniform"], ["screen_space"], VIEWS[1:2]),
+        *itertools.product(["cpu"], ["layered"], ["mirrored"], VIEWS[2:]),
+        *itertools.product(["cuda"], ["layered"], TIERS[1:], VIEWS[1:2]),
+        ("cuda", "uniform", "sky", VIEWS[3]),
     ],
 )
 def test_the_kernel_matches_the_definition(backend, smog, tier, view):
@@ -199,8 +200,8 @@ def test_the_kernel_matches_the_definition(backend, smog, tier, view):
 @pytest.mark.parametrize(
     ("backend", "tier", "index", "extinction"),
     [
-        *itertools.product(["reference", "cpu"], TIERS, [1.0, 1.333, 3.0], [0.0, 1.0, math.inf]),
-        ("cuda", "sky", 1.0, 0.0),
+        *itertools.product(["reference", "cpu"], TIERS, [1.333], [1.0]),
+        *itertools.product(["reference", "cpu"], TIERS[1:], [1.0, 3.0], [0.0, math.inf]),
         ("cuda", "mirrored", 3.0, math.inf),
         ("cuda", "screen_space", 1.333, 1.0),
     ],
@@ -256,9 +257,8 @@ def refract_exactly(eye: Camera, depth: float, index: float) -> tuple[torch.Tens
 
 
 @ALL
-@pytest.mark.parametrize("index", [1.333, 2.5])
-def test_refracted_rays_meet_the_bed_where_snell_says(backend, index):
-    eye, depth = camera(pitch_deg=-40), 0.6
+def test_refracted_rays_meet_the_bed_where_snell_says(backend):
+    eye, depth, index = camera(pitch_deg=-40), 0.6, 1.333
     bed = plane_layer(margin(eye, 40), LEVEL - depth)
     water = medium(extinction_per_m=(0.0, 0.4, 1.5), refraction_index=index)
     black = ConstantSky(torch.zeros(3))
@@ -281,9 +281,8 @@ def test_refracted_rays_meet_the_bed_where_snell_says(backend, index):
 
 
 @ALL
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, -0.02)])
-def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(backend, slope):
-    eye = camera(pitch_deg=-8)
+def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(backend):
+    eye, slope = camera(pitch_deg=-8), (0.03, -0.02)
     below = mirrored(eye).cropped(-20, -20, 101, 83)
     normal = torch.tensor([40.0, 30.0, 0.0], dtype=torch.float64) / 50  # a wall 25 m ahead
 
@@ -349,26 +348,9 @@ def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
     torch.testing.assert_close(out.double(), expected, atol=2e-6, rtol=0)  # a few float32 roundings
 
 
-@ALL
-def test_uniform_smog_leaves_its_own_colour_of_the_sky(backend):
-    eye = camera(pitch_deg=-40)
-    bed = plane_layer(eye, LEVEL - 0.3)
-    black = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
-    thin = SmogMedium(1e-6, GREY)
-    out = shade_water(eye, black, flat_field(eye), bed, smog=thin, backend=backend)
-    rays = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
-    share = reflectance(-rays[..., 2], 1.333, "exact")[..., None]
-    # The smog before the water hides less than a 1e-4th of it.
-    assert float((out - share * torch.tensor(GREY)).abs().max()) < 1e-4
-
-
 @pytest.mark.parametrize(
     ("backend", "above", "pitch_deg"),
-    [
-        *itertools.product(["reference", "cpu"], [1e-6, 0.01, 5e3], [-90.0, 0.0, 35.0]),
-        ("cuda", 1e-6, 0.0),
-        ("cuda", 5e3, 35.0),
-    ],
+    [*itertools.product(["reference", "cpu"], [1e-6, 5e3], [-90.0, 0.0]), ("cuda", 5e3, 35.0)],
 )
 def test_extreme_views_stay_finite(backend, above, pitch_deg):
     eye = camera(above=above, pitch_deg=pitch_deg, roll=0.0)
@@ -384,17 +366,6 @@ def test_extreme_views_stay_finite(backend, above, pitch_deg):
         )  # fmt: skip
         assert bool(torch.isfinite(out).all()) and float(out.min()) >= -1e-5
         assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
-
-
-@ALL
-def test_a_dry_bed_is_not_dimmed_by_any_water(backend):
-    eye = camera()
-    bed = dataclasses.replace(plane_layer(eye, LEVEL), alpha=torch.ones(43, 61))
-    water = medium(extinction_per_m=(math.inf,) * 3, refraction_index=1.0)
-    # On the plane itself, or above it by the rounding of its depth: no water over it.
-    bed = dataclasses.replace(bed, depth=bed.depth * (1 - 1e-6))
-    out = shade_water(eye, water, flat_field(eye), bed, backend=backend)
-    assert torch.equal(out, bed.rgb)
 
 
 @ALL
@@ -459,28 +430,6 @@ def test_covered_pixels_are_one_colour(backend):
     assert torch.equal(out[30:40], torch.tensor(smog.rgb).expand_as(out[30:40]))
 
 
-@ALL
-def test_several_slopes_show_one_blurred_picture(backend):
-    """A bright line reflected in rough water spreads evenly instead of showing three times."""
-    eye = camera(pitch_deg=-8)
-    below = mirrored(eye)
-    rgb = torch.zeros(43, 61, 3)
-    rgb[20:24] = 1
-    mirror = Layer(below, rgb, torch.ones(43, 61), torch.full((43, 61), 1e3))
-    water = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
-    bed = plane_layer(eye, LEVEL - 0.3)
-    zero = torch.zeros(43, 61)
-    rough = WaveField(zero, zero, torch.full((43, 61), 0.004))
-    out = shade_water(eye, water, rough, bed, mirror=mirror, backend=backend)
-    column = out[:, 30, 0]
-    top = int(column.argmax())
-    rises = column[1:] - column[:-1]
-    assert float(column[top]) > 0.01
-    # One hill, but for the small steps of mip levels' pixels.
-    assert float(rises[:top].min()) > -0.15 * float(column[top])
-    assert float(rises[top:].max()) < 0.15 * float(column[top])
-
-
 @pytest.mark.parametrize("backend", ["cpu", "cuda"])
 def test_other_skies_go_through_a_cube_map(backend):
     eye = camera()
@@ -530,15 +479,8 @@ def test_results_do_not_depend_on_the_number_of_threads():
     assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
 
 
-def test_what_does_not_fit_is_refused():
+def test_a_bed_seen_by_another_camera_is_refused():
     eye = camera()
-    bed, field, cover = plane_layer(eye, LEVEL - 0.3), flat_field(eye), uncovered(eye)
-    turned = dataclasses.replace(bed, camera=camera(pitch_deg=-21))
-    for message, water, seen, options in (
-        ("above the water", medium(level_z_m=20.0), bed, {}),
-        ("window of the image", medium(), turned, {}),
-        ("mirrored eye", medium(), bed, {"mirror": bed}),
-        ("cover must be", medium(), bed, {"cover": cover[1:]}),
-    ):
-        with pytest.raises(ValueError, match=message):
-            shade_water(eye, water, field, seen, **options)
+    turned = plane_layer(camera(pitch_deg=-21), LEVEL - 0.3)
+    with pytest.raises(ValueError, match="windows of one image"):
+        shade_water(eye, medium(), flat_field(eye), turned)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -28,38 +30,18 @@ def turned_camera(seed: int, width=31, height=19, position=(0.0, 0.0, 0.0)) -> C
     )
 
 
-def looking(forward, down) -> Camera:
-    forward, down = (torch.tensor(v, dtype=torch.float64) for v in (forward, down))
-    rotation = torch.stack([torch.linalg.cross(down, forward), down, forward])
-    return Camera("c", 8, 6, 10.0, 10.0, 4.0, 3.0, rigid(rotation, torch.zeros(3).double()))
-
-
-@pytest.mark.parametrize("level_z_m", [-1.5, 1.5, 0.0])
-@pytest.mark.parametrize("seed", range(20))
-def test_the_window_is_the_least_that_holds_all_rays_that_meet_the_plane(seed, level_z_m):
-    camera = turned_camera(seed)
-    meets = plane_depth(camera, level_z_m).isfinite()
-    if level_z_m == 0.0:  # an eye in the plane: rays that rise
-        meets = camera.ray_directions(torch.float64)[..., 2] > 0
-    window = plane_window(camera, level_z_m)
-    if not bool(meets.any()):
-        assert window is None
-        return
-    rows, columns = meets.any(1).nonzero(), meets.any(0).nonzero()
-    assert window == Window(
-        int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
-    )
-
-
-def test_straight_down_up_and_along():
-    down = looking((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
-    up = looking((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    assert plane_window(down, -1.0) == Window(0, 0, 8, 6)
-    assert plane_window(up, -1.0) is None
-    assert plane_window(up, 1.0) == Window(0, 0, 8, 6)
-    along = looking((1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-    assert plane_window(along, -1.0) == Window(0, 3, 8, 6)  # the rows below the horizon
-    assert plane_window(along.cropped(0, 0, 8, 3), -1.0) is None
+def test_the_window_is_the_least_that_holds_all_rays_that_meet_the_plane():
+    for seed, level_z_m in itertools.product(range(12), [-1.5, 1.5, 0.0]):
+        camera = turned_camera(seed)
+        meets = plane_depth(camera, level_z_m).isfinite()
+        if level_z_m == 0.0:  # an eye in the plane: rays that rise
+            meets = camera.ray_directions(torch.float64)[..., 2] > 0
+        rows, columns = meets.any(1).nonzero(), meets.any(0).nonzero()
+        expected = None
+        if len(rows):
+            first, last = (int(columns.min()), int(rows.min())), (columns.max(), rows.max())
+            expected = Window(*first, int(last[0]) + 1, int(last[1]) + 1)
+        assert plane_window(camera, level_z_m) == expected
 
 
 def test_depths_reach_the_plane():
@@ -71,7 +53,7 @@ def test_depths_reach_the_plane():
     assert bool((depth[met] > 0).all())
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_pixel_of_the_mirrored_camera_looks_along_the_reflected_ray(seed):
     camera, level = turned_camera(seed, position=(0.4, 0.3, 1.7)), -0.2
     mirrored = mirrored_camera(camera, level)
@@ -106,14 +88,6 @@ def test_cut_and_paste():
     expected[3, :2] = torch.tensor([2.0, 3.0])
     assert torch.equal(into, expected)
     assert window.grown(Margins(1, 2, 3, 4)) == Window(0, 0, 7, 8)
-
-
-def test_pixels_of_a_window_keep_their_rays():
-    camera = turned_camera(7)
-    part = camera.cropped(-3, 5, 12, 40)
-    whole = camera.ray_directions(torch.float64)
-    inside = part.ray_directions(torch.float64)[: 19 - 5, 3:]
-    assert torch.allclose(inside, whole[5:, :9], atol=1e-13)
 
 
 def test_masks_grow_at_least_by_their_margins():

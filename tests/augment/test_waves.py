@@ -87,36 +87,6 @@ def random_points(count: int, extent_m: float = 50.0) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(0).uniform(-extent_m, extent_m, (count, 2)))
 
 
-# The records
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("directions", np.ones((5, 2)), "unit length"),
-        ("directions", np.ones((5, 3)), r"float64 \[5, 2\].*got float64 \[5, 3\]"),
-        ("amplitudes_m", np.full(5, -0.1), "amplitudes_m must be >= 0"),
-        ("amplitudes_m", np.zeros(4), r"amplitudes_m must be float64 \[5\]"),
-        ("amplitudes_m", np.zeros(5, np.float32), "float32"),
-        ("wavelengths_m", np.zeros(5), "wavelengths_m must be > 0"),
-        ("steepness", np.full(5, 0.21), "sum to at most 1.*got 1.05 from 5 waves"),
-        ("steepness", np.full(5, -0.1), "steepness must be >= 0"),
-        ("phases_rad", np.full(5, np.nan), "phases_rad must be finite"),
-        ("depth_m", 0.0, "depth_m must be > 0"),
-        ("depth_m", math.nan, "depth_m must be > 0"),
-    ],
-)
-def test_a_wave_set_refuses_what_makes_no_surface(field, value, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(waves_of(), **{field: value})
-
-
-def test_a_steepness_of_one_may_be_a_sum_of_decimal_fractions():
-    tenths = np.full(5, 0.1) + 0.1
-    assert tenths.sum() == 1.0
-    assert dataclasses.replace(waves_of(), steepness=tenths + 1e-12).steepness.sum() > 1
-
-
 # What a recipe draws
 
 
@@ -137,12 +107,6 @@ def test_the_first_numbers_of_a_seed_are_pinned():
     phases = [2.751173005872406, 1.4414570607582793, 5.628359912392606]
     assert waves.wavelengths_m.tolist() == pytest.approx(wavelengths, rel=1e-12)
     assert waves.phases_rad.tolist() == pytest.approx(phases, rel=1e-12)
-
-
-def test_still_water_has_no_waves():
-    assert len(make_waves(Waves(preset="still"), seed=0, depth_m=1.0).wavelengths_m) == 0
-    assert make_waves(Waves(components=()), seed=0, depth_m=1.0).is_flat
-    assert make_waves(Waves(preset="wind", height=0.0), seed=0, depth_m=1.0).is_flat
 
 
 @pytest.mark.parametrize(("preset", "count"), [("calm", 1), ("breeze", 24), ("wind", 64)])
@@ -305,12 +269,20 @@ def fields_of(waves: WaveSet, camera: Camera, *, backend: str, level_z_m: float 
     return torch.stack([field.normal_x, field.normal_y, field.slope_variance]).cpu()
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("waves", SETS)
-def test_the_kernel_matches_the_definition(camera, waves):
-    assert_matches_the_definition(SETS[waves], CAMERAS[camera], "cpu")
-    seen = fields_of(SETS[waves], CAMERAS[camera], backend="reference")
-    assert bool((seen != 0).any()) == (camera != "up")
+@pytest.mark.parametrize(
+    ("waves", "cameras"),
+    [
+        ("24", CAMERAS),
+        ("one", ["tele"]),
+        ("64", ["rolled"]),
+        ("1 mm and 1 km", ["driving", "down"]),
+    ],
+)
+def test_the_kernel_matches_the_definition(waves, cameras):
+    for name in cameras:
+        assert_matches_the_definition(SETS[waves], CAMERAS[name], "cpu")
+        seen = fields_of(SETS[waves], CAMERAS[name], backend="reference")
+        assert bool((seen != 0).any()) == (name != "up")
 
 
 def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) -> None:
@@ -323,14 +295,11 @@ def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) 
     assert float((fast - slow).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize(("waves", "rows"), [("one", 2), ("24", 1)])
-def test_the_gpu_s_kernel_matches_the_definition(camera, waves, rows):
+@pytest.mark.parametrize("camera", ["rolled", "down", "under water", "one pixel", "tele"])
+def test_the_gpu_s_kernel_matches_the_definition(camera):
     camera = CAMERAS[camera]
-    tops = (camera.height // 2, camera.height - rows)  # an interpreted row takes its time
-    for top in tops if waves == "one" else tops[1:]:
-        part = camera.cropped(0, top, camera.width, min(rows, camera.height))
-        assert_matches_the_definition(SETS[waves], part, "cuda")
+    last = camera.cropped(0, camera.height - 1, camera.width, 1)  # interpreted: slow
+    assert_matches_the_definition(SETS["24"], last, "cuda")
 
 
 @pytest.mark.gpu
@@ -365,7 +334,7 @@ def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.
     return point(0, 0), np.stack([columns, rows], axis=1), ray
 
 
-@pytest.mark.parametrize("camera", ["driving", "rolled", "down", "tele"])
+@pytest.mark.parametrize("camera", ["rolled", "tele"])
 def test_the_field_is_what_its_definition_says_pixel_by_pixel(camera):
     camera, waves = CAMERAS[camera], waves_of(12, steepness=0.6, slope=1.0, low=0.05, high=3.0)
     field = fields_of(waves, camera, backend="reference")
@@ -411,8 +380,6 @@ def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
         field = fields_of(waves, camera, backend=backend)
         assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
         assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())
-    with pytest.raises(ValueError, match="level_z_m must be finite"):
-        wave_field(waves, camera, math.inf)
 
 
 def test_two_cameras_see_one_surface():

@@ -12,7 +12,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood import cuda_kernels as kernels
 from augment.effects.flood.flood import Layer
-from augment.effects.flood.refraction import MIP_LEVELS, smooth_variance, window_offset
+from augment.effects.flood.refraction import MIP_LEVELS, smooth_variance
 from augment.effects.flood.water import Water, flat_faces, medium_numbers, view_numbers
 from augment.effects.flood.water_kernels import HIDDEN_COVER
 from augment.effects.flood.water_plane import (
@@ -22,6 +22,7 @@ from augment.effects.flood.water_plane import (
     column_intervals,
     falling_rows,
     image_coordinates,
+    window_offset,
 )
 from augment.effects.flood.waves import WaveField, WaveSet, turns_at
 from augment.effects.smog import SmogMedium
@@ -57,7 +58,7 @@ def _on_gpu(part: Tensor) -> Tensor:
     return part.detach().float().to(gpu_device()).contiguous()
 
 
-# ---- Layers put together, as `flood_view` defines it ---------------------------------------------
+# ---- Layers composited ---------------------------------------------------------------------------
 
 
 def find_water(
@@ -99,9 +100,7 @@ def merge_depths(
     others: list[tuple[Tensor, Tensor]],
     window: Window,
 ) -> None:
-    """Buffers of two layers as one scene's, in place: alpha, the pair of expected depths, and pairs
-    of which those of the layer that covers more of a pixel are kept.
-    """
+    """As `flood_view.merge_depths`, in place. others: pairs of buffers of the two layers."""
     assert len(others) <= MAX_OTHERS
     (rows, columns), (own_rows, own_columns) = window.overlap(alpha)
     wide, count = columns.stop - columns.start, 0
@@ -124,19 +123,14 @@ def merge_depths(
     )
 
 
-# ---- Waves ---------------------------------------------------------------------------------------
-# Float64 is needed for phases alone, and reduced here: the eye's own turns of every wave, and the
-# place of every stretch's anchor.
+# ---- Waves: phases need float64, which is reduced here -------------------------------------------
 
 
 def fill_field(
     waves: WaveSet, camera: Camera, height: float, *, farthest: float, limits: tuple[float, ...]
 ) -> WaveField:
-    """`wave_field` of waves that are not flat, on the GPU.
-
-    height: of the eye over the plane, metres. farthest: depth at which the plane is still met.
-    limits: horizontal part of a ray, at unit z, below which it is vertical; lengths in pixels at
-    which a wave is gone, and at full height.
+    """`wave_field` of waves that are not flat. height: of the eye over the plane, metres. farthest:
+    depth at which the plane is still met. limits: as of the CPU's `fill_field`.
     """
     rotation = camera.world_from_camera[:3, :3].numpy()
     a, b = rotation[:, 0] / camera.fx, rotation[:, 1] / camera.fy

@@ -1,4 +1,4 @@
-"""A flood placed in a scene, and the layers that its water is drawn from."""
+"""A flood placed in a scene, what its surface reflects, and the labels of boxes in it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from augment.cameras import Camera
 from augment.effects.flood.waves import WaveSet
 from augment.labels import Boxes
 
-# ---- Labelled boxes: how deep each stands in the water, and what of it is hidden -----------------
-# Boxes come in the dataset's world, which lies `world_origin_m` off the scene's.
+# ---- Labelled boxes, in the dataset's world, which lies `world_origin_m` off the scene's ---------
 
 
 def submerged_fraction(
@@ -47,8 +46,8 @@ def hidden_pixels(
 ) -> BoxPixels:
     """How many pixels show each box, and how many of them (`marked`) do so through water.
 
-    scene_depth_m: z of the scene's own surface, seen through the water where there is some; 0 =
-    none. water: 255 where water is the first surface.
+    scene_depth_m: z of the scene's own surface, seen through the water; 0 = none. water: 255 where
+    water is the first surface.
     """
     return count_pixels(PlacedBoxes.of(boxes, world_origin_m), camera, scene_depth_m, water)
 
@@ -91,8 +90,8 @@ class Layer:
 
 
 # ---- How much unpolarised light a water surface reflects -----------------------------------------
-# `cosine` is that of the angle between the ray and the surface normal, in [0, 1]; `index` the
-# refraction index behind the surface over the one before it. An index of 1 reflects nothing.
+# cosine: between the ray and the surface normal, in [0, 1]. index: the refraction index behind the
+# surface over the one before it; 1 reflects nothing.
 
 
 def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
@@ -101,7 +100,6 @@ def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     With c and t the cosines on both sides: Rs = ((c - n t) / (c + n t))^2 and
     Rp = ((n c - t) / (n c + t))^2.
     """
-    _check(index)
     if index == 1:
         return torch.zeros_like(cosine)
     c = cosine
@@ -117,12 +115,9 @@ def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
 def schlick(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:
     """Schlick (1994): F0 + (1 - F0) (1 - cosine)^5 with F0 = ((n - 1) / (n + 1))^2.
 
-    For n >= 1, where the cosine is on the air's side. At n = 1.333 it misses `exact` by up to 0.009
+    For n >= 1: it knows no total reflection. At n = 1.333 it misses `exact` by up to 0.009
     below 70 degrees, by 0.027 at 75 and by 0.059 at 84.
     """
-    _check(index)
-    if index < 1:
-        raise ValueError(f"Schlick's formula knows no total reflection: index >= 1; got {index}")
     if index == 1:
         return torch.zeros_like(cosine)
     normal = ((index - 1) / (index + 1)) ** 2
@@ -134,8 +129,3 @@ def reflectance(
 ) -> Float[Tensor, "*B"]:
     """Reflected share of the light by the model a recipe names."""
     return exact(cosine, index) if model == "exact" else schlick(cosine, index)
-
-
-def _check(index: float) -> None:
-    if not 0 < index < float("inf"):
-        raise ValueError(f"index must be a finite number > 0; got {index}")

@@ -1,8 +1,8 @@
 """A view of a flooded scene: the layers that are rasterised, and how they become one picture.
 
 For an eye above the water, a point of a ray lies in front of the water exactly if it lies above its
-plane. So nothing has to be guessed from a depth image: the scene is drawn in layers that are cut at
-the plane pixel by pixel (augment.render.layout),
+plane. So the scene is drawn in layers that are cut at the plane pixel by pixel
+(augment.render.layout),
 
     front     what lies above, over the whole image
     bed       what lies below, where the plane is in view
@@ -28,7 +28,7 @@ from augment.cameras import Camera
 from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
 from augment.effects.flood.refraction import is_smooth
-from augment.effects.flood.screen_space import ScreenReflection, trace_screen
+from augment.effects.flood.screen_space import trace_screen
 from augment.effects.flood.water import shade_water
 from augment.effects.flood.water_plane import (
     Margins,
@@ -41,7 +41,7 @@ from augment.effects.flood.water_plane import (
     plane_window,
     resized,
 )
-from augment.effects.flood.waves import WaveField, wave_field
+from augment.effects.flood.waves import wave_field
 from augment.effects.smog import SmogMedium, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.buffers import (
     ALPHA,
@@ -64,7 +64,7 @@ from augment.scene import PosedGaussians
 from augment.sky import Sky, sample_at
 from augment.timing import timed
 
-# ---- Layers put together: the torch definition, and the way to kernels ---------------------------
+# ---- Layers composited ---------------------------------------------------------------------------
 
 ROWS = 32  # image rows a thread takes at a time
 
@@ -74,7 +74,7 @@ def find_water(
 ) -> tuple[Bool[Tensor, "H W"], float]:
     """Where a camera above the water sees it first, and the largest share of it in any pixel.
 
-    alpha: of what stands before the water. It is seen first where that leaves more than half.
+    alpha: of what stands before the water, which is seen where that leaves more than half.
     """
     kernels = kernels_for(backend, alpha)
     if kernels == CUDA:
@@ -104,8 +104,7 @@ def composite_water(
 ) -> Float[Tensor, "H W 3"]:
     """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
 
-    color: of the window's pixels. backend: kernels work on float32 in place, in the front's own
-    colours: fresh memory would take as long as the arithmetic.
+    color: of the window's pixels. backend: kernels work in place, in the front's own colours.
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
@@ -127,9 +126,8 @@ def composite_water(
         return rgb
     dry = _dry_rows(camera)
     if dry:
-        part = composite_sky(
-            rgb[:dry], alpha[:dry], camera.cropped(0, 0, camera.width, dry), sky, smog=smog
-        )
+        above = camera.cropped(0, 0, camera.width, dry)
+        part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog)
         # Rows that show both: what falls there belongs to the water, the rest to the sky.
         shared = rgb[window.top : dry].clone()
         rgb[:dry] = part
@@ -137,14 +135,9 @@ def composite_water(
             wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
             rgb[window.top : dry][wet] = shared[wet]
     with kernel_threads(ROWS):
-        water_kernels.composite_water(
-            *_rays(window.of(camera)),
-            window.top,
-            window.left,
-            alpha.numpy(),
-            color.contiguous().numpy(),
-            rgb.numpy(),
-        )
+        images = alpha.numpy(), color.contiguous().numpy(), rgb.numpy()
+        rays = _rays(window.of(camera))
+        water_kernels.composite_water(*rays, window.top, window.left, *images)
     return rgb
 
 
@@ -171,8 +164,8 @@ def merge_depths(
     """Buffers of two layers as one scene's, colour excepted; behind: what the window shows through
     the water.
 
-    Alpha and expected depth are what one render would give. Median depth and the heaviest splat
-    are those of the layer that covers more of the pixel. backend: kernels work on float32 in place.
+    Alpha and expected depth are what one render would give; other buffers are those of the layer
+    that covers more of the pixel. backend: kernels work in place.
     """
     assert front.alpha is not None and behind.alpha is not None
     requested = buffers - {RGB, ALPHA}
@@ -215,8 +208,7 @@ def merge_depths(
     return RenderOutput(**values)
 
 
-# ---- The view from under the water: absorption on the way, and the air through Snell's window ----
-# The surface is taken as flat from below, and what it reflects back down as water.
+# ---- The view from under the water, whose surface is taken as flat -------------------------------
 
 
 def view_from_below(
@@ -224,8 +216,8 @@ def view_from_below(
 ) -> Float[Tensor, "H W 3"]:
     """The picture of an eye at or below the water's surface, not clamped.
 
-    front: what lies under water. air: what lies above, from the same camera, on the same device.
-    smog: in the air.
+    front: what lies under water. air: what lies above, from the same camera. smog: in the air.
+    What the surface reflects back down counts as water.
     """
     camera = front.camera
     rgb, device = front.rgb, front.rgb.device
@@ -320,19 +312,12 @@ class LayerRenderer:
             return raster
         return replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
 
-    def layer(
-        self, camera: Camera, clip: HeightClip, pixel_mask: Bool[Tensor, "H W"] | None = None
-    ) -> Layer:
-        buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
-        return as_layer(camera, self.draw(camera, clip, buffers, pixel_mask))
-
 
 @dataclass(frozen=True, eq=False)
 class FloodedImage:
-    """rgb [H, W, 3]: with sky and water, not clamped. scene: buffers of the scene's own surfaces,
-    through the water where there is some: those asked for, with alpha, if any besides colour and
-    alpha are. water [H, W]: where a ray meets water first. is_hidden: whether what stands before
-    the water hides all of it, so that only the front was drawn.
+    """rgb: with sky and water, not clamped. scene: alpha and the requested buffers of the scene's
+    surfaces through the water; empty if only colour and alpha are requested. water: where a ray
+    meets water first. is_hidden: the front hides all of it, and nothing else was drawn.
     """
 
     rgb: Float[Tensor, "H W 3"]
@@ -354,21 +339,11 @@ def render_flooded(
 
     buffers: of the scene's surfaces, as for `rasterize`.
     """
-    window = plane_window(camera, medium.level_z_m)
     if float(camera.centre[2]) <= medium.level_z_m:
         return _from_below(renderer, camera, medium, buffers)
+    window = plane_window(camera, medium.level_z_m)
     if window is None:
         return None
-    return _from_above(renderer, camera, medium, buffers, window)
-
-
-def _from_above(
-    renderer: LayerRenderer,
-    camera: Camera,
-    medium: FloodMedium,
-    buffers: frozenset[str],
-    window: Window,
-) -> FloodedImage:
     above = HeightClip(medium.level_z_m, ABOVE)
     requested = buffers | {RGB, ALPHA}
     if medium.reflection == "screen_space":
@@ -399,8 +374,12 @@ def _from_above(
         bed = _draw_bed(renderer, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
     with timed("flood: mirrored view"):
         mirror = _mirror_layer(renderer, camera, medium, window, seen)
+    screen = None
     with timed("flood: screen march"):
-        screen = _screen_reflection(camera, medium, crop, field, front, backend)
+        if medium.reflection == "screen_space":
+            needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
+            layer = as_layer(camera, front)
+            screen = trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
     with timed("flood: colours of the water"):
         color = shade_water(
             crop,
@@ -428,9 +407,7 @@ def _draw_bed(
     margins: Margins,
     seen: Bool[Tensor, "h w"],
 ) -> RenderOutput:
-    """What lies below the surface, but for what the front hides, and, where only a picture is
-    needed, what the water does.
-    """
+    """What lies below the surface; not what the front hides, nor, in a mere picture, the water."""
     reach = math.inf if scene_buffers else visible_depth_m(medium)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
     requested = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
@@ -461,29 +438,15 @@ def _mirror_layer(
         view = view.scaled(COARSE)
         pixel_mask = resized(pixel_mask, view)
     above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
-    return renderer.layer(view, above, pixel_mask)
-
-
-def _screen_reflection(
-    camera: Camera,
-    medium: FloodMedium,
-    crop: Camera,
-    field: WaveField,
-    front: RenderOutput,
-    backend: str,
-) -> ScreenReflection | None:
-    if medium.reflection != "screen_space":
-        return None
-    needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
-    layer = as_layer(camera, front)
-    return trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
+    buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
+    return as_layer(view, renderer.draw(view, above, buffers, pixel_mask))
 
 
 def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
     """What tilted waves look at beyond the flat reflection.
 
-    A slope turns the reflected ray by twice its angle, mostly up or down, where the reflections are
-    drawn out. The side below the reflections is the horizon, beyond which no reflection looks.
+    A slope turns the reflected ray by twice its angle, mostly up or down. The side below the
+    reflections is the horizon, beyond which no reflection looks.
     """
     waves = medium.waves
     slopes = waves.wavenumbers * waves.amplitudes_m
@@ -520,9 +483,8 @@ def _from_below(
         front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
         above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
         air = renderer.draw(camera, above, requested)
-    image = view_from_below(
-        as_layer(camera, front), as_layer(camera, air), medium, renderer.sky, renderer.medium
-    )
+    layers = as_layer(camera, front), as_layer(camera, air)
+    image = view_from_below(*layers, medium, renderer.sky, renderer.medium)
     water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
     scene = merge_depths(front, air, whole, buffers, backend=renderer.backend)

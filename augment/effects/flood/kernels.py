@@ -1,14 +1,4 @@
-"""Numba kernels that march mirrored rays, eight at a time, through a pyramid of the nearest depth.
-
-The letters are those of `screen_space`, which defines the result. The pyramid holds inverse depths,
-which are linear along a ray's image: a cell of level l is the largest of 4^l x 4^l pixels, 0 where
-nothing stands. A ray whose own inverse depth stays above a cell's, all the way across it, is in
-front of everything there and passes the cell at once.
-
-The levels lie in one array: level 0, padded to whole cells of the highest level, [R, C]; to the
-right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical in the camera (3),
-its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width and height.
-"""
+"""Numba kernels for the water's normals and for the march of mirrored rays through the image."""
 
 from __future__ import annotations
 
@@ -23,11 +13,13 @@ from numba.extending import intrinsic
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner, kernel
 
-# ---- Numba kernel for the water's normals at every pixel of a camera -----------------------------
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
+
+# ---- The water's normals at every pixel of a camera ----------------------------------------------
 # Along a row of the image everything is rational in the column. With d the ray (unit z in the
-# camera), a and b its change per column and row, eye at height h and s = -h / d_z, the plane
-# point n
-# columns right of an anchor pixel (index 0) lies at
+# camera), a and b its change per column and row, eye at height h and s = -h / d_z, the plane point
+# n columns right of an anchor pixel (index 0) lies at
 #
 #     p = p0 + s n A,   A = a - (a_z / d0_z) d0      (horizontal parts)
 #
@@ -36,10 +28,6 @@ from augment.render.cpu.jit import inner, kernel
 #     (s / d_z) d0_z A   and   (s / d_z) (b d0_z - b_z d0 + n (b a_z - b_z a))
 #
 # So float64 is needed once per wave and chunk of a row; float32 counts turns from the anchor.
-
-# pyright: reportCallIssue=false
-# (of numba's intrinsics it sees the compiler's first argument as well)
-
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
 KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
@@ -311,11 +299,15 @@ def fill_field(
                 slope_variance[i, begin + j] = out[2 * CHUNK + j]
 
 
-# ---- screen space kernels ------------------------------------------------------------------------
-
-# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
-# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
-
+# ---- Mirrored rays, eight at a time, through a pyramid of the nearest depth ----------------------
+# The letters are those of `screen_space`, which defines the result. The pyramid holds inverse
+# depths, which are linear along a ray's image: a cell of level l is the largest of 4^l x 4^l
+# pixels, 0 where nothing stands. A ray whose inverse depth stays above a cell's all the way across
+# is in front of everything there and passes the cell at once.
+#
+# The levels lie in one array: level 0, padded to whole cells of the highest level, [R, C]; to the
+# right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical in the camera (3),
+# its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width, height.
 
 COVERED = np.float32(1 - 1 / 512)  # an alpha through which the water does not show
 THICKNESS_M = np.float32(0.25)  # how thick anything is taken to be, at least,
@@ -512,21 +504,6 @@ def _step(pyramid, ray, state):
 
 
 @inner()
-def _march(pyramid, view, lanes, xs, ys, first, ways, trusts):
-    """(way / |x|, weight) of eight mirrored rays of pixels of the image that see the water.
-
-    xs, ys: pixel centres, read from `first` on; the results go to the same places. lanes: scratch.
-    """
-    ray, state, to_sky, scale = _set_up(view, xs, ys, first)
-    for _ in range(MAX_STEPS):
-        # The sign is clear where a ray goes on; one that has ended just here does no harm.
-        if not v8.any_not_negative(state[1] - state[0]):
-            break
-        state = _step(pyramid, ray, state)
-    _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts)
-
-
-@inner()
 def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts):
     """Results of eight rays that have ended."""
     x0, y0, dx, dy, _, _, _, _, near, change, end = ray
@@ -591,11 +568,20 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
 
 @inner()
 def _run(pyramid, view, lanes, xs, ys, count, ways, trusts):
-    """`_march` of the first `count` pixels of a list, which has room for eight more."""
+    """(way / |x|, weight) of the mirrored rays of a list's first `count` pixels; it has room for
+    eight more. xs, ys: pixel centres that see the water. lanes: scratch.
+    """
     for first in range(0, count, 8):
         for spare in range(count, first + 8):
             xs[spare], ys[spare] = xs[count - 1], ys[count - 1]
-        _march(pyramid, view, lanes, xs, ys, np.uint64(first), ways, trusts)
+        at = np.uint64(first)
+        ray, state, to_sky, scale = _set_up(view, xs, ys, at)
+        for _ in range(MAX_STEPS):
+            # The sign is clear where a ray goes on; one that has ended just here does no harm.
+            if not v8.any_not_negative(state[1] - state[0]):
+                break
+            state = _step(pyramid, ray, state)
+        _finish(pyramid, view, lanes, ray, state, to_sky, scale, at, ways, trusts)
 
 
 @inner()

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -27,6 +27,7 @@ from augment.effects.flood.water_kernels import (
     SOLID_ALPHA,
     STEEPEST,
 )
+from augment.effects.flood.water_plane import window_offset
 from augment.effects.flood.waves import WaveField
 from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.composite import sky_behind
@@ -88,16 +89,14 @@ def mip_chain(image: Float[Tensor, "H W C"]) -> list[Tensor]:
     levels = [image]
     while len(levels) < MIP_LEVELS and max(levels[-1].shape[:2]) > 1:
         last = levels[-1]
-        rows = _pairs(last.shape[0])
-        columns = _pairs(last.shape[1])
-        wide = (last[rows[0]] + last[rows[1]]) / 2
-        levels.append((wide[:, columns[0]] + wide[:, columns[1]]) / 2)
+        rows, columns = (torch.arange(0, size, 2) for size in last.shape[:2])
+        below, right = (
+            (rows + 1).clamp(max=len(last) - 1),
+            (columns + 1).clamp(max=last.shape[1] - 1),
+        )
+        wide = (last[rows] + last[below]) / 2
+        levels.append((wide[:, columns] + wide[:, right]) / 2)
     return levels
-
-
-def _pairs(size: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    first = torch.arange(0, size, 2)
-    return first, (first + 1).clamp(max=size - 1)
 
 
 def blurred(
@@ -122,9 +121,8 @@ SMOOTH_PX = 2.0  # reflections that a pixel's slopes spread over less are as goo
 class Surface:
     """What the pixels of a camera see of a plane `height_m` below the eye.
 
-    meets: the ray goes down; where it does not, the rest is made up but finite.
-    directions: rays with unit z in the camera. points: where they meet the plane. distance: from
-    the eye to there, metres. to_eye: unit.
+    meets: the ray goes down; where it does not, the rest is made up but finite. directions: rays
+    with unit z in the camera. points: where they meet the plane. distance: from there to the eye.
     """
 
     height_m: float
@@ -175,8 +173,8 @@ def tilted_normals(
     """(weight [H, W], unit normal [H, W, 3]) of slopes that stand for all slopes in a pixel.
 
     Gauss-Hermite quadrature over the slope along the view's horizontal direction, whose variance is
-    V: the pixel's own normal has weight 2/3, slopes sqrt(3 V) to either side have 1/6 each. The
-    first is the pixel's own, and the only one that counts where the pixel is smooth.
+    V: the pixel's own normal, the first, has weight 2/3, slopes sqrt(3 V) to either side 1/6 each.
+    In smooth pixels the first alone counts.
     """
     dtype = surface.points.dtype
     nx, ny = field.normal_x.to(dtype), field.normal_y.to(dtype)
@@ -230,25 +228,6 @@ def _at_least_upward(ray: Tensor) -> Tensor:
 # ---- The bed as seen through the surface ---------------------------------------------------------
 
 
-def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
-    """(left, top) of a window of the image that another window lies in, pixels.
-
-    Raises:
-        ValueError: they are not windows of one image.
-    """
-    left, top = outer.cx - inner.cx, outer.cy - inner.cy
-    focal = max(abs(outer.fx / inner.fx - 1), abs(outer.fy / inner.fy - 1))
-    apart = float((outer.camera_from_world - inner.camera_from_world).abs().max())
-    off_grid = max(abs(left - round(left)), abs(top - round(top)))
-    if focal > 1e-9 or apart > 1e-6 or off_grid > 1e-3:
-        raise ValueError(
-            f"the bed must be seen through a window of the image of camera {inner.name!r}; the "
-            f"focal lengths differ by a factor of {1 + focal:.6g}, poses by {apart:.3g}, "
-            f"offsets are ({left:.6g}, {top:.6g}) pixels"
-        )
-    return round(left), round(top)
-
-
 def through_the_surface(
     surface: Surface,
     normal: Float[Tensor, "H W 3"],
@@ -259,9 +238,9 @@ def through_the_surface(
 ) -> Float[Tensor, "H W 3"]:
     """Colour of the light that comes up through the surface: T = a bed + (1 - a) water.
 
-    The search for the bed's depth along the ray starts from the bed straight behind the pixel.
-    Where it leaves the bed's image or meets a hole, that bed is taken, and the water's own colour
-    where there is none either, or it lies too deep to be seen.
+    The search along the refracted ray starts from the bed straight behind the pixel, which is taken
+    where it leaves the bed's image or meets a hole; the water's own colour where there is no bed
+    behind the pixel, or too deep to be seen.
     """
     water = water_color(surface, camera, medium, smog)
     own_column, own_row = _own_pixel(bed.camera, camera, normal.dtype)
@@ -350,13 +329,6 @@ def smog_before(
 Colours = list[Tensor]  # one [H, W, 3], or 4 with alpha, for each of a pixel's normals
 
 
-def mirrored_eye_is(mirror: Camera, level_z_m: float, eye: Float[Tensor, "3"]) -> bool:
-    """Whether a camera stands where the plane mirrors the eye."""
-    expected = torch.tensor([eye[0], eye[1], 2 * level_z_m - eye[2]], dtype=torch.float64)
-    allowed = 1e-6 * (1 + float(expected.abs().max()))
-    return float((mirror.centre - expected).abs().max()) <= allowed
-
-
 def reflect_sky(
     surface: Surface,
     rays: list[Tensor],
@@ -384,8 +356,7 @@ def reflect_mirror(
     """The mirrored layer's colours and alphas.
 
     A ray's length is first that of the flat mirror's ray, then what the layer shows where the
-    tilted ray of that length ends. In rough pixels all rays take the length of the first: what they
-    show is blurred over more than they would differ.
+    tilted ray of that length ends. All of a pixel's rays take the length of the first.
     """
     to_mirror = torch.tensor([0.0, 0.0, -2 * surface.height_m], dtype=surface.points.dtype)
     flat = surface.directions * torch.tensor([1.0, 1.0, -1.0], dtype=surface.points.dtype)
@@ -413,10 +384,7 @@ def reflect_screen(
     smooth: Bool[Tensor, "H W"],
     rest: Tensor,
 ) -> Float[Tensor, "H W 4"]:
-    """What the image itself shows where the ray of smooth pixels ends, as far as it does.
-
-    The rest elsewhere, and in rough pixels: they are blurred too much for the image to add to it.
-    """
+    """What the image itself shows where the rays of smooth pixels end; `rest` elsewhere."""
     camera = screen.layer.camera
     column, row, matches = _end_in_image(surface, ray, screen)
     matches = matches & is_inside(camera, column, row) & smooth
@@ -461,10 +429,8 @@ def _end_in_image(
 def _fetch(
     layer: Layer, places: list[tuple[Tensor, Tensor]], smooth: Bool[Tensor, "H W"]
 ) -> Colours:
-    """Colour and alpha at every normal's coordinates.
-
-    Where a pixel has several normals, each sees an average as wide as they lie apart: single
-    points would show as so many ghosts.
+    """Colour and alpha at every normal's coordinates; of several, each sees an average as wide as
+    they lie apart: single points would show as so many ghosts.
     """
     image = stacked(layer)
     (column, row), *sides = places

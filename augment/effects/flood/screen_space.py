@@ -1,7 +1,7 @@
 """Reflections in flat water found in the camera's own image: a march through its depth.
 
-The torch definition, and the entry to the kernels that do it in less time (see
-`screen_space_kernels`: Lee et al. 2018, "Mipmap-accelerated screen space reflections").
+The torch definition and the launch of the kernels (Lee et al. 2018, "Mipmap-accelerated screen
+space reflections").
 
 A mirrored ray starts at the point x = s d where the pixel's ray d (unit z in the camera, eye at 0)
 meets the water and runs along d - 2 d_z n, n being the vertical. Let a = -2 d_z, and n's image in
@@ -28,6 +28,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood import kernels
 from augment.effects.flood.flood import Layer
+from augment.effects.flood.water_plane import window_offset
 from augment.render.buffers import CPU, CUDA, kernels_for
 from augment.render.threads import kernel_threads
 
@@ -39,7 +40,6 @@ HIDDEN_PX, NEAR_M = float(kernels.HIDDEN_PX), float(kernels.NEAR_M)
 AGREEING, EDGE = float(kernels.AGREEING), float(kernels.EDGE)
 
 STEP_PX = 0.25  # of the definition's march
-STRIDES = (1, 2, 4)
 RAYS = 1 << 18  # rays the definition marches at a time
 ROWS = 4  # rows of rays a thread takes at a time
 
@@ -48,9 +48,9 @@ ROWS = 4  # rows of rays a thread takes at a time
 class ScreenReflection:
     """How far the mirrored rays of a window's pixels run until they meet what the image shows.
 
-    layer: what was marched through, with the whole image's camera. distance [h, w]: metres along
-    the mirrored ray from the flat surface; infinite where it ends in the sky or nothing is known.
-    weight [h, w]: how far that can be trusted, 0 to 1.
+    layer: what was marched through, with the whole image's camera. distance: metres along the
+    mirrored ray from the flat surface; infinite where it ends in the sky or nothing is known.
+    weight: how far that can be trusted, 0 to 1.
     """
 
     layer: Layer
@@ -69,33 +69,26 @@ def trace_screen(
 ) -> ScreenReflection:
     """What the mirrored rays of the flat surface z = level_z_m meet, for the pixels of `camera`.
 
-    front: what stands above the water, over the whole image. camera: a window of that image (same
-    eye, same pixels), which may reach beyond it. needed: the pixels to trace, best the smooth ones;
-    None for all. Weight 0 have the others, those that the front covers or whose own ray does not
-    meet the water, and rays that leave the image, come back to the camera's plane, or are lost
-    behind something thin. The weight falls to 0 over the outer 4 % of the image.
+    front: what stands above the water, over the whole image. camera: a window of that image, which
+    may reach beyond it. needed: the pixels to trace; None for all. The weight is 0 of the others,
+    of those that the front covers or whose own ray does not meet the water, and of rays that leave
+    the image, come back to the camera's plane, or are lost behind something thin. It falls to 0
+    over the outer 4 % of the image.
 
-    backend: kernels equal this definition but for rays that pass a silhouette's pixel by its
-    corner. The CPU's trace every `stride`-th pixel of rows and columns, interpolate where four
-    agree and trace what is left.
+    backend: kernels equal this definition but for rays that graze a silhouette's pixel. The CPU's
+    trace every `stride`-th pixel of rows and columns, interpolate where four agree and trace the
+    rest; it is 1, 2 or 4.
 
     Raises:
-        ValueError: another stride, or a camera that is no window of the front's.
+        ValueError: the camera is no window of the front's.
     """
-    if stride not in STRIDES:
-        raise ValueError(f"stride must be one of {STRIDES}; got {stride}")
-    left, top = _window_origin(front.camera, camera)
+    left, top = window_offset(front.camera, camera)
     size, device = (camera.height, camera.width), front.alpha.device
     if float(camera.centre[2]) <= level_z_m:
         distance = torch.full(size, math.inf, device=device)
         return ScreenReflection(front, distance, torch.zeros_like(distance))
     if needed is None:
         needed = torch.ones(size, dtype=torch.bool, device=device)
-    elif tuple(needed.shape) != size:
-        raise ValueError(
-            f"needed must be [{camera.height}, {camera.width}] as camera {camera.name!r} is; "
-            f"got {list(needed.shape)}"
-        )
     backend = kernels_for(backend, front.alpha.detach())
     vertical = _vertical(front.camera, level_z_m)
     if backend == CUDA:
@@ -103,25 +96,10 @@ def trace_screen(
 
         found = cuda.trace(front, camera, left, top, needed, vertical)
     elif backend == CPU:
-        found = _run_kernels(front, camera, vertical, left, top, stride, needed)
+        found = _run_kernels(front, camera, vertical, (left, top), stride, needed)
     else:
         found = _trace(front, camera, level_z_m, left, top, needed)
     return ScreenReflection(front, *found)
-
-
-def _window_origin(whole: Camera, window: Camera) -> tuple[int, int]:
-    """Column and row of the image at which the window starts."""
-    left, top = whole.cx - window.cx, whole.cy - window.cy
-    same_pose = torch.equal(whole.camera_from_world, window.camera_from_world)
-    same_focal = (whole.fx, whole.fy) == (window.fx, window.fy)
-    on_grid = abs(left - round(left)) < 1e-6 and abs(top - round(top)) < 1e-6  # float64 rounding
-    if not (same_pose and same_focal and on_grid):
-        raise ValueError(
-            f"camera {window.name!r} must be a window of the front's ({whole.name!r}): same pose, "
-            f"focal lengths {(whole.fx, whole.fy)} and whole pixels of offset; got same pose: "
-            f"{same_pose}, {(window.fx, window.fy)}, offset {(left, top)}"
-        )
-    return round(left), round(top)
 
 
 def _vertical(camera: Camera, level_z_m: float) -> tuple[list[float], list[float], float]:
@@ -135,8 +113,7 @@ def _run_kernels(
     front: Layer,
     camera: Camera,
     vertical: tuple[list[float], list[float], float],
-    left: int,
-    top: int,
+    origin: tuple[int, int],
     stride: int,
     needed: Bool[Tensor, "h w"],
 ) -> tuple[Tensor, Tensor]:
@@ -154,20 +131,18 @@ def _run_kernels(
     distance, weight = np.empty((2, camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
         kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), pyramid)
-        kernels.trace(pyramid, view, alpha, asked, left, top, stride, ways, trust)
-        kernels.spread(
-            pyramid, view, alpha, asked, left, top, stride, ways, trust, distance, weight
-        )
+        traced = pyramid, view, alpha, asked, *origin, stride, ways, trust
+        kernels.trace(*traced)
+        kernels.spread(*traced, distance, weight)
     return torch.from_numpy(distance), torch.from_numpy(weight)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Mirrored rays in pixels, float64 [N] each; the letters are the module's.
+    """Mirrored rays in pixels; the letters are the module's.
 
     x, y: where they start. step_x, step_y: G / g. near: 1 / s. bend: c. scale: a g. end: the t at
-    which the march is over. to_sky: it is over because the ray is infinitely far away.
-    metres: |x|.
+    which the march is over; to_sky: infinitely far away. metres: |x|.
     """
 
     x: Float[Tensor, "N"]
@@ -282,8 +257,7 @@ def _back_side(surface: Tensor) -> Tensor:
 def _refine(rays: _Rays, solid: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Where the ray meets the plane through the pixel (x, y) it was found in, at most 1 px off it.
 
-    The plane's inverse depth is linear in the image: differences towards those neighbours whose
-    depth agrees.
+    The plane's inverse depth is linear in the image, by differences to neighbours that agree.
     """
     column, row = x.long(), y.long()
     here = solid[row, column]

@@ -22,23 +22,20 @@ from augment.effects.flood import water_kernels as kernels
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.refraction import (
     MIP_LEVELS,
-    Surface,
     before_sky,
     is_smooth,
     meet_plane,
     mirrored,
-    mirrored_eye_is,
     reflect_mirror,
     reflect_screen,
     reflect_sky,
     smooth_variance,
     through_the_surface,
     tilted_normals,
-    window_offset,
 )
 from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.water_kernels import HIDDEN_COVER, MIN_COSINE
-from augment.effects.flood.water_plane import image_coordinates
+from augment.effects.flood.water_plane import image_coordinates, window_offset
 from augment.effects.flood.waves import WaveField
 from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.buffers import CPU, REFERENCE, kernels_for
@@ -47,6 +44,7 @@ from augment.render.threads import kernel_threads
 from augment.sky import (
     ConstantSky,
     CubemapSky,
+    LatLongSky,
     Sky,
     bordered_faces,
     directions_of_cubemap,
@@ -123,18 +121,19 @@ def flat_faces(sky: Sky, smog: SmogMedium | None) -> tuple[Tensor, int, SmogMedi
     seen, layered = sky_behind(sky, smog)
     if isinstance(seen, ConstantSky):
         return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
-    image = seen.faces if isinstance(seen, CubemapSky) else getattr(seen, "image", None)
-    known = None if image is None else _known_faces.get(seen)
+    if not isinstance(seen, CubemapSky | LatLongSky):
+        return _padded(_sampled(seen)), SKY_SIZE + 2, layered
+    is_cube = isinstance(seen, CubemapSky)
+    image = seen.faces if is_cube else seen.image
+    known = _known_faces.get(seen)
     if known is None or known[0] != image._version:
-        if isinstance(seen, CubemapSky):
-            faces = bordered_faces(seen)
-        else:
-            faces = with_border(seen.sample(directions_of_cubemap(SKY_SIZE)))
-        known = (0 if image is None else image._version), _padded(faces)
-        if image is not None:
-            _known_faces[seen] = known
-    size = seen.faces.shape[1] if isinstance(seen, CubemapSky) else SKY_SIZE
-    return known[1], size + 2, layered
+        faces = bordered_faces(seen) if is_cube else _sampled(seen)
+        known = _known_faces[seen] = (image._version, _padded(faces))
+    return known[1], (len(image[0]) if is_cube else SKY_SIZE) + 2, layered
+
+
+def _sampled(sky: Sky) -> Tensor:
+    return with_border(sky.sample(directions_of_cubemap(SKY_SIZE)))
 
 
 def _padded(faces: Tensor) -> Tensor:
@@ -226,12 +225,11 @@ def shade_water(
     water's own colour. backend: kernels equal the definition within float rounding.
 
     Raises:
-        ValueError: the eye is not above the water, or cameras, images and fields do not fit.
+        ValueError: the bed's camera and this one are not windows of one image.
     """
     if smog is not None and smog.sigma_per_m == 0:
         smog = None
     water = Water(camera, cover, medium, field, bed, mirror, screen, sky, smog)
-    _check(water)
     layers = (bed, mirror, None if screen is None else screen.layer)
     images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]
     backend = kernels_for(backend, cover, *(part for parts in images for part in parts))
@@ -255,45 +253,10 @@ def shade_water(
         if screen is not None:
             seen = [reflect_screen(surface, rays[0], screen, smooth, seen[0]), *seen[1:]]
         for (weight, normal), color, behind in zip(taps, seen, above, strict=True):
-            share = weight * reflected_share(surface, normal, medium)
+            # Facets that look away from the eye count as seen edge-on.
+            cosine = (normal * surface.to_eye).sum(-1).clamp(MIN_COSINE, 1)
+            share = weight * reflectance(cosine, medium.refraction_index, medium.fresnel)
             out = out + share[..., None] * (before_sky(color, behind) - below)
     plain = torch.tensor(medium.rgb if smog is None else smog.rgb, dtype=out.dtype)
     out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain)
     return torch.where(surface.meets[..., None], out, 0)
-
-
-def reflected_share(
-    surface: Surface, normal: Float[Tensor, "h w 3"], medium: FloodMedium
-) -> Float[Tensor, "h w"]:
-    """F at a normal; facets that look away from the eye count as seen edge-on."""
-    cosine = (normal * surface.to_eye).sum(-1).clamp(MIN_COSINE, 1)
-    return reflectance(cosine, medium.refraction_index, medium.fresnel)
-
-
-def _check(water: Water) -> None:
-    camera, level_z_m, mirror = water.camera, water.medium.level_z_m, water.mirror
-    eye_z = float(camera.centre[2])
-    if not eye_z > level_z_m:
-        raise ValueError(
-            f"camera {camera.name!r} must be above the water at z = {level_z_m} m; "
-            f"its eye is at z = {eye_z} m"
-        )
-    window_offset(water.bed.camera, camera)
-    parts = [("cover", water.cover, camera), ("field", water.field.normal_x, camera)]
-    layers = {"bed": water.bed, "mirror": mirror}
-    if water.screen is not None:
-        parts.append(("screen.distance", water.screen.distance, camera))
-        layers["screen.layer"] = water.screen.layer
-    parts += [(name, part.alpha, part.camera) for name, part in layers.items() if part is not None]
-    for name, part, own in parts:
-        if tuple(part.shape) != (own.height, own.width):
-            raise ValueError(
-                f"{name} must be [{own.height}, {own.width}] as its camera {own.name!r} is; "
-                f"got {list(part.shape)}"
-            )
-    if mirror is not None and not mirrored_eye_is(mirror.camera, level_z_m, camera.centre):
-        expected = [*camera.centre.tolist()[:2], 2 * level_z_m - eye_z]
-        raise ValueError(
-            f"the mirror's camera must stand at the mirrored eye {expected}; "
-            f"it stands at {mirror.camera.centre.tolist()}"
-        )

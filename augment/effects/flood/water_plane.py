@@ -16,11 +16,10 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.geometry import any_in_squares, rigid
 
-# ---- Which pixels of an image's rows see the water's plane, by float64 once a row ----------------
-# Whether a ray falls is the sign of a sum that float64 has to decide, and near the horizon the
-# small fall is what distances are divided by. Along a row the fall is linear in the column: the
-# rays that fall are an interval. Kernels that know it and the fall at its end nearest to the
-# horizon need no float64: from there the fall only grows.
+# ---- Which pixels of an image's rows see the water's plane ---------------------------------------
+# Float64 has to decide whether a ray falls, and near the horizon distances are divided by the small
+# fall. Along a row the fall is linear in the column: the rays that fall are an interval. Kernels
+# that know it and the fall at its end nearest to the horizon need no float64.
 
 BEGIN, END, ANCHOR, FALL = range(4)  # of a row's numbers
 ROW = 4
@@ -29,10 +28,9 @@ Holds = Callable[[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]], Bool[np.nda
 
 
 def falling_rows(camera: Camera) -> Int32[np.ndarray, "H 4"]:
-    """Of each row: the first and one past the last column whose rays fall, a column of these, and
-    the bits of float32 world z of its ray, the one nearest to zero.
-
-    The signs are those of `Camera.ray_directions` in float64.
+    """Of each row: the first and one past the last column whose rays fall (by the float64 of
+    `Camera.ray_directions`), a column of these, and the bits of float32 world z of its ray, the one
+    nearest to zero.
     """
     u, v = image_coordinates(camera)
     rise = camera.world_from_camera[2, :3].numpy()
@@ -76,7 +74,7 @@ def column_intervals(
     return begin, end
 
 
-# ---- Windows of an image, and the plane in them --------------------------------------------------
+# ---- Windows of an image -------------------------------------------------------------------------
 
 GRAIN = 16  # pixels a side of the squares that masks are grown in
 
@@ -91,36 +89,24 @@ class Margins:
     bottom: int
 
     def around(self, mask: Bool[Tensor, "h w"], reach: Margins) -> Bool[Tensor, "H W"]:
-        """A window's mask as one of the grown window, grown by the reach: in whole squares, so that
-        nothing is missed.
-        """
+        """A window's mask as one of the grown window, grown by the reach in whole squares."""
+        left, up, right, down = (-(-side // GRAIN) for side in dataclasses.astuple(reach))
         if mask.device.type != "cpu":
-            return self._around_by_torch(mask, reach)
+            pad, pool = torch.nn.functional.pad, torch.nn.functional.max_pool2d
+            inside = pad(mask.float()[None, None], (self.left, self.right, self.top, self.bottom))
+            coarse = pad(pool(inside, GRAIN, ceil_mode=True), (right, left, down, up))
+            grown = pool(coarse, (up + down + 1, left + right + 1), 1)
+            fine = grown[0, 0].repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
+            return (fine[: inside.shape[2], : inside.shape[3]] > 0).contiguous()
         height, width = mask.shape
         inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
         inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
         coarse = any_in_squares(inside, GRAIN)
-        left, up, right, down = reach.in_squares()
         square = np.ones((up + down + 1, left + right + 1), np.uint8)
         # OpenCV grows towards what lies before the anchor in the kernel's own direction.
         grown = cv2.dilate(coarse.astype(np.uint8), square, anchor=(right, down))
         fine = grown.repeat(GRAIN, 0).repeat(GRAIN, 1)[: inside.shape[0], : inside.shape[1]]
         return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
-
-    def in_squares(self) -> tuple[int, int, int, int]:
-        """Left, top, right and bottom in whole squares."""
-        left, top, right, bottom = (-(-side // GRAIN) for side in dataclasses.astuple(self))
-        return left, top, right, bottom
-
-    def _around_by_torch(self, mask: Tensor, reach: Margins) -> Tensor:
-        """`around` of a mask on a GPU: the same squares."""
-        pad, pool = torch.nn.functional.pad, torch.nn.functional.max_pool2d
-        inside = pad(mask.float()[None, None], (self.left, self.right, self.top, self.bottom))
-        coarse = pool(inside, GRAIN, ceil_mode=True)
-        left, up, right, down = reach.in_squares()
-        grown = pool(pad(coarse, (right, left, down, up)), (up + down + 1, left + right + 1), 1)
-        fine = grown[0, 0].repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
-        return (fine[: inside.shape[2], : inside.shape[3]] > 0).contiguous()
 
 
 @dataclass(frozen=True)
@@ -164,11 +150,29 @@ class Window:
         return image[self.top : self.bottom, self.left : self.right]
 
 
+def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
+    """(left, top) of the window `inner` of an image in the window `outer`, pixels.
+
+    Raises:
+        ValueError: they are not windows of one image.
+    """
+    left, top = outer.cx - inner.cx, outer.cy - inner.cy
+    focal = max(abs(outer.fx / inner.fx - 1), abs(outer.fy / inner.fy - 1))
+    apart = float((outer.camera_from_world - inner.camera_from_world).abs().max())
+    off_grid = max(abs(left - round(left)), abs(top - round(top)))
+    if focal > 1e-9 or apart > 1e-6 or off_grid > 1e-3:
+        raise ValueError(
+            f"cameras {outer.name!r} and {inner.name!r} must be windows of one image; focal "
+            f"lengths differ by a factor of {1 + focal:.6g}, poses by {apart:.3g}, offsets are "
+            f"({left:.6g}, {top:.6g}) pixels"
+        )
+    return round(left), round(top)
+
+
 def plane_window(camera: Camera, level_z_m: float) -> Window | None:
     """The least window with all pixels whose rays meet the plane; None where no ray does.
 
-    A ray meets the plane where it falls, from an eye above it, or rises, from an eye below it. From
-    an eye in the plane rays are taken to meet it where they rise.
+    A ray meets the plane where it falls, from an eye above it, or rises, from one in or below it.
     """
     side = -1.0 if float(camera.centre[2]) > level_z_m else 1.0
     # World z along the camera's axes: of a ray it is linear in column and row.
@@ -219,9 +223,8 @@ def plane_depth(
 def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
     """The camera whose pictures are the reflections that `camera` sees in the plane.
 
-    It stands at the eye's mirror image. Mirroring turns left and right hands round, so the image
-    is turned upside down too, which makes it an ordinary camera again: its pixel (column, row) is
-    the reflection in the pixel (column, height - 1 - row).
+    Mirroring swaps left- and right-handed axes, so the image is turned upside down too: its pixel
+    (column, row) is the reflection in the pixel (column, height - 1 - row).
     """
     mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
     flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)

@@ -6,15 +6,15 @@ The parameter point x of the still plane goes, with phase theta = k D.x - omega 
 
 k = 2 pi / wavelength, omega^2 = g k tanh(k h) for water of depth h, A the amplitude and S = Q k A
 the steepness (Q as in Finch, GPU Gems 1, chapter 1). The surface folds over itself where sum S
-exceeds 1. The normal is the cross product of the tangents d/dx and d/dy of the whole sum. The usual
-closed form (-sum k A D cos(theta), 1 - sum S sin(theta)) is exact for one wave only, and right for
-many to first order.
+exceeds 1. The normal is the cross product of the tangents d/dx and d/dy of the whole sum; the usual
+closed form is exact for one wave only.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,54 +30,23 @@ from augment.rng import rng_for
 from recipes.weather import Wave, Waves
 
 GRAVITY_MPS2 = 9.80665
-UNIT_ERROR = 1e-6  # of a direction's length, which scales a wavelength no more than this
 CUSP = 1e-12  # area that is left of a unit of the plane where the surface counts as a point
-STEEPNESS_ROUNDING = 1e-9  # sums of decimal fractions that make 1 on paper
 
 
 @dataclass(frozen=True, eq=False)
 class WaveSet:
     """N Gerstner waves, float64; N may be 0: still water.
 
-    directions [N, 2]: unit, world x and y, where each runs to. amplitudes_m, wavelengths_m,
-    steepness (Q k A of each wave; their sum is <= 1), phases_rad [N]. depth_m: of the water, for
-    the dispersion; > 0, may be infinite.
+    directions [N, 2]: unit, world x and y, where each runs to. steepness: Q k A of each wave; their
+    sum is <= 1. depth_m: of the water, for the dispersion; > 0, may be infinite.
     """
 
-    directions: np.ndarray
-    amplitudes_m: np.ndarray
-    wavelengths_m: np.ndarray
-    steepness: np.ndarray
-    phases_rad: np.ndarray
+    directions: Float64[np.ndarray, "N 2"]
+    amplitudes_m: Float64[np.ndarray, "N"]
+    wavelengths_m: Float64[np.ndarray, "N"]
+    steepness: Float64[np.ndarray, "N"]
+    phases_rad: Float64[np.ndarray, "N"]
     depth_m: float
-
-    def __post_init__(self) -> None:
-        count = len(self.wavelengths_m)
-        for name in ("directions", "amplitudes_m", "wavelengths_m", "steepness", "phases_rad"):
-            values, shape = getattr(self, name), [count, 2] if name == "directions" else [count]
-            if values.dtype != np.float64 or list(values.shape) != shape:
-                raise ValueError(
-                    f"{name} must be float64 {shape} (N={count} from wavelengths_m); "
-                    f"got {values.dtype} {list(values.shape)}"
-                )
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} must be finite; got {values[~np.isfinite(values)][0]}")
-        if (self.wavelengths_m <= 0).any():
-            raise ValueError(f"wavelengths_m must be > 0; got {self.wavelengths_m.min()}")
-        for name in ("amplitudes_m", "steepness"):
-            if (getattr(self, name) < 0).any():
-                raise ValueError(f"{name} must be >= 0; got {getattr(self, name).min()}")
-        lengths = np.hypot(self.directions[:, 0], self.directions[:, 1])
-        if (np.abs(lengths - 1) > UNIT_ERROR).any():
-            worst = lengths[np.abs(lengths - 1).argmax()]
-            raise ValueError(f"directions must be of unit length; got one of length {worst}")
-        if self.steepness.sum() > 1 + STEEPNESS_ROUNDING:
-            raise ValueError(
-                "the waves' steepness must sum to at most 1, or the surface folds over itself; "
-                f"got {self.steepness.sum():.6g} from {count} waves: lower their steepness"
-            )
-        if not self.depth_m > 0:  # also catches NaN
-            raise ValueError(f"depth_m must be > 0; got {self.depth_m}")
 
     @property
     def is_flat(self) -> bool:
@@ -108,11 +77,10 @@ class WaveSet:
 
 @dataclass(frozen=True, eq=False)
 class WaveField:
-    """The surface at every pixel of a camera: what its waves are to the one that sees them.
+    """The surface at every pixel of a camera; 0 where the ray does not meet the plane.
 
     normal_x, normal_y: the unit normal's world x and y; its z is positive. slope_variance: of the
-    slopes too fine for the image, along the ray's horizontal direction. All 0 where the ray does
-    not meet the plane in front of the eye.
+    slopes too fine for the image, along the ray's horizontal direction.
     """
 
     normal_x: Float32[Tensor, "H W"]
@@ -126,14 +94,9 @@ def turns_at(waves: WaveSet, timestamp_ns: int) -> np.ndarray:
     The frequency's float64 times the time is reduced in whole numbers, rounded once: in float64
     alone a phase at 1.7e18 ns would be off by 1e-5 rad and would jump from frame to frame.
     """
-    passed = [_fraction_of_turns(float(f), timestamp_ns) for f in waves.frequencies_hz]
+    ratios = [float(f).as_integer_ratio() for f in waves.frequencies_hz]
+    passed = [(n * timestamp_ns % (d * 10**9)) / (d * 10**9) for n, d in ratios]
     return np.remainder(waves.phases_rad / (2 * math.pi), 1.0) - np.asarray(passed, np.float64)
-
-
-def _fraction_of_turns(frequency_hz: float, timestamp_ns: int) -> float:
-    numerator, denominator = frequency_hz.as_integer_ratio()
-    denominator *= 10**9
-    return (numerator * timestamp_ns % denominator) / denominator
 
 
 def phase_of(
@@ -170,19 +133,18 @@ def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, 
     return torch.where(length > CUSP, normals / length.clamp_min(CUSP), level)
 
 
-# ---- Waves drawn from what a recipe says of them -------------------------------------------------
-# A preset is a spectrum for a flooded street: a fetch of tens of metres, so short waves only,
-# within some angle of the wind, all of the same slope (the mean square slope per octave of a wind
-# sea is nearly constant: Phillips 1958). The open sea has an rms slope of 0.09 in a wind of 1 m/s,
-# 0.17 at 5 m/s (Cox and Munk 1954: mean square 0.003 + 0.00512 U); sheltered water lies below that.
+# ---- Waves drawn for a recipe --------------------------------------------------------------------
+# A preset is a spectrum for a flooded street: a fetch of tens of metres, so short waves only, all
+# of the same slope (the mean square slope per octave of a wind sea is nearly constant: Phillips
+# 1958). The open sea has an rms slope of 0.09 in a wind of 1 m/s, 0.17 at 5 m/s (Cox and Munk 1954:
+# mean square 0.003 + 0.00512 U); sheltered water lies below that.
 
 MAX_STEEPNESS = 0.8  # of all waves together, so that no crest of a preset comes near a cusp
 _WIDEST_RAD = math.radians(85)  # no wave runs against the wind that raised it
 
 
-@dataclass(frozen=True)
-class _Spectrum:
-    """Wavelengths, rms slope of all waves together, deviation of their directions."""
+class _Spectrum(NamedTuple):
+    """rms_slope: of all waves together. spread_deg: deviation of their directions."""
 
     shortest_m: float
     longest_m: float
@@ -198,13 +160,10 @@ _SPECTRA = {
 
 
 def make_waves(recipe: Waves, *, seed: int, depth_m: float) -> WaveSet:
-    """The recipe's waves, the same bits for the same recipe, seed and depth.
+    """The recipe's waves. The draw depends on no scene, frame or camera, so all views of all times
+    see one surface.
 
-    seed: taken where the recipe has none of its own. depth_m: of the water, metres, > 0. The draw
-    depends on no scene, frame or camera, so all views of all times see one surface.
-
-    Raises:
-        ValueError: the components' steepness sums to more than 1, or depth_m is not > 0.
+    seed: taken where the recipe has none of its own. depth_m: of the water, > 0.
     """
     if recipe.components is not None:
         return _from_components(recipe.components, depth_m)
@@ -246,7 +205,7 @@ def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m:
     )
 
 
-# ---- What a camera sees of waves: normals per pixel, and roughness where waves are too fine ------
+# ---- Normals per pixel, and roughness where waves are too fine -----------------------------------
 # The footprint of a pixel on the plane is J = d(plane point)/d(pixel), metres per pixel. A wave
 # advances by k |J^T D| radians per pixel; shorter than two pixels it would glitter. Its terms fade
 # out between four pixels and two by a smoothstep w, and the slope it loses becomes slope variance
@@ -265,18 +224,12 @@ def wave_field(
 ) -> WaveField:
     """The waves at every pixel of a camera, at its own time. level_z_m: the plane, scene world.
 
-    backend: with kernels by them, equal to the definition in float64 within 1e-5 of a normal's
-    components (for surfaces that keep clear of cusps). "cuda" leaves the field on the GPU.
-
-    Raises:
-        ValueError: level_z_m is not finite.
+    backend: kernels equal the definition within 1e-5 of a normal's components, clear of cusps.
+    "cuda" leaves the field on the GPU.
     """
-    if not math.isfinite(level_z_m):
-        raise ValueError(f"level_z_m must be finite; got {level_z_m}")
     height = float(camera.centre[2]) - level_z_m
     kernels = kernels_for(backend)
-    is_still = waves.is_flat or abs(height) < TOUCHING_M
-    if is_still:
+    if waves.is_flat or abs(height) < TOUCHING_M:
         device = gpu_device() if kernels == CUDA else None
         still = torch.zeros(camera.height, camera.width, device=device)
         return WaveField(still, still, still)
@@ -319,11 +272,11 @@ def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:
 def _footprint(camera: Camera, rays: Tensor, away: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     """Metres of world x and y, [H, W, 2] each, that the plane point moves per column and row."""
     rotation = camera.world_from_camera[:3, :3]
-    steps = []
-    for turn in (rotation[:, 0] / camera.fx, rotation[:, 1] / camera.fy):
-        slide = turn[:2] - (turn[2] / z)[..., None] * rays[..., :2]
-        steps.append(away[..., None] * slide)
-    return steps[0], steps[1]
+    across, down = (
+        away[..., None] * (turn[:2] - (turn[2] / z)[..., None] * rays[..., :2])
+        for turn in (rotation[:, 0] / camera.fx, rotation[:, 1] / camera.fy)
+    )
+    return across, down
 
 
 def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:

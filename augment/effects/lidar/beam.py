@@ -93,10 +93,8 @@ def intensity_column(sweep: LidarSweep) -> str | None:
 
 
 def white_level(intensity: np.ndarray) -> float:
-    """The intensity of a white, diffuse surface that is met head on.
-
-    Fractions up to 1 are taken for reflectances. Of other scales, 8 bits, 100 is taken for 100 %,
-    as Velodyne and Hesai document theirs; what is above comes from retroreflectors.
+    """The intensity of a white, diffuse surface that is met head on: 1 of fractions, else 100, as
+    Velodyne and Hesai document their 8 bits; what is above comes from retroreflectors.
     """
     values = np.asarray(intensity)
     if values.dtype.kind == "f":
@@ -120,8 +118,8 @@ def reflectances(sweep: LidarSweep) -> np.ndarray:
 def origins_of(scene: Scene, frame_index: int, sweep: LidarSweep) -> np.ndarray:
     """Where each return's beam started, float64 [N, 3], dataset world.
 
-    From the labels where they know. Else 1.8 m above the ego's origin at the frame's time, which is
-    wrong by the sensor's place on its car and by what the car drove within the sweep.
+    From the labels where they know. Else EGO_SENSOR_M at the frame's time, which is wrong by the
+    sensor's place on its car and by what the car drove within the sweep.
 
     Raises:
         ValueError: what the labels gave is not one origin a return.
@@ -318,11 +316,9 @@ def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
     return medium.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
 
 
-@dataclass(frozen=True, eq=False)
-class SoftEcho:
-    """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as
-    `signal`, near_gain included. strongest [K]: the greatest signal up to each range.
-    share [K]: of the whole echo, that comes from up to each range.
+class SoftEcho(NamedTuple):
+    """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as `signal`.
+    strongest [K]: the greatest up to each range. share [K]: of the whole echo, up to each range.
     """
 
     ranges_m: np.ndarray
@@ -421,13 +417,10 @@ BACKWARD = 0.019  # of the light that grains deflect (Petzold 1972, harbour)
 MOREL = 0.33  # diffuse reflectance of water over b_b / (a + b_b) (Morel and Prieur 1977)
 
 
-@dataclass(frozen=True, eq=False)
-class WaterEcho:
-    """What becomes of beams [M] that meet the water; the others are not in it.
-
-    rows [M]: their numbers. surface_m [M]: range of the surface, where the air ends. range_m [M]:
-    as the sensor reports it, light being slower in water. kept [M]: of the bed's echo. is_bed [M]:
-    the bed's echo is the stronger. reflectance [M]: of the water, where it is not.
+class WaterEcho(NamedTuple):
+    """The M beams that meet the water: their rows; range of the surface, where the air ends; range
+    as reported, light being slower in water; what is kept of the bed's echo; whether that is the
+    stronger; reflectance of the water.
     """
 
     rows: np.ndarray
@@ -458,9 +451,8 @@ def meet_water(
 ) -> WaterEcho:
     """The echoes of beams [N] that would reach a surface at ends_m, of a reflectance, under water.
 
-    origins, directions: [N, 3], scene world. Beams that start under water are not in it.
-    The bed is taken to be level about the return, so that its depth is the same where the bent beam
-    comes down: a wheel's side under water is reported too near by about the bend.
+    origins, directions: [N, 3], scene world. Beams that start under water are left out. The bed
+    counts as level about the return: a wheel's side is reported too near by about the bend.
     """
     drop = origins[:, 2] - medium.level_z_m
     fall = -directions[:, 2]
@@ -579,8 +571,7 @@ def meet_layers(
 ) -> np.ndarray:
     """Where beams [N] end, ends_m at most, float64 [N]. origins, directions: [N, 3], scene world.
 
-    An actor stands where it was when the sensor looked at it, by the times of the returns about it,
-    as far as the sweep has them; else where it is at the frame's time.
+    An actor stands where it was at the times of the returns about it, else at the frame's time.
     """
     hits = ends_m.copy()
     if snow.ground is not None:
