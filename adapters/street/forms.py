@@ -443,6 +443,11 @@ def _edge_bits(
 Vectors = Sequence[float] | np.ndarray  # [3] or [P, 3]
 
 
+def xyz(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float) -> np.ndarray:
+    """Vectors [N, 3] of coordinates [N] or one for all."""
+    return np.stack(np.broadcast_arrays(x, y, z), -1)
+
+
 def _rows(values: Vectors) -> np.ndarray:
     return np.atleast_2d(np.asarray(values, np.float64))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Material, Shapes, join
+from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Material, Shapes, join, xyz
 from adapters.street.light import SKY_RGB, SUN_RGB, Body
 from adapters.street.raycast import Tree
 from adapters.street.world import MovingBody
@@ -297,7 +297,7 @@ def _flat_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: n
     over = u + v - 1
     opened = (shapes.edges[shape] & OPEN_DIAGONAL) > 0
     inside = (shapes.kind[shape] != Kind.TRIANGLE) | (over < np.where(opened, -1e-9, 1e-9))
-    local = np.stack([u, v, np.zeros_like(u)], 1)[inside]
+    local = xyz(u, v, 0)[inside]
     sides = np.zeros((len(u), 2, 3))
     sides[:, 0, 0], sides[:, 1, 1] = du, dv
     return shape[inside], local, sides[inside]
@@ -312,13 +312,11 @@ def _disc_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: n
     whole = rings[owner] == 1
     radius = np.where(whole, 0.0, (ring[owner] + 0.5) / rings[owner])
     angle = 2 * np.pi * (number + 0.5 * (ring[owner] % 2)) / around[owner]
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    c, s = np.cos(angle), np.sin(angle)
     depth = np.where(whole, 1.1, 1 / rings[owner])
     width = np.where(whole, 1.1, 2 * np.pi * radius / around[owner])
-    sides = np.stack(
-        [np.stack([c * depth, s * depth, zero], 1), np.stack([-s * width, c * width, zero], 1)], 1
-    )
-    return index[ring_owner[owner]], np.stack([radius * c, radius * s, zero], 1), sides
+    sides = np.stack([xyz(c * depth, s * depth, 0), xyz(-s * width, c * width, 0)], 1)
+    return index[ring_owner[owner]], xyz(radius * c, radius * s, 0), sides
 
 
 def _tube_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
@@ -326,14 +324,12 @@ def _tube_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: n
     owner, number = _expand(counts[:, 0] * rows)
     i, j = number // rows[owner], number % rows[owner]
     angle = 2 * np.pi * (i + 0.5 * (j % 2)) / counts[owner, 0]
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    c, s = np.cos(angle), np.sin(angle)
     width = 2 * np.pi / counts[owner, 0]
     one = np.ones_like(j)
     middle, height = _line(j, counts[owner, 1], one, one)
-    sides = np.stack(
-        [np.stack([-s * width, c * width, zero], 1), np.stack([zero, zero, 2 * height], 1)], 1
-    )
-    return index[owner], np.stack([c, s, 2 * middle - 1], 1), sides
+    sides = np.stack([xyz(-s * width, c * width, 0), xyz(0, 0, 2 * height)], 1)
+    return index[owner], xyz(c, s, 2 * middle - 1), sides
 
 
 def _blob_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
@@ -343,12 +339,10 @@ def _blob_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: n
     z = 1 - (2 * number + 1) / total
     angle = number * 2.399963229728653
     flat = np.sqrt(1 - z * z)
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    c, s = np.cos(angle), np.sin(angle)
     size = np.sqrt(4 * np.pi / total)[:, None]
-    sides = np.stack(
-        [np.stack([-s, c, zero], 1) * size, np.stack([-z * c, -z * s, flat], 1) * size], 1
-    )
-    return index[owner], np.stack([flat * c, flat * s, z], 1), sides
+    sides = np.stack([xyz(-s, c, 0) * size, xyz(-z * c, -z * s, flat) * size], 1)
+    return index[owner], xyz(flat * c, flat * s, z), sides
 
 
 def _area(length: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ from adapters.street.forms import (
     quads,
     triangle,
     tube,
+    xyz,
 )
 from adapters.street.layout import (
     CAMBER,
@@ -88,10 +89,8 @@ def panels(
 ) -> Shapes:
     """Upright panels over (x, z) rectangles [R, 4] at y = depth_m, seen from the street."""
     x0, z0, x1, z1 = np.asarray(rectangles, np.float64).reshape(-1, 4).T
-    zero = np.zeros_like(x0)
-    corner = np.stack([x0, zero + depth_m, z0], 1)
-    u, v = np.stack([x1 - x0, zero, zero], 1), np.stack([zero, zero, z1 - z0], 1)
-    return parallelograms(corner, u, v, look, edges=edges)
+    u, v = xyz(x1 - x0, 0, 0), xyz(0, 0, z1 - z0)
+    return parallelograms(xyz(x0, depth_m, z0), u, v, look, edges=edges)
 
 
 def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
@@ -210,8 +209,8 @@ def _lettering(x0: float, x1: float, z: float, style: Style) -> Shapes:
     count = int(min(12, (x1 - x0 - 0.8) / pitch))
     starts = middle + (np.arange(count) - count / 2) * pitch
     tall = 0.18 + 0.10 * ((np.arange(count) * 5) % 3 == 0)
-    low = np.full(count, z + 0.17)
-    rectangles = np.stack([starts, low, starts + 0.2, z + 0.17 + tall], 1)
+    sides = np.broadcast_arrays(starts, z + 0.17, starts + 0.2, z + 0.17 + tall)
+    rectangles = np.stack(sides, 1)
     return panels(rectangles[(np.arange(count) % 5) != 3], -0.135, style.trim)
 
 
@@ -224,7 +223,7 @@ def _awning(x0: float, x1: float, z: float, style: Style) -> Shapes:
     for start, look in ((0, style.accent), (1, style.trim)):
         x = edges[start::2]
         u = ((x1 - x0) / count, 0.0, 0.0)
-        top = np.stack([x, np.full_like(x, -1.25), np.full_like(x, z - 0.55)], 1)
+        top = xyz(x, -1.25, z - 0.55)
         parts.append(parallelograms(top, u, slope, look))
         parts.append(parallelograms(top + hem, u, -hem, look))
     return join(parts)
@@ -490,14 +489,8 @@ def _sloped(
 ) -> Shapes:
     """Panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
     x0, y0, x1, y1 = rectangles.T
-    zero = np.zeros_like(x0)
-    return parallelograms(
-        np.stack([x0, y0, z0 + slope * y0], 1),
-        np.stack([x1 - x0, zero, zero], 1),
-        np.stack([zero, y1 - y0, slope * (y1 - y0)], 1),
-        look,
-        edges=edges,
-    )
+    u, v = xyz(x1 - x0, 0, 0), xyz(0, y1 - y0, slope * (y1 - y0))
+    return parallelograms(xyz(x0, y0, z0 + slope * y0), u, v, look, edges=edges)
 
 
 def _markings(layout: Layout) -> list[Rectangle]:
