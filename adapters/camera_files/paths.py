@@ -561,13 +561,8 @@ def _camera(name: str, view: PosedView, change: WorldChange, timestamp_ns: int) 
     camera_from_world = invert_pose(change.pose(view.world_from_camera))
     try:
         return Camera(
-            name=name,
-            width=view.width,
-            height=view.height,
-            fx=view.fx,
-            fy=view.fy,
-            cx=view.cx,
-            cy=view.cy,
+            name,
+            *(view.width, view.height, view.fx, view.fy, view.cx, view.cy),
             camera_from_world=torch.from_numpy(camera_from_world),
             timestamp_ns=timestamp_ns,
         )

@@ -238,29 +238,15 @@ def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
     if angle > 1e-6:  # below, sin loses its digits and the straight line is exact
         wa, wb = np.sin(wa * angle) / np.sin(angle), np.sin(wb * angle) / np.sin(angle)
     wb *= sign
-    w, x, y, z = (
-        wa * a[0] + wb * b[0],
-        wa * a[1] + wb * b[1],
-        wa * a[2] + wb * b[2],
-        wa * a[3] + wb * b[3],
-    )
+    w, x = wa * a[0] + wb * b[0], wa * a[1] + wb * b[1]
+    y, z = wa * a[2] + wb * b[2], wa * a[3] + wb * b[3]
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
-    out[0, 0], out[0, 1], out[0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    out[1, 0], out[1, 1], out[1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    out[2, 0], out[2, 1], out[2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
+    out[0, 0], out[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+    out[2, 2] = 1 - 2 * (x * x + y * y)
+    out[0, 1], out[0, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[1, 0], out[1, 2] = 2 * (x * y + w * z), 2 * (y * z - w * x)
+    out[2, 0], out[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
     for k in range(3):
         out[k, 3] = (1.0 - f) * centres[i, k] + f * centres[j, k]
 

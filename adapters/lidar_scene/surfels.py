@@ -186,14 +186,8 @@ def surfels_from_points(
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
         spacing = np.repeat(edge_m[:, None], 2, 1).astype(np.float32)
-        return Surfels(
-            points,
-            frame[:, 2],
-            frame[:, 0],
-            spacing,
-            np.ones(count, bool),
-            np.zeros((count, 0), int),
-        )
+        isolated, neighbours = np.ones(count, bool), np.zeros((count, 0), int)
+        return Surfels(points, frame[:, 2], frame[:, 0], spacing, isolated, neighbours)
     index, distance = find_neighbours(points, edge_m)
     axes = _principal_axes(points, index, semantic)
     if semantic is None:

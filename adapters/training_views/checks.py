@@ -358,8 +358,7 @@ class Checks:
             "camera_time_offset_ms": None if late is None else 1e3 * late,
             "calibration_offsets": {
                 o.camera: {
-                    name: getattr(o, name)
-                    for name in ("right_px", "down_px", "angle_deg", "is_sure")
+                    n: getattr(o, n) for n in ("right_px", "down_px", "angle_deg", "is_sure")
                 }
                 for o in self.offsets
             },

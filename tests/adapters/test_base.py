@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from splat_scenes import street
 
 from adapters.base import open_scene, recognise
-from adapters.uri import add_to_uri, format_uri, parse_uri
+from adapters.uri import format_uri, parse_uri
 from augment.errors import AdapterError
 from augment.files.ply import write_ply, write_splat
 
@@ -70,12 +70,6 @@ def test_format_uri_is_the_inverse(path: str, query: dict[str, str]) -> None:
     path = "absent/" + path
     normal = str(Path(path))
     assert parse_uri(format_uri("gaussians", path, query)) == ("gaussians", normal, query)
-
-
-def test_add_to_uri() -> None:
-    uri = add_to_uri("procedural:street?seed=3", "camera_path", "a b.json")
-    assert uri == "procedural:street?seed=3&camera_path=a%20b.json"
-    assert parse_uri(add_to_uri(uri, "seed", "4"))[2] == {"seed": "4", "camera_path": "a b.json"}
 
 
 def test_unknown_schemes_list_the_known() -> None:

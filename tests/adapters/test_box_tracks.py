@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar_scene.split import (
-    FLOOR_M,
-    HALO_M,
-    Motion,
-    indices_between,
-    join_tracks,
-    split_sweeps,
-)
+from adapters.lidar_scene.split import FLOOR_M, HALO_M, Motion, join_tracks, split_sweeps
 from adapters.raw_drive import BoxSample, Sweep
 from augment.geometry import rigid, rotmat_from_quat
 from augment.scene import Track
@@ -114,21 +107,6 @@ def test_points_go_into_the_actor_each_at_its_own_time():
     np.testing.assert_allclose(motion.into_actor(world, times), local, atol=1e-9)
 
 
-def test_the_span_holds_every_pose():
-    track = random_track()
-    first = int(track.timestamps_ns[1]) + 7
-    last = int(track.timestamps_ns[3]) - 9
-    low, high = Motion.of(track).span(first, last)
-    for time in np.linspace(first, last, 33).astype(np.int64):
-        centre = track.pose_at(int(time))[:3, 3].numpy()
-        assert (centre >= low).all() and (centre <= high).all()
-
-
-def test_indices_between_is_strict():
-    points = np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5], [0.5, 2, 0.5]], np.float32)
-    assert indices_between(points, np.zeros(3), np.ones(3)).tolist() == [2]
-
-
 def sweep_of(points, times_ms, classes) -> Sweep:
     return Sweep(
         np.array(points, np.float32), np.array(times_ms, np.int64) * MS, np.array(classes, np.int16)
@@ -174,9 +152,3 @@ def test_returns_after_the_track_belong_to_the_world():
     sweep = sweep_of([[0.5, 0, 0.7]], [300], [SemanticClass.VEHICLE])
     world, (actor,) = split_sweeps([sweep], [track])
     assert len(world) == 1 and len(actor) == 0
-
-
-def test_nothing_comes_of_nothing():
-    assert join_tracks([]) == ()
-    world, actors = split_sweeps([], join_tracks([sample("a", 0, 0.0)]))
-    assert len(world) == 0 and len(actors[0]) == 0

@@ -16,14 +16,11 @@ from adapters.camera_files.paths import (
     NO_CAMERAS,
     frames_from_views,
     ground_grid,
-    ground_under,
-    lowest_ground,
     make_default_path,
     solid_points,
 )
 from adapters.world import WorldChange
 from augment.files.ply import read_splats
-from augment.scene import Gaussians
 
 
 def along_and_across(positions: np.ndarray, heading_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -94,14 +91,6 @@ def test_drive_ends_with_scene_ahead() -> None:
     assert ahead.max() > 15
 
 
-def test_side_cameras_look_to_their_sides() -> None:
-    path = make_default_path(street(), is_metric=True)
-    front, left, right = (v.world_from_camera for v in path.views[:3])
-    turn = np.cross(front[:3, 2], left[:3, 2])[2], np.cross(front[:3, 2], right[:3, 2])[2]
-    assert turn == pytest.approx((math.sin(math.pi / 3), -math.sin(math.pi / 3)))
-    np.testing.assert_array_equal(front[:3, 3], left[:3, 3])
-
-
 def test_what_blocks_the_road_is_avoided() -> None:
     """A truck across two thirds of the road: the line passes on the free side or stops before."""
     rng = torch.Generator().manual_seed(1)
@@ -141,41 +130,6 @@ def test_degenerate_scenes_get_a_path(kind, count: int) -> None:
     """One Gaussian, or many in one place: no division by their extent."""
     made = make_default_path(gaussians_at(torch.ones(count, 3)), is_metric=True, kind=kind)
     assert frames_from_views(made.views, WorldChange())[0] and made.note.startswith(NO_CAMERAS)
-
-
-def test_frames_of_a_default_path() -> None:
-    frames, _ = frames_from_views(make_default_path(street(), is_metric=True).views, WorldChange())
-    assert [frame.index for frame in frames] == list(range(len(frames)))
-    assert list(frames[0].cameras) == ["front", "left", "right"]
-    np.testing.assert_allclose(
-        frames[0].world_from_ego[:3, 0], frames[0].cameras["front"].world_from_camera[:3, 2]
-    )
-
-
-def test_ground_under_a_path() -> None:
-    points = solid_points(street(heading_deg=0, slope=0.1))
-    positions = np.stack([np.arange(5.0, 55), np.zeros(50), 0.1 * np.arange(5.0, 55) + 1.6], 1)
-    heights, kept = ground_under(points, positions, radius=3.0)
-    assert len(kept) == 50
-    # The low tenth within 3 m on a slope of 0.1 lies up to 0.3 m below the centre.
-    np.testing.assert_allclose(heights, 0.1 * kept[:, 0], atol=0.35)
-    lowest = lowest_ground(points, positions, radius=3.0)
-    assert lowest == pytest.approx(0.5, abs=0.5)
-    assert lowest_ground(points, positions + np.array([0, 500, 0]), radius=3.0) is None
-
-
-def test_ground_grid_sees_under_cars() -> None:
-    """Cells that hold a parked car take the road from their neighbours; strays count for little."""
-    grid = ground_grid(solid_points(street(heading_deg=0)), cell=1.0)
-    places = np.stack([np.arange(3.0, 55), np.full(52, -3.0)], 1)
-    np.testing.assert_allclose(grid.at(places), 0, atol=0.3)
-    assert np.isnan(grid.at(np.array([[1000.0, 0]]))).all()
-
-
-def test_faint_scenes_still_have_points() -> None:
-    solid = street()
-    faint = Gaussians(**{**vars(solid), "opacities": torch.full((len(solid),), 0.1)})
-    assert len(solid_points(faint)) == len(solid)
 
 
 def test_real_tiles_are_driven(shared_dir: Path) -> None:

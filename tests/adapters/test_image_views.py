@@ -7,10 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import torch
 
-from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
+from adapters.lidar_scene.image_views import Body, View, observe_views
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import Surfels
@@ -165,15 +164,6 @@ def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
     assert not seen.seen[below].any() and seen.seen[above].all()
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.125])
-def test_images_are_decoded_at_a_fraction(tmp_path, scale):
-    cv2.imwrite(str(tmp_path / "a.jpg"), solid(RED)[..., ::-1])
-    image = read_image(tmp_path / "a.jpg", scale)
-    assert image.shape == (HEIGHT * scale, WIDTH * scale, 3)
-    np.testing.assert_allclose(image.mean((0, 1)), RED, atol=3)  # JPEG
-    assert read_image(tmp_path / "none.jpg", scale) is None
-
-
 def test_images_that_cannot_be_used_are_problems(tmp_path):
     small = view(tmp_path / "small.png", solid(RED)[::2, ::2], camera())
     (tmp_path / "bad.png").write_bytes(b"no image")
@@ -213,8 +203,3 @@ def test_above_a_wall_that_leaves_the_lidars_view_another_image_is_believed(tmp_
         observe_views([Body(tall)], views, sky, image_scale=1.0)
         got = sky.finish().sample(direction)[0]
         np.testing.assert_allclose(got, np.divide(colour, 255), atol=0.08)
-
-
-def test_a_sky_nobody_saw_has_a_colour():
-    faces = gatherer().finish().faces
-    assert torch.isfinite(faces).all() and (faces > 0.5).all() and (faces < 1).all()

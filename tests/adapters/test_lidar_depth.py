@@ -81,11 +81,6 @@ def test_the_nearest_of_a_pixel_wins():
     assert len(depth) == 1 and depth.depth_m[0] == 7 and depth.timestamp_ns[0] == 2 * SECOND
 
 
-def test_what_is_behind_or_outside_is_left_out():
-    points = [[-5, 0, 0], [0.05, 0, 0], [5, 5.01, 0], [5, 0, -4], [np.nan, 0, 0]]
-    assert len(lidar_depth(scene(points, [10] * 5), 0, camera())) == 0
-
-
 def test_a_moving_objects_returns_are_carried_to_the_cameras_time():
     # Its rear face, 2 m behind its centre, seen a tenth of a second early and late.
     actor = driving_actor(20.0)

@@ -16,7 +16,7 @@ from drivestudio_files import write_run
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
-from adapters.pandaset.files import SENSORS_M, PandaSetLabels, places_at, read_lidar
+from adapters.pandaset.files import SENSORS_M, PandaSetLabels, read_lidar
 from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
 from adapters.recording.adapter import RecordingLabels
 from adapters.street.layout import StreetParameters
@@ -54,10 +54,6 @@ def test_pandasets_sensors_ride_on_the_car(tmp_path: Path) -> None:
     expected = SENSORS_M[[0, 0, 0, 0, 1]] + along[:, None] * [1.0, 0.0, 0.0]
     np.testing.assert_allclose(found, expected, atol=1e-5)  # float64 seconds since 1970
     assert labels.lidar_origins(99, sweep) is None
-
-
-def test_places_of_a_single_pose() -> None:
-    assert (places_at(np.ones((1, 3)), np.zeros(1), np.arange(4.0)) == 1).all()
 
 
 @pytest.mark.skipif(not PANDASET.is_dir(), reason=f"{PANDASET} is not there")

@@ -15,7 +15,6 @@ from adapters.lidar_scene.surfels import (
     SplatShape,
     borrow_colours,
     bridge_gaps,
-    coarse_sample,
     edges_at,
     fill_ground,
     fill_walls,
@@ -63,28 +62,12 @@ def test_a_known_class_outvotes_any_number_of_unknown():
     assert thin.semantic.tolist() == [Class.SIGN]
 
 
-def test_thinning_does_not_depend_on_the_order_of_points():
-    rng = np.random.default_rng(0)
-    points = point_set(rng.normal(size=(4000, 3)) * 8)
-    shuffled = rng.permutation(4000)
-    a, ea = thin_points(points, ORIGIN, voxel_m=0.4)
-    b, eb = thin_points(point_set(points.points[shuffled]), ORIGIN, voxel_m=0.4)
-    np.testing.assert_allclose(a.points, b.points, atol=1e-5)  # sums in another order
-    np.testing.assert_array_equal(ea, eb)
-
-
 def test_voxels_grow_with_distance_from_the_path():
     far = np.array([[NEAR_M / 2, 0, 0], [2 * NEAR_M, 0, 0], [8 * NEAR_M, 0, 0]])
     edges = edges_at(far, ORIGIN, voxel_m=0.1)
     np.testing.assert_allclose(edges, 0.1 * np.array([1, 2, 8]) ** GROWTH, rtol=1e-6)
     path = np.array([[0.0, 0, 0], [8 * NEAR_M, 0, 0]])
     assert edges_at(far[2:], path, voxel_m=0.1) == pytest.approx(0.1)
-
-
-def test_the_coarse_sample_is_of_the_points_and_spread_out():
-    points = plane((0, 0, 1), half=2.0)
-    index = coarse_sample(points, np.full(len(points), 0.5, np.float32))
-    assert len(np.unique(index)) == len(index) and 49 <= len(index) <= 100
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (1, 2, 3)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
@@ -71,13 +70,6 @@ def test_two_sources_give_the_same_bits_whatever_the_memory(scene):
         a, b = big.load(key), small.load(key)
         for name in ("rgb", "weight", "sky", "depth_pixels", "depth_m", "depth_weight"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def test_facts_are_plain(scene):
-    facts = RecordedViews(scene, scale=0.5).facts
-    assert json.loads(json.dumps(facts)) == facts
-    assert facts["images"] == {"front": 4, "left": 4} and facts["depth_priors"] == ["lidar"]
-    assert facts["sizes_px"]["front"] == [32, 24]
 
 
 def test_frames_are_held_out_by_position(scene):

@@ -94,10 +94,6 @@ def test_labels_pass_through(scene):
     assert scene.lidar(7) is None and len(scene.boxes(7)) == 0
 
 
-def test_opening_twice_gives_the_same_bits(scene, folder):
-    assert_same_bits(scene, open_recording(str(folder), QUERY))
-
-
 def test_held_out_frames_leave_no_trace_in_the_gaussians(copy):
     query = QUERY | {"held_out": "1:2"}
     held = open_recording(str(copy), query)

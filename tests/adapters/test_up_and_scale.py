@@ -52,12 +52,6 @@ def test_up_is_found_in_any_pose_and_unit_among_strays(up: str) -> None:
     assert off_deg < 1e-5 if up != TILTED else off_deg < 1.0
 
 
-def test_the_same_file_gives_the_same_up() -> None:
-    first, again = (find_ground(posed(street(), TILTED)) for _ in range(2))
-    assert first is not None and again is not None
-    assert np.array_equal(first.up, again.up) and first.lead == again.lead
-
-
 def test_what_has_no_clear_ground_is_not_guessed_at() -> None:
     rng = torch.Generator().manual_seed(2)
     cloud = torch.randn(4000, 3, generator=rng)
