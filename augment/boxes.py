@@ -214,10 +214,9 @@ def _inside(
     return near[kept]
 
 
-# --------------------------------------------------------------------------------------------------
-# Labelled boxes as an image shows them: outlines of the projected boxes, and what hides them. A
-# box's own axes: x along its length, y its width, z its height. Pixels count from the image's upper
-# left corner: the first one's centre is at 0.5.
+# ---- Outlines of projected boxes, and what hides them --------------------------------------------
+# A box's own axes: x along its length, y its width, z its height. Pixels count from the image's
+# upper left corner: the first one's centre is at 0.5.
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,10 +270,9 @@ def outline_boxes(
     corners_m = centers_m[:, None] + (CORNERS * sizes_m[:, None]) @ rotations.transpose(0, 2, 1)
     size = np.array(image_size, np.float64)
     ends, seen = _edges_in_image(corners_m, K, size)  # [B, E, 2]
-    points = np.concatenate(
-        [ends, np.broadcast_to(_image_corners(size), (len(ends), 4, 2))], axis=1
-    )
-    shown = [seen, _hit(centers_m, sizes_m, rotations, _image_corners(size), K)]
+    image_corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
+    points = np.concatenate([ends, np.broadcast_to(image_corners, (len(ends), 4, 2))], axis=1)
+    shown = [seen, _hit(centers_m, sizes_m, rotations, image_corners, K)]
     shown = np.concatenate(shown, axis=1)[..., None]
     low = np.where(shown, points, np.inf).min(axis=1, initial=np.inf)
     high = np.where(shown, points, -np.inf).max(axis=1, initial=-np.inf)
@@ -378,10 +376,6 @@ def _hull_area(points: np.ndarray) -> float:
 def _project(points_m: np.ndarray, K: np.ndarray) -> np.ndarray:
     z = np.maximum(points_m[..., 2:], NEAR_M)  # nearer ones belong to edges that are not seen
     return points_m[..., :2] / z * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
-def _image_corners(size: np.ndarray) -> np.ndarray:
-    return np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
 
 
 def _hit(

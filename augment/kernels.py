@@ -5,8 +5,6 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-# ---- Numba kernel for splats whose colours change with time or stand still while they turn -------
-
 BLOCK = 2048  # splats a thread takes at a time
 
 

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numba import prange
 
+from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.backward_kernels import (
     G_ABS,
@@ -25,30 +26,11 @@ from augment.render.cpu.geometry import from_eye
 from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
-from augment.render.layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
+from augment.render.layout import BLOCK, LANES, U
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernels of the image loss: L1 and SSIM against a recorded picture, and their gradients
-# With x the picture, y the recorded one, G the window's blur, P = G(x + y) and N = G(x - y):
-#
-#     A1 = (P^2 - N^2)/2 + C1 = 2 mu_x mu_y + C1        A2 = 2 sigma_xy + C2, from G((x + y)^2)
-#     B1 = (P^2 + N^2)/2 + C1 = mu_x^2 + mu_y^2 + C1    B2 = sigma_x^2 + sigma_y^2 + C2, G((x -
-# y)^2)
-#     SSIM = A1 A2 / (B1 B2)
-#
-# so that four blurs do instead of five, and the gradient takes three: with a, b, c the derivatives
-# by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
-#
-#     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
-#
-# Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
-# zeros above and below, and zeros from the image's width to the stride. Sums are left as LANES sums
-# of every row, to be added up in float64.
-
-# --------------------------------------------------------------------------------------------------
-# Numba kernels for a sky that is learnt: a cube map's colours behind a view, and their gradient..
+# ---- A sky that is learnt: a cube map's colours behind a view, and their gradient ----------------
 # The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. What
-# it found is kept (texel, fractions), so that the way back computes no direction again.
+# it found is kept (texel, fractions): the backward pass reuses it.
 
 PARTS = 4  # gradients are summed in as many copies of the cube map, whatever the threads
 BAND = 8  # image rows at a time; part p sums bands p, p + PARTS, ... so that all see as much sky
@@ -130,10 +112,10 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
                     texel = texels[i, j]
                     if texel == UNSEEN:
                         continue
-                    through = one - alpha[i, j]
-                    red = through * d_rgb[i, j, 0]
-                    green = through * d_rgb[i, j, 1]
-                    blue = through * d_rgb[i, j, 2]
+                    transmittance = one - alpha[i, j]
+                    red = transmittance * d_rgb[i, j, 0]
+                    green = transmittance * d_rgb[i, j, 1]
+                    blue = transmittance * d_rgb[i, j, 2]
                     if red == zero and green == zero and blue == zero:
                         continue
                     fc, fr = fractions[0, i, j], fractions[1, i, j]
@@ -217,6 +199,22 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d
             d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
         sums[chunk] = total
 
+
+# ---- The image loss: L1 and SSIM against a recorded picture, and their gradients -----------------
+# With x the picture, y the recorded one, G the window's blur, P = G(x + y) and N = G(x - y):
+#
+#     A1 = (P^2 - N^2)/2 + C1 = 2 mu_x mu_y + C1        A2 = 2 sigma_xy + C2, from G((x + y)^2)
+#     B1 = (P^2 + N^2)/2 + C1 = mu_x^2 + mu_y^2 + C1    B2 = sigma_x^2 + sigma_y^2 + C2,
+#     SSIM = A1 A2 / (B1 B2)                                 from G((x - y)^2)
+#
+# so that four blurs do instead of five, and the gradient takes three: with a, b, c the derivatives
+# by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
+#
+#     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
+#
+# Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
+# zeros above and below, and zeros from the image's width to the stride. Sums are left as LANES sums
+# of every row, to be added up in float64.
 
 PAD = 5  # the window's radius
 MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
@@ -306,10 +304,10 @@ def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
         rows[U(3) * stride + j] = alpha[at]
     one = v8.splat(np.float32(1))
     for j in range(U(0), stride, U(LANES)):
-        through = one - v8.load(rows, U(3) * stride + j)
+        transmittance = one - v8.load(rows, U(3) * stride + j)
         for c in range(U(0), U(3)):
             behind = v8.load(sky, (c * height + row) * stride + j)
-            value = v8.fmuladd(through, behind, v8.load(rows, c * stride + j))
+            value = v8.fmuladd(transmittance, behind, v8.load(rows, c * stride + j))
             v8.store(out, first + c * plane + j, value)
 
 
@@ -326,20 +324,9 @@ def _mapped(planes, at, plane, color_map, channel):
 
 @kernel
 def compare(
-    rgb,
-    alpha,
-    sky,
-    color_map,
-    recorded,
-    weight,
-    is_sky,
-    size,
-    behind,
-    pairs,
-    weights,
-    sums,
+    rgb, alpha, sky, color_map, recorded, weight, is_sky, size, behind, pairs, weights, sums,
     covered,
-):
+):  # fmt: skip
     """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
 
     recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
@@ -543,7 +530,7 @@ MOMENTS = 6
 def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
     """moments: float64 [B, MOMENTS], filled, in each part's axes.
 
-    addresses, sizes, blocks: as in cpu_project; rows (flat), ids, counts: as project_backward
+    addresses, sizes, blocks: as in project; rows (flat), ids, counts: as project_backward
     wrote them. Splats whose gradient is not finite are left out, as they are of the update.
     """
     for block in prange(blocks.shape[0]):
@@ -611,29 +598,14 @@ def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
 
 @kernel
 def update_splats(
-    addresses,
-    sizes,
-    views,
-    blocks,
-    firsts,
-    rows,
-    ids,
-    counts,
-    functions,
-    rates,
-    corrections,
-    geometry_m,
-    geometry_v,
-    sh_m,
-    sh_v,
-    age,
-    grads,
-):
+    addresses, sizes, views, blocks, firsts, rows, ids, counts, functions, rates, corrections,
+    geometry_m, geometry_v, sh_m, sh_v, age, grads,
+):  # fmt: skip
     """One step of Adam for every row of gradients; a splat whose row is not finite stays as it is.
 
-    addresses, sizes, views, blocks: as in cpu_project; the splats are changed in place. firsts:
+    addresses, sizes, views, blocks: as in project; the splats are changed in place. firsts:
     int64 [P], index of each part's first splat in the arrays of moments. rows, ids, counts: what
-    cpu_project_backward wrote. functions: SH functions that are learnt by now. rates: float32
+    project_backward wrote. functions: SH functions that are learnt by now. rates: float32
     [RATES]. corrections: as `bias_corrections` gives them, flat. geometry_m to grads: flat arrays
     of `Splats`.
     """
@@ -693,10 +665,10 @@ def _write_bases(means, ids, at, left, view, functions, basis):
     dx, dy, dz = from_eye(means, picked, U(0), view)
     inverse = v8.splat(np.float32(1)) / v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, basis)
-    row = U(V_ROTATION + 6)
+    row = U(L.V_ROTATION + 6)
     z = v8.fmuladd(v8.splat(view[row]), dx, v8.splat(view[row + U(1)]) * dy)
     z = v8.fmuladd(v8.splat(view[row + U(2)]), dz, z)
-    v8.store(basis, U(_FUNCTIONS * LANES), z * v8.splat(np.float32(1) / view[V_FOCAL]))
+    v8.store(basis, U(_FUNCTIONS * LANES), z * v8.splat(np.float32(1) / view[L.V_FOCAL]))
 
 
 @inner()

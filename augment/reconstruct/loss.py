@@ -36,8 +36,6 @@ from augment.sky import CubemapSky, Sky, directions_of_cubemap
 MIN_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step
 MIN_ALPHA = 0.05
 
-# ---- Buffers of the image loss that calls share, and the sums of the sky's gradient --------------
-
 
 @dataclass(frozen=True, eq=False)
 class SkyGradient:
@@ -176,14 +174,21 @@ def view_loss(
         ValueError: an array's shape or type is wrong, or depth_pixels are not increasing indices.
     """
     camera = view.camera
-    rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
+    size = (camera.height, camera.width)
+    faces = sky_faces.shape[1] if sky_faces.ndim == 4 and sky_faces.shape[1] else 1
+    rgb = _plain("rgb", rgb, (*size, 3), camera)
+    alpha = _plain("alpha", alpha, size, camera)
+    sky_faces = _plain("sky_faces", sky_faces, (6, faces, faces, 3), camera)
+    color_map = _plain("color_map", color_map, (3, 4), camera)
     if expected_depth is not None:
-        size = (camera.height, camera.width)
-        expected_depth = _plain("expected_depth", expected_depth, np.float32, size, camera)
+        expected_depth = _plain("expected_depth", expected_depth, size, camera)
     scratch = scratch or LossScratch()
     buffers = scratch.image(camera.height, camera.width)
     with kernel_threads():
-        _sample_sky(alpha, camera, sky_faces, np.float32(MIN_SKY), buffers)
+        rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
+        intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
+        seen = (buffers.sky_colors, buffers.texels, buffers.fractions)
+        kernels.sample_sky(alpha, sky_faces, rotation, intrinsics, np.float32(MIN_SKY), *seen)
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
         depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
         surface = _compare_surface(alpha, view, weights, buffers)
@@ -191,39 +196,10 @@ def view_loss(
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
     total += weights.depth * depth + weights.surface * surface + weights.sky * sky
     return ViewLoss(
-        total=total,
-        l1=l1,
-        ssim=ssim,
-        depth=depth,
-        sky=sky,
-        d_rgb=buffers.d_rgb,
-        d_alpha=buffers.d_alpha,
-        d_expected_depth=buffers.d_expected_depth,
-        d_color_map=d_color_map,
-        d_sky=d_sky,
-        surface=surface,
-    )
-
-
-def _sample_sky(
-    alpha: np.ndarray,
-    camera: Camera,
-    sky_faces: np.ndarray,
-    least: np.float32,
-    buffers: ImageBuffers,
-) -> None:
-    rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
-    intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
-    kernels.sample_sky(
-        alpha,
-        sky_faces,
-        rotation,
-        intrinsics,
-        least,
-        buffers.sky_colors,
-        buffers.texels,
-        buffers.fractions,
-    )
+        total=total, l1=l1, ssim=ssim, depth=depth, sky=sky, d_rgb=buffers.d_rgb,
+        d_alpha=buffers.d_alpha, d_expected_depth=buffers.d_expected_depth, d_color_map=d_color_map,
+        d_sky=d_sky, surface=surface,
+    )  # fmt: skip
 
 
 def _compare(
@@ -242,20 +218,9 @@ def _compare(
     weight, is_sky = _writeable(view.weight).reshape(-1), _writeable(view.sky).reshape(-1)
     pairs, slopes, kept = buffers.pairs, buffers.slopes, buffers.weights
     kernels.compare(
-        rgb.reshape(-1),
-        alpha.reshape(-1),
-        sky,
-        mapping,
-        recorded,
-        weight,
-        is_sky,
-        size,
-        buffers.behind,
-        pairs,
-        kept,
-        buffers.sums.reshape(-1),
-        buffers.covered,
-    )
+        rgb.reshape(-1), alpha.reshape(-1), sky, mapping, recorded, weight, is_sky, size,
+        buffers.behind, pairs, kept, buffers.sums.reshape(-1), buffers.covered,
+    )  # fmt: skip
     error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
     covered = float(buffers.covered.sum())
     count = 3 * weight_sum
@@ -267,19 +232,10 @@ def _compare(
     per_weight = 1 / count if count > 0 else 0.0
     factors = ((1 - weights.d_ssim) * per_weight, ssim_factor, weights.sky / pixels)
     kernels.differentiate(
-        sky,
-        mapping,
-        is_sky,
-        buffers.behind,
-        pairs,
-        slopes,
-        kept,
-        size,
-        np.array(factors, np.float32),
-        buffers.d_rgb.reshape(-1),
-        buffers.d_alpha.reshape(-1),
+        sky, mapping, is_sky, buffers.behind, pairs, slopes, kept, size,
+        np.array(factors, np.float32), buffers.d_rgb.reshape(-1), buffers.d_alpha.reshape(-1),
         buffers.map_sums.reshape(-1),
-    )
+    )  # fmt: skip
     d_color_map = buffers.map_sums.sum(axis=(0, 3), dtype=np.float64)
     return error_sum * per_weight, ssim, covered / pixels, d_color_map
 
@@ -294,8 +250,8 @@ def _compare_surface(
     pixels = view.depth_pixels  # each once
     share = view.depth_weight * np.float32(weights.surface / weight_sum)
     buffers.d_alpha.reshape(-1)[pixels] -= share
-    through = (1 - alpha.reshape(-1)[pixels]) * view.depth_weight
-    return float(through.sum(dtype=np.float64)) / weight_sum
+    transmittance = (1 - alpha.reshape(-1)[pixels]) * view.depth_weight
+    return float(transmittance.sum(dtype=np.float64)) / weight_sum
 
 
 def _compare_depth(
@@ -312,16 +268,11 @@ def _compare_depth(
         return 0.0
     sums = np.empty(-(-len(view.depth_pixels) // kernels.CHUNK))
     kernels.compare_depth(
-        expected_depth.reshape(-1),
-        alpha.reshape(-1),
-        _writeable(view.depth_pixels),
-        _writeable(view.depth_m),
-        _writeable(view.depth_weight),
-        np.float32(weights.depth / weight_sum),
-        np.float32(MIN_ALPHA),
-        buffers.d_expected_depth.reshape(-1),
-        sums,
-    )
+        expected_depth.reshape(-1), alpha.reshape(-1), _writeable(view.depth_pixels),
+        _writeable(view.depth_m), _writeable(view.depth_weight),
+        np.float32(weights.depth / weight_sum), np.float32(MIN_ALPHA),
+        buffers.d_expected_depth.reshape(-1), sums,
+    )  # fmt: skip
     if sums.min() < 0:
         raise ValueError(
             f"view of camera {view.camera.name!r}: depth_pixels must be increasing indices from 0 "
@@ -332,25 +283,10 @@ def _compare_depth(
     return float(sums.sum()) / weight_sum
 
 
-def _checked(
-    rgb: np.ndarray, alpha: np.ndarray, camera: Camera, sky_faces: np.ndarray, color_map: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    size = (camera.height, camera.width)
-    faces = sky_faces.shape[1] if sky_faces.ndim == 4 and sky_faces.shape[1] else 1
-    return (
-        _plain("rgb", rgb, np.float32, (*size, 3), camera),
-        _plain("alpha", alpha, np.float32, size, camera),
-        _plain("sky_faces", sky_faces, np.float32, (6, faces, faces, 3), camera),
-        _plain("color_map", color_map, np.float32, (3, 4), camera),
-    )
-
-
-def _plain(
-    name: str, value: np.ndarray, dtype: type, shape: tuple[int, ...], camera: Camera
-) -> np.ndarray:
-    if value.shape != shape or value.dtype != dtype:
+def _plain(name: str, value: np.ndarray, shape: tuple[int, ...], camera: Camera) -> np.ndarray:
+    if value.shape != shape or value.dtype != np.float32:
         raise ValueError(
-            f"{name} of camera {camera.name!r} must be {np.dtype(dtype)} {list(shape)}; "
+            f"{name} of camera {camera.name!r} must be float32 {list(shape)}; "
             f"got {value.dtype} {list(value.shape)}"
         )
     return _writeable(value)

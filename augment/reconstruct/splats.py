@@ -78,20 +78,13 @@ class Splats:
                 semantic[at : at + len(part)] = part.semantic.numpy()
             at += len(part)
         return Splats(
-            starts=np.cumsum([0, *counts], dtype=np.int64),
-            means=joined("means"),
-            quats=joined("quats"),
-            scales=joined("scales"),
-            opacities=joined("opacities"),
-            sh=sh,
-            semantic=semantic,
-            geometry_m=np.zeros((total, GEOMETRY), np.float32),
-            geometry_v=np.zeros((total, GEOMETRY), np.float32),
-            sh_m=np.zeros_like(sh),
-            sh_v=np.zeros_like(sh),
-            age=np.zeros(total, np.int32),
+            starts=np.cumsum([0, *counts], dtype=np.int64), means=joined("means"),
+            quats=joined("quats"), scales=joined("scales"), opacities=joined("opacities"), sh=sh,
+            semantic=semantic, geometry_m=np.zeros((total, GEOMETRY), np.float32),
+            geometry_v=np.zeros((total, GEOMETRY), np.float32), sh_m=np.zeros_like(sh),
+            sh_v=np.zeros_like(sh), age=np.zeros(total, np.int32),
             grads=np.zeros((total, 3), np.float32),
-        )
+        )  # fmt: skip
 
     def gaussians(self, part: int) -> Gaussians:
         """A copy of one part."""
@@ -550,16 +543,10 @@ class ColorAdam:
         """rows: int32 [T], each once. gradient: float32 [T, 3]. Colours stay within [0, 1]."""
         with kernel_threads():
             kernels.update_rows(
-                self._values.reshape(-1),
-                self._m.reshape(-1),
-                self._v.reshape(-1),
-                self._count,
-                rows,
-                gradient,
-                np.float32(rate),
-                np.array([BETA1, BETA2], np.float32),
+                self._values.reshape(-1), self._m.reshape(-1), self._v.reshape(-1), self._count,
+                rows, gradient, np.float32(rate), np.array([BETA1, BETA2], np.float32),
                 CORRECTIONS.reshape(-1),
-            )
+            )  # fmt: skip
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The moments and counts themselves, by name."""

@@ -326,6 +326,7 @@ def _blocks(counts: np.ndarray) -> np.ndarray:
 # ---- What renders the views: the CPU's kernels, or gsplat on a GPU; all else is the same
 
 DEVICES = ("cpu", "cuda")
+SETTINGS = RasterSettings()
 
 
 class CpuRenderer:
@@ -340,17 +341,10 @@ class CpuRenderer:
         self._scratch = Scratch()
 
     def record(
-        self,
-        splats: Splats,
-        inputs: Inputs,
-        poses: np.ndarray,
-        camera: Camera,
-        settings: RasterSettings,
-        *,
-        with_depth: bool,
+        self, splats: Splats, inputs: Inputs, poses: np.ndarray, camera: Camera, *, with_depth: bool
     ) -> Tape:
         """inputs: of these splats; poses: world_from_part of their parts, float64 [P, 4, 4]."""
-        return record(inputs, camera, settings, self._scratch, with_depth=with_depth)
+        return record(inputs, camera, SETTINGS, self._scratch, with_depth=with_depth)
 
 
 # The GPU holds a copy of all splats; what a step changed on the CPU, it is sent: the rows of the
@@ -376,14 +370,7 @@ class GsplatRenderer:
         self._scratch = Scratch()
 
     def record(
-        self,
-        splats: Splats,
-        inputs: Inputs,
-        poses: np.ndarray,
-        camera: Camera,
-        settings: RasterSettings,
-        *,
-        with_depth: bool,
+        self, splats: Splats, inputs: Inputs, poses: np.ndarray, camera: Camera, *, with_depth: bool
     ) -> GsplatTape:
         self._refresh(splats)
         # SH need no gradients of their own: they follow from the colours'.
@@ -399,7 +386,7 @@ class GsplatRenderer:
         images = draw_with_gsplat(
             parts,
             camera,
-            settings,
+            SETTINGS,
             with_depth=with_depth,
             functions=int(inputs.modes[M_FUNCTIONS]),
             keep_color_slopes=True,
@@ -550,7 +537,7 @@ class Trainer:
         self, scene: Scene, source: ViewSource, config: FitConfig, *, device: str = "cpu"
     ) -> None:
         """scene: what is started from; it is not changed. source: at least one training view.
-        device: where views are rendered (augment.reconstruct.renderers); bits are those of "cpu".
+        device: where views are rendered; bits are those of "cpu".
         """
         if not source.train:
             raise ValueError("the view source has no training views; nothing can be learnt")
@@ -566,7 +553,6 @@ class Trainer:
         self._map_adams = {name: DenseAdam(m) for name, m in self.color_maps.items()}
         self._scene = scene
         self._source = source
-        self._settings = RasterSettings()
         self._renderer = fit_renderer(device)
         self._loss_scratch = LossScratch()
         self.actor_poses = ActorPoses(scene.actors)
@@ -608,16 +594,9 @@ class Trainer:
                 self._add_noise(tape.inputs, grads)
             self._densify()
         return StepRecord(
-            step=self.step,
-            key=key,
-            loss=loss.total,
-            l1=loss.l1,
-            ssim=loss.ssim,
-            depth=loss.depth,
-            sky=loss.sky,
-            splats=len(self.splats),
-            stage_s=stages,
-        )
+            step=self.step, key=key, loss=loss.total, l1=loss.l1, ssim=loss.ssim, depth=loss.depth,
+            sky=loss.sky, splats=len(self.splats), stage_s=stages,
+        )  # fmt: skip
 
     def scene(self) -> Scene:
         """The scene as fitted so far; it shares nothing with the trainer."""
@@ -700,15 +679,11 @@ class Trainer:
         return _PosedParts(numbers, poses)
 
     def _render(self, parts: _PosedParts, camera: Camera) -> Tape | GsplatTape:
-        inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, self._settings)
+        inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, SETTINGS)
         inputs.modes[M_FUNCTIONS] = self._functions
+        with_depth = self.config.loss.depth > 0
         return self._renderer.record(
-            self.splats,
-            inputs,
-            parts.poses,
-            camera,
-            self._settings,
-            with_depth=self.config.loss.depth > 0,
+            self.splats, inputs, parts.poses, camera, with_depth=with_depth
         )
 
     @property
@@ -735,24 +710,13 @@ class Trainer:
         forces = part_forces(inputs, grads) if self.config.pose_refinement else None
         with kernel_threads():
             update_splats(
-                inputs.addresses,
-                inputs.sizes,
-                inputs.views,
-                inputs.blocks,
-                inputs.first_ids,
-                grads.rows.reshape(-1),
-                grads.ids,
-                grads.counts,
-                self._functions,
+                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
+                grads.rows.reshape(-1), grads.ids, grads.counts, self._functions,
                 splat_rates(self.config, self.step, camera, self._extent_m),
-                CORRECTIONS.reshape(-1),
-                splats.geometry_m.reshape(-1),
-                splats.geometry_v.reshape(-1),
-                splats.sh_m.reshape(-1),
-                splats.sh_v.reshape(-1),
-                splats.age,
-                splats.grads.reshape(-1),
-            )
+                CORRECTIONS.reshape(-1), splats.geometry_m.reshape(-1),
+                splats.geometry_v.reshape(-1), splats.sh_m.reshape(-1), splats.sh_v.reshape(-1),
+                splats.age, splats.grads.reshape(-1),
+            )  # fmt: skip
         if loss.d_sky is not None:
             rate = decayed(rates.sky, rates.sky_end, done)
             above = self._is_sky[loss.d_sky.texels]

@@ -19,7 +19,13 @@ BACKENDS = (AUTO, REFERENCE, CPU, CUDA)
 
 def available_backends() -> dict[str, str | None]:
     """Every backend but "auto", with None where it can run and else the reason why it cannot."""
-    return {REFERENCE: None, CPU: _obstacle(import_cpu), CUDA: _obstacle(import_cuda)}
+    obstacles: dict[str, str | None] = {REFERENCE: None, CPU: None, CUDA: None}
+    for backend, import_it in ((CPU, import_cpu), (CUDA, import_cuda)):
+        try:
+            import_it()
+        except BackendUnavailable as error:
+            obstacles[backend] = str(error)
+    return obstacles
 
 
 def import_cpu() -> ModuleType:
@@ -51,36 +57,18 @@ def kernels_for(backend: str, *images: Tensor | None) -> str:
     CUDA where they lie on a GPU.
     """
     given = [image for image in images if image is not None]
-    if backend == REFERENCE or not all(_for_kernels(image) for image in given):
+    tracking = torch.is_grad_enabled()
+    if backend == REFERENCE or not all(
+        image.dtype == torch.float32 and not (tracking and image.requires_grad) for image in given
+    ):
         return REFERENCE
     if backend == AUTO:
         return CUDA if any(image.device.type != "cpu" for image in given) else CPU
     return backend
 
 
-def _for_kernels(image: Tensor) -> bool:
-    tracked = torch.is_grad_enabled() and image.requires_grad
-    return image.dtype == torch.float32 and not tracked
-
-
-def _obstacle(importing: object) -> str | None:
-    assert callable(importing)
-    try:
-        importing()
-    except BackendUnavailable as error:
-        return str(error)
-    return None
-
-
-RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW = (
-    "rgb",
-    "alpha",
-    "expected_depth",
-    "median_depth",
-    "splat_ids",
-    "mode_depth",
-    "snow",
-)
+RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH = "rgb", "alpha", "expected_depth", "median_depth"
+SPLAT_IDS, MODE_DEPTH, SNOW = "splat_ids", "mode_depth", "snow"
 BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW)
 # Depth estimators by the names that recipes and placement give them.
 DEPTH_ESTIMATORS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}

@@ -91,18 +91,12 @@ def _composite_cubemap(
         airlight = smog.rgb
     with kernel_threads(ROWS):
         composite_kernels.composite_cubemap(
-            rgb.detach().contiguous().numpy(),
-            alpha.detach().contiguous().numpy(),
-            faces.contiguous().numpy(),
-            camera.world_from_camera[:3, :3].numpy().astype(np.float32),
-            np.float32(1 / camera.fx),
-            np.float32(1 / camera.fy),
-            np.float32(camera.cx),
-            np.float32(camera.cy),
-            np.float32(min(strength, 1e30)),
-            np.asarray(airlight, np.float32),
-            out,
-        )
+            rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(),
+            faces.contiguous().numpy(), camera.world_from_camera[:3, :3].numpy().astype(np.float32),
+            np.float32(1 / camera.fx), np.float32(1 / camera.fy), np.float32(camera.cx),
+            np.float32(camera.cy), np.float32(min(strength, 1e30)),
+            np.asarray(airlight, np.float32), out,
+        )  # fmt: skip
     return torch.from_numpy(out)
 
 

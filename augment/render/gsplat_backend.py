@@ -22,7 +22,6 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
 from augment.geometry import multiply_quats, quat_from_rotmat
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda.runtime import gpu_device
 from augment.scene import PosedGaussians
@@ -93,20 +92,6 @@ def _check_compiled() -> None:
             "gsplat is installed without its kernels, and found no CUDA toolkit (nvcc) to compile "
             "them with: install one, or a gsplat built for this torch, or use backend 'cpu'"
         )
-
-
-def rasterize_gsplat(
-    parts: Sequence[PosedGaussians],
-    camera: Camera,
-    buffers: frozenset[str],
-    settings: RasterSettings,
-) -> RenderOutput:
-    """As `rasterize_reference` without smog and clip; see `draw_with_gsplat`. buffers: some of
-    DIFFERENTIABLE.
-    """
-    images = draw_with_gsplat(parts, camera, settings, with_depth=EXPECTED_DEPTH in buffers)
-    made = {RGB: images.rgb, ALPHA: images.alpha, EXPECTED_DEPTH: images.expected_depth}
-    return RenderOutput(**{name: made[name] for name in buffers})
 
 
 def draw_with_gsplat(

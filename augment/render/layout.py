@@ -11,18 +11,15 @@ from typing import Literal
 
 import numpy as np
 
-# ------------------------------------------------------------------------------------------------
-# Splats cut at a height: what lies above a level plane, or below it, and nothing of the rest
+# ---- Splats cut at a height: what lies above a level plane, or below it, is drawn ----------------
 # A splat is taken for the surface on which its density is highest along each ray: with covariance
-# S2
-# of its image position and c, that of image position and depth, the depth there is
+# S2 of its image position and c, that of image position and depth, the depth there is
 #
 #     z(p) = z + g . (p - mean2d),    g = S2^-1 c
 #
 # to first order (the conditional mean of a Gaussian). Of a plane it is 1/z that is linear in the
-# image, so i(p) = 1/z - g . (p - mean2d) / z^2 is used, which has the same slope. Seen from an
-# eye at
-# height h_eye over the plane, a point at inverse depth i on the ray through p is at height
+# image, so i(p) = 1/z - g . (p - mean2d) / z^2 is used, which has the same slope. Seen from an eye
+# at height h_eye over the plane, a point at inverse depth i on the ray through p is at height
 # z (h_eye i + s(p)), s being the vertical part of the ray's direction. So
 #
 #     L(p) = h_eye i(p) + s(p)
@@ -30,12 +27,9 @@ import numpy as np
 # is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
 # its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge.
 # Parallel rays need no such detour: there z(p) is exact for a plane, and the height linear in p.
-# Where there is a clip, expected and mode depth, too, are taken over these surfaces, 1/i(p), no
-# farther from the centre than the splat reaches: the centres of large splats stand nearer or
-# farther
-# than what a pixel shows of them, by more than shallow water is deep. `UNCUT` asks for that and
-# cuts
-# nothing.
+# With a clip, expected and mode depth, too, are taken over these surfaces, 1/i(p), no farther from
+# the centre than the splat reaches: the centres of large splats stand nearer or farther than what a
+# pixel shows of them, by more than shallow water is deep. `UNCUT` asks for that and cuts nothing.
 
 ABOVE, BELOW = "above", "below"
 SIGNS = {ABOVE: 1.0, BELOW: -1.0}

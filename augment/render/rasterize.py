@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.smog import SmogMedium
@@ -32,21 +31,20 @@ from augment.render.buffers import (
     kernels_for,
 )
 from augment.render.constants import MAX_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.gsplat_backend import tracked_geometry
+from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
 from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
 from augment.scene import Gaussians, PosedGaussians
 
-# ---- What shines through pixels that a raised transmittance stop has finished: more of the same --
-# Behind the stop nothing has been blended, so at most this share of a pixel is unknown. Left
-# transparent it would show the sky through every wall; instead, what the pixel has blended stands
-# for it: rgb and snow are divided by alpha, which becomes 1. At the default stop and below nothing
-# is done: 1e-4 is less than 8 bits show, and gsplat leaves it transparent, too.
-
 
 def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
     """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to by kernels.
+
+    Behind a raised transmittance stop nothing has been blended. Left transparent, that share of a
+    pixel would show the sky through every wall; instead what the pixel has blended stands for it:
+    rgb and snow are divided by alpha, which becomes 1. (1e-4, the default, is less than 8 bits
+    show, and gsplat leaves it transparent, too.)
 
     backend: with kernels, float32 without gradients goes through them, equal within float rounding.
     """
@@ -56,7 +54,15 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
     images = {name: image for name, image in images.items() if image is not None}
     kernels = kernels_for(backend, alpha, *images.values())
     if kernels == CPU:
-        _by_kernel(alpha, images, stop)
+        from augment.render import composite_kernels
+        from augment.render.threads import kernel_threads
+
+        flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
+        rgb, snow = (flat.get(name, np.empty(0, np.float32)) for name in ("rgb", "snow"))
+        with kernel_threads():
+            composite_kernels.renormalise_alpha(
+                alpha.numpy().reshape(-1), rgb, snow, np.float32(1 - stop)
+            )
         return output
     if kernels == CUDA:
         from augment.render.cuda import images as cuda_images
@@ -71,21 +77,6 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
     }
     opaque = torch.where(finished, torch.ones_like(alpha), alpha)
     return dataclasses.replace(output, alpha=opaque, **scaled)
-
-
-def _by_kernel(alpha: Tensor, images: dict[str, Tensor], stop: float) -> None:
-    from augment.render import composite_kernels
-    from augment.render.threads import kernel_threads
-
-    flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
-    none = np.empty(0, np.float32)
-    with kernel_threads():
-        composite_kernels.renormalise_alpha(
-            alpha.numpy().reshape(-1),
-            flat.get("rgb", none),
-            flat.get("snow", none),
-            np.float32(1 - stop),
-        )
 
 
 logger = logging.getLogger(__name__)
@@ -341,34 +332,24 @@ def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
 
 
 def _check_settings(settings: RasterSettings) -> None:
-    s, degree = settings, settings.sh_degree
+    s, degree, most = settings, settings.sh_degree, MAX_TRANSMITTANCE_STOP
     above_0 = "finite and > 0 (metres)"
-    for name, is_good, expected in (
-        ("near_m", math.isfinite(s.near_m) and s.near_m > 0, above_0),
-        (
-            "alpha_max",
+    rules = {
+        "near_m": (0 < s.near_m < math.inf, above_0),
+        "alpha_max": (
             0 < s.alpha_max < 1,
             "between 0 and 1 (usual: 0.999 or 0.99), since a splat of alpha 1 would never be "
             "blended",
         ),
-        (
-            "mode_depth_floor_m",
-            math.isfinite(s.mode_depth_floor_m) and s.mode_depth_floor_m > 0,
-            above_0,
+        "mode_depth_floor_m": (0 < s.mode_depth_floor_m < math.inf, above_0),
+        "transmittance_stop": (
+            0 < s.transmittance_stop <= most,
+            f"> 0 and at most {most}, since median depth is where less than half the light is left",
         ),
-        (
-            "transmittance_stop",
-            0 < s.transmittance_stop <= MAX_TRANSMITTANCE_STOP,
-            f"> 0 and at most {MAX_TRANSMITTANCE_STOP}, since median depth is where less than half "
-            f"the light is left",
-        ),
-        (
-            "radius_clip_px",
-            math.isfinite(s.radius_clip_px) and s.radius_clip_px >= 0,
-            "finite and >= 0 (pixels)",
-        ),
-        ("sh_degree", degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
-    ):
+        "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
+        "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
+    }
+    for name, (is_good, expected) in rules.items():
         if not is_good:
             raise ValueError(f"settings.{name} must be {expected}; got {getattr(s, name)}")
 
@@ -378,18 +359,12 @@ def _tracked(parts: Sequence[PosedGaussians]) -> bool:
 
 
 def _requires_grad(gaussians: Gaussians) -> bool:
-    return any(tensor.requires_grad for tensor in _floats(gaussians).values())
-
-
-def _floats(gaussians: Gaussians) -> dict[str, torch.Tensor]:
-    return {
-        name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")
-    }
+    return any(getattr(gaussians, name).requires_grad for name in (*GEOMETRY, "sh"))
 
 
 def _detached(part: PosedGaussians) -> PosedGaussians:
     """The part without autograd, which numpy would refuse; the same object where it has none."""
     if not _requires_grad(part.gaussians):
         return part
-    tensors = {name: tensor.detach() for name, tensor in _floats(part.gaussians).items()}
+    tensors = {name: getattr(part.gaussians, name).detach() for name in (*GEOMETRY, "sh")}
     return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, **tensors))

@@ -64,21 +64,18 @@ def select_thread_pool() -> str:
 
 def _preload_tbb() -> bool:
     """Load TBB with its symbols visible, so that numba's pool finds it by name."""
-    for path in (*_installed_libraries(), Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
+    try:
+        files = importlib.metadata.files("tbb") or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    installed = [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
+    for path in (*installed, Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
         try:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
         except OSError:
             continue
         return True
     return False
-
-
-def _installed_libraries() -> list[Path]:
-    try:
-        files = importlib.metadata.files("tbb") or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    return [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
 
 
 @contextmanager

@@ -104,40 +104,22 @@ class Tape:
         counts = scratch.array("grad_counts", (blocks,), np.int64)
         with kernel_threads():
             backward_kernels.blend_backward(
-                self.records,
-                self.tile_splat_ids,
-                self.tile_offsets,
-                self.size,
-                self.limits,
-                self.rgb.reshape(-1),
-                self.alpha.reshape(-1),
-                None if depth is None else depth.reshape(-1),
-                d_rgb.reshape(-1),
-                d_alpha.reshape(-1),
-                None if d_depth is None else d_depth.reshape(-1),
-                shares,
+                self.records, self.tile_splat_ids, self.tile_offsets, self.size, self.limits,
+                self.rgb.reshape(-1), self.alpha.reshape(-1),
+                None if depth is None else depth.reshape(-1), d_rgb.reshape(-1),
+                d_alpha.reshape(-1), None if d_depth is None else d_depth.reshape(-1), shares,
                 reached,
-            )
+            )  # fmt: skip
             timer.end_stage("raster backward")
             backward_kernels.sum_shares(
                 self.tile_splat_ids, self.tile_offsets, reached, shares, _RANGES, sums, touched
             )
             timer.end_stage("sum backward")
             backward_kernels.project_backward(
-                inputs.addresses,
-                inputs.sizes,
-                inputs.views,
-                inputs.blocks,
-                inputs.first_ids,
-                self.found,
-                touched,
-                inputs.modes,
-                self.records,
-                sums,
-                rows.reshape(-1),
-                ids,
+                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
+                self.found, touched, inputs.modes, self.records, sums, rows.reshape(-1), ids,
                 counts,
-            )
+            )  # fmt: skip
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
 
@@ -179,19 +161,11 @@ def record(
         tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
         timer.end_stage("raster")
     return Tape(
-        inputs=inputs,
-        camera=camera,
-        rgb=images[RGB],
-        alpha=images[ALPHA],
-        expected_depth=images.get(EXPECTED_DEPTH),
-        records=splats.records,
-        found=splats.found,
-        tile_splat_ids=tile_splat_ids,
-        tile_offsets=tile_offsets,
-        size=tiles.size,
-        limits=tiles.limits,
-        scratch=scratch,
-    )
+        inputs=inputs, camera=camera, rgb=images[RGB], alpha=images[ALPHA],
+        expected_depth=images.get(EXPECTED_DEPTH), records=splats.records, found=splats.found,
+        tile_splat_ids=tile_splat_ids, tile_offsets=tile_offsets, size=tiles.size,
+        limits=tiles.limits, scratch=scratch,
+    )  # fmt: skip
 
 
 # ---- The CPU rasteriser as a torch operation: forward and backward through the kernels -----------

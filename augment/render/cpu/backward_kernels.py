@@ -21,6 +21,7 @@ import math
 import numpy as np
 from numba import prange
 
+from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.blend import alpha_of, is_closed, remaining_transmittance, shrink
 from augment.render.cpu.geometry import (
@@ -38,32 +39,7 @@ from augment.render.cpu.geometry import (
 from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.project import add_direction_slopes
 from augment.render.cpu.simd import LOG2_E, floats_at
-from augment.render.layout import (
-    BLOCK,
-    BLUE,
-    DEPTH,
-    FALL_Y,
-    GREEN,
-    LANES,
-    LEAN_X,
-    M_ANTIALIASED,
-    M_FUNCTIONS,
-    MEAN_Y,
-    PIXELS,
-    RECORD,
-    RED,
-    SHARP_X,
-    SPLAT_ID,
-    STRIP,
-    STRIPS,
-    TILE_H,
-    TILE_W,
-    V_BLUR,
-    V_FOCAL,
-    V_HIGH,
-    V_LOW,
-    U,
-)
+from augment.render.layout import BLOCK, LANES, PIXELS, RECORD, STRIP, STRIPS, TILE_H, TILE_W, U
 
 # Of a list entry, one cache line: sums of g, g off, g off^2, g dy, g off dy, g dy^2, and of
 # |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and z.
@@ -71,7 +47,7 @@ SHARE = 16
 S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
 
 # Planes of a tile: transmittance as in blend, what lies behind, and the pixel's gradients.
-THROUGH, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
+TRANSMITTANCE, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
 PLANES = 7 * PIXELS
 GROUP = 4  # tiles a thread takes at a time
 _LN2 = np.float32(math.log(2))
@@ -79,20 +55,9 @@ _LN2 = np.float32(math.log(2))
 
 @kernel
 def blend_backward(
-    records,
-    tile_splat_ids,
-    tile_offsets,
-    size,
-    limits,
-    rgb,
-    alpha,
-    depth,
-    d_rgb,
-    d_alpha,
-    d_depth,
-    shares,
-    reached,
-):
+    records, tile_splat_ids, tile_offsets, size, limits, rgb, alpha, depth, d_rgb, d_alpha, d_depth,
+    shares, reached,
+):  # fmt: skip
     """dL of every list entry that the forward blend came to.
 
     records, tile_splat_ids, tile_offsets, size, limits: as for blend.blend_tiles, in one slice.
@@ -147,22 +112,9 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
 
 @inner()
 def _replay_list(
-    records,
-    tile_splat_ids,
-    first,
-    last,
-    left,
-    top,
-    limits,
-    state,
-    staged,
-    spans,
-    values,
-    places,
-    rows,
-    d_depth,
-    shares,
-):
+    records, tile_splat_ids, first, last, left, top, limits, state, staged, spans, values, places,
+    rows, d_depth, shares,
+):  # fmt: skip
     """Fill the shares of a tile's list as far as light reaches; returns how far that is."""
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
@@ -175,20 +127,9 @@ def _replay_list(
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
         stage(
-            records,
-            tile_splat_ids,
-            U(at),
-            U(count),
-            left,
-            top,
-            shares,
-            d_depth,
-            None,
-            None,
-            None,
-            None,
-            staged,
-        )
+            records, tile_splat_ids, U(at), U(count), left, top, shares, d_depth, None, None, None,
+            None, staged,
+        )  # fmt: skip
         for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):
@@ -219,20 +160,20 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     least, end_light = v8.splat(limits[2]), v8.splat(limits[7])
     zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
-    sharp = staged[U(SHARP_X) * n + k]
-    fall = v8.splat(staged[U(FALL_Y) * n + k])
-    tilt = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
+    sharp = staged[U(L.SHARP_X) * n + k]
+    fall = v8.splat(staged[U(L.FALL_Y) * n + k])
+    tilt = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
     steps, ln2 = v8.splat(sharp), v8.splat(_LN2)
-    red, green = v8.splat(staged[U(RED) * n + k]), v8.splat(staged[U(GREEN) * n + k])
-    blue, z = v8.splat(staged[U(BLUE) * n + k]), zero
+    red, green = v8.splat(staged[U(L.RED) * n + k]), v8.splat(staged[U(L.GREEN) * n + k])
+    blue, z = v8.splat(staged[U(L.BLUE) * n + k]), zero
     if d_depth is not None:
-        z = v8.splat(staged[U(DEPTH) * n + k])
+        z = v8.splat(staged[U(L.DEPTH) * n + k])
     s0, sx, sxx, sy, sxy, syy = zero, zero, zero, zero, zero, zero
     sr, sg, sb, sz, ax, ay = zero, zero, zero, zero, zero, zero
     for i in range(item, end):
         at = U(places[i + U(ITEMS)])
         row = np.float32(at % U(STRIP) // U(LANES)) + np.float32(0.5)
-        dy = v8.splat(row - staged[U(MEAN_Y) * n + k])
+        dy = v8.splat(row - staged[U(L.MEAN_Y) * n + k])
         off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
         e = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
         alpha = alpha_of(staged, values, k, i, alpha_max, log_cut)
@@ -304,10 +245,8 @@ def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touc
                         v8.store(sums, at + i, total)
 
 
-# --------------------------------------------------------------------------------------------------
-# Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian.
-# Eight splats at a time the projection of geometry is repeated and its chain rule followed
-# backwards. Names: g_a is dL/da.
+# ---- From gradients of a splat's ellipse, depth and colour to those of its Gaussian --------------
+# Eight splats at a time, by the chain rule through the projection. Names: g_a is dL/da.
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
 # tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). Between them
@@ -321,20 +260,9 @@ _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
 
 @kernel
 def project_backward(
-    addresses,
-    sizes,
-    views,
-    blocks,
-    first_ids,
-    found,
-    touched,
-    modes,
-    records,
-    sums,
-    grads,
-    ids,
+    addresses, sizes, views, blocks, first_ids, found, touched, modes, records, sums, grads, ids,
     counts,
-):
+):  # fmt: skip
     """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
     addresses to first_ids, found, modes, records: as in project. touched, sums: what
@@ -350,7 +278,7 @@ def project_backward(
         taken = U(0)
         for slot in range(base, base + found[block]):
             if touched[slot] != 0:
-                number = np.float32(records[slot * RECORD + SPLAT_ID]).view(np.int32)
+                number = np.float32(records[slot * RECORD + L.SPLAT_ID]).view(np.int32)
                 slots[taken] = np.int32(slot)
                 picked[taken] = number - np.int32(first_ids[part])
                 ids[U(base) + taken] = picked[taken]
@@ -366,7 +294,7 @@ def project_backward(
         quats = floats_at(addresses[part, 1], count * 4)
         scales = floats_at(addresses[part, 2], count * 3)
         sh = floats_at(addresses[part, 4], count * functions * 3)
-        used = min(modes[M_FUNCTIONS], functions)
+        used = min(modes[L.M_FUNCTIONS], functions)
         for at in range(U(0), taken, U(LANES)):
             _color_backward(
                 sh, U(functions), U(used), means, views[part], slots, picked, at, records, sums,
@@ -395,9 +323,9 @@ def _color_backward(
         slot, splat = U(slots[at + lane]), U(picked[at + lane])
         share, record = slot * U(SHARE), slot * U(RECORD)
         zero = np.float32(0)
-        red = sums[share + U(S_RED)] if records[record + U(RED)] > zero else zero
-        green = sums[share + U(S_GREEN)] if records[record + U(GREEN)] > zero else zero
-        blue = sums[share + U(S_BLUE)] if records[record + U(BLUE)] > zero else zero
+        red = sums[share + U(S_RED)] if records[record + U(L.RED)] > zero else zero
+        green = sums[share + U(S_GREEN)] if records[record + U(L.GREEN)] > zero else zero
+        blue = sums[share + U(S_BLUE)] if records[record + U(L.BLUE)] > zero else zero
         rows[U(_SLOPES + G_COLOR) * U(LANES) + lane] = red
         rows[U(_SLOPES + G_COLOR + 1) * U(LANES) + lane] = green
         rows[U(_SLOPES + G_COLOR + 2) * U(LANES) + lane] = blue
@@ -437,11 +365,11 @@ def _geometry_backward(
     x0, x1, x2 = right
     y0, y1, y2 = down
     s0, s1, s2 = sizes
-    blur = v8.splat(view[V_BLUR])
+    blur = v8.splat(view[L.V_BLUR])
     xx, yy = dot(x0, x1, x2, x0, x1, x2), dot(y0, y1, y2, y0, y1, y2)
     cxx, cyy = xx + blur, yy + blur
-    sharp = v8.gather(records, slots, at, U(RECORD), U(SHARP_X))
-    lean = v8.gather(records, slots, at, U(RECORD), U(LEAN_X))
+    sharp = v8.gather(records, slots, at, U(RECORD), U(L.SHARP_X))
+    lean = v8.gather(records, slots, at, U(RECORD), U(L.LEAN_X))
     along = k / (sharp * sharp)
 
     # The conic: e = ... - sharp^2 (dx - lean dy)^2 - k / cyy dy^2, sharp^2 = k / along.
@@ -453,7 +381,7 @@ def _geometry_backward(
     g_xx = g_along
     g_xy = g_lean - two * lean * g_along
     g_yy = lean * lean * g_along - lean * g_lean + g_fall
-    if modes[M_ANTIALIASED]:
+    if modes[L.M_ANTIALIASED]:
         # log2 of opacity holds half of log2(det / det_blurred), det = |x cross y|^2.
         half = v8.splat(np.float32(0.5) * _INVERSE_LN2) * sum_0
         c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
@@ -502,16 +430,16 @@ def _geometry_backward(
         dot(b0, b1, b2, m[6], m[7], m[8]),
     )
     zero, t = v8.splat(np.float32(0)), rotation_row(view, U(2))
-    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
-    u_low, u_high = v8.splat(view[V_LOW]), v8.splat(view[V_HIGH])
-    v_low, v_high = v8.splat(view[V_LOW + 1]), v8.splat(view[V_HIGH + 1])
+    fx, fy = v8.splat(view[L.V_FOCAL]) * inverse, v8.splat(view[L.V_FOCAL + 1]) * inverse
+    u_low, u_high = v8.splat(view[L.V_LOW]), v8.splat(view[L.V_HIGH])
+    v_low, v_high = v8.splat(view[L.V_LOW + 1]), v8.splat(view[L.V_HIGH + 1])
     raw_u, raw_v = x * inverse, y * inverse
     free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
     free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
     g_u = v8.select(free_u, zero - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zero)
     g_v = v8.select(free_v, zero - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zero)
-    g_x = (g_u + g_px * v8.splat(view[V_FOCAL])) * inverse
-    g_y = (g_v + g_py * v8.splat(view[V_FOCAL + 1])) * inverse
+    g_x = (g_u + g_px * v8.splat(view[L.V_FOCAL])) * inverse
+    g_y = (g_v + g_py * v8.splat(view[L.V_FOCAL + 1])) * inverse
     g_z = dot(p0, p1, p2, jx[0], jx[1], jx[2]) + dot(q0, q1, q2, jy[0], jy[1], jy[2])
     g_z = _share(sums, slots, at, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
     for axis in range(3):

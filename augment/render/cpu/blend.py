@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from augment.render import layout as L
 from augment.render.constants import DEPTH_EPS
 from augment.render.cpu import simd as v8
 from augment.render.cpu.geometry import (
@@ -40,16 +41,9 @@ from augment.render.cpu.simd import exp2
 from augment.render.layout import (
     BIN_SHIFT,
     BLOCK,
-    BLUE,
-    DEPTH,
-    GREEN,
-    IS_SNOW,
     LANES,
     PIXELS,
     RECORD,
-    RED,
-    SHARP_X,
-    SPLAT_ID,
     STRIP,
     STRIPS,
     TILE_H,
@@ -274,7 +268,7 @@ GROUP = 8  # tiles a thread takes at a time
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
 # is negative where blending has stopped; its size is then the final one. An image needs its plane
 # and all before, so those that cost most come last.
-THROUGH, P_RED, P_GREEN, P_BLUE, P_SNOW = (U(i * PIXELS) for i in range(5))
+TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_SNOW = (U(i * PIXELS) for i in range(5))
 P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
 COLOR_STATE, SNOW_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
 STATE = MODELESS_STATE + MODE_PLANES * PIXELS
@@ -284,24 +278,9 @@ CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 
 @kernel
 def blend_tiles(
-    records,
-    tile_splat_ids,
-    tile_offsets,
-    tiles,
-    states,
-    is_last,
-    size,
-    limits,
-    rgb,
-    alpha,
-    expected,
-    median,
-    ids,
-    mode,
-    snow,
-    cuts,
-    lights,
-):
+    records, tile_splat_ids, tile_offsets, tiles, states, is_last, size, limits, rgb, alpha,
+    expected, median, ids, mode, snow, cuts, lights,
+):  # fmt: skip
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
     records: flat float32. tile_splat_ids, tile_offsets: lists of slots. tiles: uint8 [tiles],
@@ -373,32 +352,9 @@ def _clear(state, used, width, height):
 
 @inner()
 def _blend_list(
-    records,
-    tile_splat_ids,
-    first,
-    last,
-    left,
-    top,
-    limits,
-    state,
-    staged,
-    spans,
-    values,
-    places,
-    rows,
-    rgb,
-    expected,
-    median,
-    ids,
-    mode,
-    snow,
-    cuts,
-    lines,
-    edges,
-    surfaces,
-    lights,
-    lit,
-):
+    records, tile_splat_ids, first, last, left, top, limits, state, staged, spans, values, places,
+    rows, rgb, expected, median, ids, mode, snow, cuts, lines, edges, surfaces, lights, lit,
+):  # fmt: skip
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
@@ -493,25 +449,9 @@ def shrink(state, strip, rows):
 
 @inner()
 def _blend_items(
-    state,
-    staged,
-    values,
-    places,
-    items,
-    limits,
-    rgb,
-    expected,
-    median,
-    ids,
-    mode,
-    snow,
-    cuts,
-    lines,
-    edges,
-    surfaces,
-    lights,
-    lit,
-):
+    state, staged, values, places, items, limits, rgb, expected, median, ids, mode, snow, cuts,
+    lines, edges, surfaces, lights, lit,
+):  # fmt: skip
     """Blend all items in turn. The next one's alpha is begun before this one is blended.
 
     edges: None where no splat is cut.
@@ -538,18 +478,18 @@ def _blend_items(
         weight = v8.select(kept, weight, zero)
         v8.store(state, at, remaining_transmittance(transmittance, after, kept, end))
         if rgb is not None:
-            _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
-            _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
-            _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
+            _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
+            _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
+            _add(state, at + P_BLUE, weight, staged[U(L.BLUE) * n + splat])
         if rgb is not None and lights is not None and is_lit(lit, splat):
             share = weight * light_share(lit, staged, values, splat, item, at, limits)
             _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
             _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
             _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
         if snow is not None:
-            _add(state, at + P_SNOW, weight, staged[U(IS_SNOW) * n + splat])
+            _add(state, at + P_SNOW, weight, staged[U(L.IS_SNOW) * n + splat])
         if expected is not None or mode is not None:
-            centre = staged[U(DEPTH) * n + splat]
+            centre = staged[U(L.DEPTH) * n + splat]
             depth = v8.splat(centre)
             if cuts is not None:
                 depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
@@ -560,21 +500,21 @@ def _blend_items(
                 add_sample(state, at + P_MODE, depth, weight, limits[4])
         if median is not None:
             crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
-            depth = v8.splat(staged[U(DEPTH) * n + splat])
+            depth = v8.splat(staged[U(L.DEPTH) * n + splat])
             before = v8.load(state, at + P_MEDIAN)
             v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
         if ids is not None:
             best = v8.load(state, at + P_BEST)
             heavier = v8.greater(weight, best)
             v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
-            number = v8.splat(staged[U(SPLAT_ID) * n + splat])
+            number = v8.splat(staged[U(L.SPLAT_ID) * n + splat])
             v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
         alpha, splat = next_alpha, following
 
 
 @inner()
 def alpha_of(staged, values, splat, item, alpha_max, log_cut):
-    sharp = v8.splat(staged[U(SHARP_X) * U(BATCH) + splat])
+    sharp = v8.splat(staged[U(L.SHARP_X) * U(BATCH) + splat])
     off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
     e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
     alpha = v8.minimum(exp2(e), alpha_max)

@@ -86,7 +86,7 @@ def gather_inputs(
         g, count = part.gaussians, len(part.gaussians)
         tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
         own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
-        own += [_slopes(part), *_color_maps(part)]
+        own += _looks(part)
         arrays += own
         addresses.append([array.ctypes.data for array in own])
         sizes.append([count, g.sh.shape[1]])
@@ -106,26 +106,22 @@ def gather_inputs(
     )
 
 
-def _slopes(part: PosedGaussians) -> np.ndarray:
-    """float32 [N, 3], or [1] for parts of splats of one colour."""
-    if part.shading is None:
-        return np.zeros(1, np.float32)
-    return part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
-
-
-def _color_maps(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Float32 [C, 3, 4] and int16 [N], or [1] of what is not read."""
-    maps, rows = np.zeros(1, np.float32), np.zeros(1, np.int16)
+def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes of light float32 [N, 3], colour maps float32 [C, 3, 4] and their rows int16 [N]; [1]
+    of what is not read.
+    """
+    slopes, maps, rows = np.zeros(1, np.float32), np.zeros(1, np.float32), np.zeros(1, np.int16)
+    if part.shading is not None:
+        slopes = part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
     if part.color_maps is not None:
         maps = part.color_maps.detach().to(torch.float32).contiguous().numpy()
     if part.map_rows is not None:
         rows = part.map_rows.contiguous().numpy()
-    return maps, rows
+    return slopes, maps, rows
 
 
-# --------------------------------------------------------------------------------------------------
-# Work space of the CPU rasteriser, kept between frames: fresh pages cost as much as the work. Every
-# render takes a space of its own, so threads that render at once never share one.
+# ---- Work space, kept between frames: fresh pages cost as much as the work -----------------------
+# Every render takes a space of its own, so threads that render at once never share one.
 
 _LINE = 64  # bytes of a cache line
 _KEPT = 2  # spaces kept for later renders; a process rarely renders in more threads
@@ -311,23 +307,10 @@ def project(
         lights if is_lit else None,
     )
     project_kernels.project_slice(
-        inputs.addresses,
-        inputs.sizes,
-        inputs.views,
-        inputs.blocks,
-        inputs.first_ids,
-        depths.view(np.uint32),
-        np.array(bins, np.int64),
-        tiles.open_sums(),
-        inputs.modes,
-        splats.records,
-        splats.rects,
-        splats.keys,
-        splats.found,
-        splats.counts,
-        cuts,
-        lights,
-    )
+        inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
+        depths.view(np.uint32), np.array(bins, np.int64), tiles.open_sums(), inputs.modes,
+        splats.records, splats.rects, splats.keys, splats.found, splats.counts, cuts, lights,
+    )  # fmt: skip
     return splats
 
 
@@ -423,18 +406,9 @@ class Tiles:
     ) -> None:
         """Blend every open tile's list; is_last closes them all."""
         blend_kernels.blend_tiles(
-            splats.records,
-            tile_splat_ids,
-            tile_offsets,
-            self.open,
-            self._states,
-            is_last,
-            self.size,
-            self.limits,
-            *self._images,
-            splats.cuts,
-            splats.lights,
-        )
+            splats.records, tile_splat_ids, tile_offsets, self.open, self._states, is_last,
+            self.size, self.limits, *self._images, splats.cuts, splats.lights,
+        )  # fmt: skip
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The lists of all splats and where each begins, however long they are."""

@@ -6,59 +6,13 @@ import math
 
 import numpy as np
 
+from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner
 from augment.render.cpu.simd import scalar_fmuladd
-from augment.render.layout import (
-    BLUE,
-    BLUNT_Y,
-    C_AT,
-    C_DOWN,
-    C_REACH,
-    C_RIGHT,
-    C_X,
-    C_Y,
-    CUT,
-    DEPTH,
-    FALL_X,
-    FALL_Y,
-    GREEN,
-    IS_SNOW,
-    LANES,
-    LEAN_X,
-    LEAN_Y,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RADIUS_Y,
-    RECORD,
-    RED,
-    SHARP_X,
-    SPLAT_ID,
-    STRIP,
-    TILE_H,
-    V_BLUR,
-    V_CENTRE,
-    V_CLIP_CAMERA,
-    V_CLIP_EDGE,
-    V_CLIP_EYE,
-    V_CLIP_FALL,
-    V_CLIP_LONGEST,
-    V_CLIP_PART,
-    V_CLIP_REACH,
-    V_EXTENT,
-    V_EYE,
-    V_FOCAL,
-    V_HIGH,
-    V_LOW,
-    V_PARALLEL,
-    V_ROTATION,
-    V_SUN,
-    V_WRAP,
-    U,
-)
+from augment.render.layout import CUT, LANES, RECORD, STRIP, TILE_H, U
 
-# ---- Numba functions: what a batch of splats asks for in a tile, row by row ----------------------
+# ---- What a batch of splats asks for in a tile, row by row ---------------------------------------
 # A tile is worked on in strips one register wide. The rows in which an ellipse meets a strip are an
 # interval (both are convex); they become a flat list of (row, splat) items, which one loop without
 # branches can blend.
@@ -75,27 +29,27 @@ def stage(
     n = U(BATCH)
     for k in range(count):
         record = U(tile_splat_ids[at + k]) * U(RECORD)
-        staged[U(MEAN_X) * n + k] = records[record + U(MEAN_X)] - left
-        staged[U(MEAN_Y) * n + k] = records[record + U(MEAN_Y)] - top
-        for field in range(U(LEAN_X), U(BLUNT_Y + 1)):
+        staged[U(L.MEAN_X) * n + k] = records[record + U(L.MEAN_X)] - left
+        staged[U(L.MEAN_Y) * n + k] = records[record + U(L.MEAN_Y)] - top
+        for field in range(U(L.LEAN_X), U(L.BLUNT_Y + 1)):
             staged[field * n + k] = records[record + field]
         if expected is not None or median is not None or mode is not None:
-            staged[U(DEPTH) * n + k] = records[record + U(DEPTH)]
+            staged[U(L.DEPTH) * n + k] = records[record + U(L.DEPTH)]
         if ids is not None:
-            staged[U(SPLAT_ID) * n + k] = records[record + U(SPLAT_ID)]
+            staged[U(L.SPLAT_ID) * n + k] = records[record + U(L.SPLAT_ID)]
         if snow is not None:
-            staged[U(IS_SNOW) * n + k] = records[record + U(IS_SNOW)]
+            staged[U(L.IS_SNOW) * n + k] = records[record + U(L.IS_SNOW)]
         if rgb is not None:
-            staged[U(RED) * n + k] = records[record + U(RED)]
-            staged[U(GREEN) * n + k] = records[record + U(GREEN)]
-            staged[U(BLUE) * n + k] = records[record + U(BLUE)]
+            staged[U(L.RED) * n + k] = records[record + U(L.RED)]
+            staged[U(L.GREEN) * n + k] = records[record + U(L.GREEN)]
+            staged[U(L.BLUE) * n + k] = records[record + U(L.BLUE)]
 
 
 @inner()
 def find_spans(staged, count, strip, rows, log_cut, spans):
     """Rows in which each ellipse meets the strip: first, and one past the last.
 
-    An ellipse is highest where its ridge says (LEAN_X RADIUS_Y from its mean), or, where that
+    An ellipse is highest where its ridge says (L.LEAN_X L.RADIUS_Y from its mean), or, where that
     column lies outside the strip, in the strip's nearest column.
     """
     zero, half = np.float32(0), np.float32(0.5)
@@ -105,10 +59,10 @@ def find_spans(staged, count, strip, rows, log_cut, spans):
     low, high = np.float32(rows[2 * strip]), np.float32(rows[2 * strip + 1])
     for k in range(count):
         mean_x, mean_y = staged[k], staged[n + k]
-        budget = staged[U(LOG_OPACITY) * n + k] - log_cut
-        top = staged[U(LEAN_X) * n + k] * staged[U(RADIUS_Y) * n + k]
-        fall, lean = staged[U(FALL_X) * n + k], staged[U(LEAN_Y) * n + k]
-        blunt = staged[U(BLUNT_Y) * n + k]
+        budget = staged[U(L.LOG_OPACITY) * n + k] - log_cut
+        top = staged[U(L.LEAN_X) * n + k] * staged[U(L.RADIUS_Y) * n + k]
+        fall, lean = staged[U(L.FALL_X) * n + k], staged[U(L.LEAN_Y) * n + k]
+        blunt = staged[U(L.BLUNT_Y) * n + k]
         d = min(max(top, west - mean_x), east - mean_x)
         left_over = scalar_fmuladd(-fall * d, d, budget)
         reach = math.sqrt(max(left_over, zero)) * blunt
@@ -135,11 +89,11 @@ def list_items(staged, count, strip, spans, values, places):
     first_x = np.float32(strip * LANES) + half
     for k in range(count):
         row, end = spans[k], spans[n + k]
-        sharp = staged[U(SHARP_X) * n + k]
-        fall = v8.splat(-staged[U(FALL_Y) * n + k])
-        peak = v8.splat(staged[U(LOG_OPACITY) * n + k])
+        sharp = staged[U(L.SHARP_X) * n + k]
+        fall = v8.splat(-staged[U(L.FALL_Y) * n + k])
+        peak = v8.splat(staged[U(L.LOG_OPACITY) * n + k])
         start = v8.splat(sharp * (first_x - staged[k]))
-        step = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
+        step = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
         y = np.float32(row) + half - staged[n + k]
         place = np.int32(strip * STRIP) + row * np.int32(LANES)
         for j in range(0, TILE_H, LANES):
@@ -165,9 +119,9 @@ def gather3(array, picked, at):
 def from_eye(means, picked, at, view):
     """Means minus the camera's centre, in the part's axes: first, so that digits are kept."""
     x, y, z = gather3(means, picked, at)
-    x = x - v8.splat(view[V_EYE]) - v8.splat(view[V_EYE + 3])
-    y = y - v8.splat(view[V_EYE + 1]) - v8.splat(view[V_EYE + 4])
-    z = z - v8.splat(view[V_EYE + 2]) - v8.splat(view[V_EYE + 5])
+    x = x - v8.splat(view[L.V_EYE]) - v8.splat(view[L.V_EYE + 3])
+    y = y - v8.splat(view[L.V_EYE + 1]) - v8.splat(view[L.V_EYE + 4])
+    z = z - v8.splat(view[L.V_EYE + 2]) - v8.splat(view[L.V_EYE + 5])
     return x, y, z
 
 
@@ -188,7 +142,7 @@ def cross(a, b, scale):
 
 @inner()
 def rotation_row(view, row):
-    at = U(V_ROTATION) + U(3) * row
+    at = U(L.V_ROTATION) + U(3) * row
     return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
 
 
@@ -204,14 +158,14 @@ def to_camera(d, view):
 def inverse_divisor(z, view):
     """1 over what x and y are divided by in the projection: z, or 1 where rays are parallel."""
     one = np.float32(1)
-    parallel = view[V_PARALLEL]
+    parallel = view[L.V_PARALLEL]
     return v8.splat(one) / v8.fmuladd(v8.splat(one - parallel), z, v8.splat(parallel))
 
 
 @inner()
 def to_image(x, y, inverse, view):
-    x = v8.fmuladd(v8.splat(view[V_FOCAL]) * x, inverse, v8.splat(view[V_CENTRE]))
-    return x, v8.fmuladd(v8.splat(view[V_FOCAL + 1]) * y, inverse, v8.splat(view[V_CENTRE + 1]))
+    x = v8.fmuladd(v8.splat(view[L.V_FOCAL]) * x, inverse, v8.splat(view[L.V_CENTRE]))
+    return x, v8.fmuladd(v8.splat(view[L.V_FOCAL + 1]) * y, inverse, v8.splat(view[L.V_CENTRE + 1]))
 
 
 @inner()
@@ -220,9 +174,11 @@ def semi_axes(quats, scales, picked, at, x, y, inverse, view):
     scales (3), the Jacobian's rows times the view's rotation (3 and 3), the rotations (9).
     """
     r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
-    u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[V_LOW])), v8.splat(view[V_HIGH]))
-    v = v8.minimum(v8.maximum(y * inverse, v8.splat(view[V_LOW + 1])), v8.splat(view[V_HIGH + 1]))
-    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
+    u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[L.V_LOW])), v8.splat(view[L.V_HIGH]))
+    v = v8.minimum(
+        v8.maximum(y * inverse, v8.splat(view[L.V_LOW + 1])), v8.splat(view[L.V_HIGH + 1])
+    )
+    fx, fy = v8.splat(view[L.V_FOCAL]) * inverse, v8.splat(view[L.V_FOCAL + 1]) * inverse
     jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
     jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
     m = rotation_from_quats(quats, picked, at)
@@ -252,7 +208,7 @@ def image_covariance(quats, scales, picked, at, x, y, inverse, view):
         dot(y0, y1, y2, y0, y1, y2),
     )
     # Lagrange's identity, det = |x cross y|^2, each term divided before it is squared.
-    scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[V_BLUR]))
+    scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[L.V_BLUR]))
     c0, c1, c2 = cross(right, down, scale)
     return xx, xy, yy, dot(c0, c1, c2, c0, c1, c2)
 
@@ -276,9 +232,7 @@ def rotation_from_quats(quats, picked, at):
     )
 
 
-# --------------------------------------------------------------------------------------------------
-# Numba functions: splats cut at a height (see augment.render.layout for the geometry, layout for
-# what is stored of it).
+# ---- Splats cut at a height (see augment.render.layout) ------------------------------------------
 
 SHARE, SURFACE = 0, 3 * BATCH  # where a batch's lines of each kind begin: value, slope in x and y
 REACHES = 6 * BATCH
@@ -291,9 +245,9 @@ _SHARP = np.float32(0.003)  # augment.render.layout.SHARP_PX2
 @inner()
 def height_of(d, view):
     """How far the kept side of the plane means lie. d: from the eye, in the part's axes."""
-    up = V_CLIP_PART
+    up = L.V_CLIP_PART
     rise = dot(v8.splat(view[up]), v8.splat(view[up + 1]), v8.splat(view[up + 2]), d[0], d[1], d[2])
-    return rise + v8.splat(view[V_CLIP_EYE])
+    return rise + v8.splat(view[L.V_CLIP_EYE])
 
 
 @inner()
@@ -302,9 +256,9 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
     right, down, sizes, _, _, m = semi_axes(quats, scales, picked, at, x, y, inverse, view)
     up0, up1, up2 = (
-        v8.splat(view[V_CLIP_PART]),
-        v8.splat(view[V_CLIP_PART + 1]),
-        v8.splat(view[V_CLIP_PART + 2]),
+        v8.splat(view[L.V_CLIP_PART]),
+        v8.splat(view[L.V_CLIP_PART + 1]),
+        v8.splat(view[L.V_CLIP_PART + 2]),
     )
     t = rotation_row(view, U(2))
     rise0 = sizes[0] * dot(up0, up1, up2, m[0], m[3], m[6])
@@ -315,13 +269,13 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     away2 = sizes[2] * dot(t[0], t[1], t[2], m[2], m[5], m[8])
     height = height_of(d, view)
     sigma = v8.sqrt(dot(rise0, rise1, rise2, rise0, rise1, rise2))
-    reach = v8.splat(view[V_EXTENT]) * sigma
+    reach = v8.splat(view[L.V_EXTENT]) * sigma
 
     gx, gy = _depth_slope(right, down, (away0, away1, away2))
 
-    fall = v8.splat(view[V_CLIP_FALL]) * inverse * inverse
-    lx = v8.splat(view[V_CLIP_CAMERA] / view[V_FOCAL]) - fall * gx
-    ly = v8.splat(view[V_CLIP_CAMERA + 1] / view[V_FOCAL + 1]) - fall * gy
+    fall = v8.splat(view[L.V_CLIP_FALL]) * inverse * inverse
+    lx = v8.splat(view[L.V_CLIP_CAMERA] / view[L.V_FOCAL]) - fall * gx
+    ly = v8.splat(view[L.V_CLIP_CAMERA + 1] / view[L.V_FOCAL + 1]) - fall * gy
     slope = v8.sqrt(v8.fmuladd(lx, lx, ly * ly))
     scale = one / v8.maximum(slope, v8.splat(_TINY))
     far = v8.splat(_FAR)
@@ -331,11 +285,12 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     lx = v8.select(whole, zero, lx * scale)
     ly = v8.select(whole, zero, ly * scale)
     deep = v8.sqrt(dot(away0, away1, away2, away0, away1, away2)) * inverse
-    deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(view[V_CLIP_LONGEST]))
+    deep = v8.minimum(v8.splat(view[L.V_EXTENT]) * deep, v8.splat(view[L.V_CLIP_LONGEST]))
     partly = v8.both(
-        v8.at_least(height + reach, zero), v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach)
+        v8.at_least(height + reach, zero),
+        v8.at_least(v8.splat(view[L.V_CLIP_REACH]), height - reach),
     )
-    return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
+    return partly, offset + v8.splat(view[L.V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
 
 
 @inner()
@@ -379,18 +334,18 @@ def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
     n, any_cut = U(BATCH), False
     for k in range(count):
         cut = U(tile_splat_ids[at + k]) * U(CUT)
-        x, y = staged[U(MEAN_X) * n + k], staged[U(MEAN_Y) * n + k]
-        lx, ly = cuts[cut + U(C_X)], cuts[cut + U(C_Y)]
-        lines[k] = cuts[cut + U(C_AT)] - lx * x - ly * y
+        x, y = staged[U(L.MEAN_X) * n + k], staged[U(L.MEAN_Y) * n + k]
+        lx, ly = cuts[cut + U(L.C_X)], cuts[cut + U(L.C_Y)]
+        lines[k] = cuts[cut + U(L.C_AT)] - lx * x - ly * y
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
         any_cut = any_cut or lx != np.float32(0) or ly != np.float32(0)
         if expected is not None or mode is not None:
-            gx, gy = cuts[cut + U(C_RIGHT)], cuts[cut + U(C_DOWN)]
+            gx, gy = cuts[cut + U(L.C_RIGHT)], cuts[cut + U(L.C_DOWN)]
             lines[U(3) * n + k] = -gx * x - gy * y
             lines[U(4) * n + k] = gx
             lines[U(5) * n + k] = gy
-            lines[U(6) * n + k] = cuts[cut + U(C_REACH)]
+            lines[U(6) * n + k] = cuts[cut + U(L.C_REACH)]
     return any_cut
 
 
@@ -436,9 +391,8 @@ def kept_share(lines, values, splat, item):
     return v8.maximum(v8.minimum(value, one), zero)
 
 
-# --------------------------------------------------------------------------------------------------
-# Numba functions: light by the normal of every pixel of a splat (see augment.render.shading). A
-# splat's lights are LINES float32, as there; all 0 for a splat of one colour.
+# ---- Light by the normal of every pixel of a splat (see augment.render.shading) ------------------
+# A splat's lights are SHADING_LINES float32, as there; all 0 for a splat of one colour.
 
 SHADING_LINES = 9
 L_FACING, L_X, L_Y, L_WRAP, L_LEAN_X, L_LEAN_Y, L_RED, L_GREEN, L_BLUE = range(SHADING_LINES)
@@ -458,16 +412,16 @@ def light_eight(m, towards, view):
     nx = v8.select(is_back, v8.negate(nx), nx)
     ny = v8.select(is_back, v8.negate(ny), ny)
     nz = v8.select(is_back, v8.negate(nz), nz)
-    sx, sy, sz = v8.splat(view[V_SUN]), v8.splat(view[V_SUN + 1]), v8.splat(view[V_SUN + 2])
+    sx, sy, sz = v8.splat(view[L.V_SUN]), v8.splat(view[L.V_SUN + 1]), v8.splat(view[L.V_SUN + 2])
     inverse = one / v8.maximum(v8.negate(nz), v8.splat(_MIN_FACING))
     ax, ay = nx * inverse, ny * inverse
-    fx, fy = v8.splat(view[V_FOCAL]), v8.splat(view[V_FOCAL + 1])
-    scale = one / (one + v8.splat(view[V_WRAP]))
+    fx, fy = v8.splat(view[L.V_FOCAL]), v8.splat(view[L.V_FOCAL + 1])
+    scale = one / (one + v8.splat(view[L.V_WRAP]))
     return (
         dot(nx, ny, nz, sx, sy, sz) * scale,
         v8.fmuladd(sz, ax, sx) / fx * scale,
         v8.fmuladd(sz, ay, sy) / fy * scale,
-        v8.splat(view[V_WRAP]) * scale,
+        v8.splat(view[L.V_WRAP]) * scale,
         ax / fx,
         ay / fy,
     )
@@ -500,12 +454,12 @@ def light_share(lit, staged, values, splat, item, at, limits):
     """
     n, zero, one = U(BATCH), v8.splat(np.float32(0)), v8.splat(np.float32(1))
     half = np.float32(0.5)
-    left = np.float32(at // U(STRIP) * U(LANES)) + half - staged[U(MEAN_X) * n + splat]
-    down = np.float32(at % U(STRIP) // U(LANES)) + half - staged[U(MEAN_Y) * n + splat]
+    left = np.float32(at // U(STRIP) * U(LANES)) + half - staged[U(L.MEAN_X) * n + splat]
+    down = np.float32(at % U(STRIP) // U(LANES)) + half - staged[U(L.MEAN_Y) * n + splat]
     x, y = v8.lane_numbers() + v8.splat(left), v8.splat(down)
     # Squared distance from the mean, of that at which alpha is cut off: from the log of alpha.
-    peak = staged[U(LOG_OPACITY) * n + splat]
-    off = v8.splat(staged[U(SHARP_X) * n + splat])
+    peak = staged[U(L.LOG_OPACITY) * n + splat]
+    off = v8.splat(staged[U(L.SHARP_X) * n + splat])
     off = v8.fmuladd(off, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
     e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
     rim = (v8.splat(peak) - e) / v8.splat(max(peak - limits[1], _TINY))

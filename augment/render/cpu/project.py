@@ -13,15 +13,9 @@ import numpy as np
 from numba import prange
 
 from augment.effects.smog import MAX_EXPONENT
+from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.geometry import (
-    C_AT,
-    C_DOWN,
-    C_REACH,
-    C_RIGHT,
-    C_X,
-    C_Y,
-    CUT,
     L_FACING,
     L_LEAN_X,
     L_LEAN_Y,
@@ -44,73 +38,14 @@ from augment.render.cpu.geometry import (
 )
 from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
-from augment.render.layout import (
-    A_MAPS,
-    A_MEANS,
-    A_OPACITIES,
-    A_QUATS,
-    A_ROWS,
-    A_SCALES,
-    A_SH,
-    A_SLOPES,
-    BIN_SHIFT,
-    BLOCK,
-    BLUE,
-    BLUNT_Y,
-    DEPTH,
-    FALL_X,
-    FALL_Y,
-    GREEN,
-    IS_SNOW,
-    LANES,
-    LAYERED_SMOG,
-    LEAN_X,
-    LEAN_Y,
-    LOG_OPACITY,
-    M_ANTIALIASED,
-    M_CLIP,
-    M_COLOR,
-    M_FUNCTIONS,
-    M_LIGHT,
-    M_SMOG,
-    MAP,
-    MEAN_X,
-    MEAN_Y,
-    NO_SMOG,
-    RADIUS_Y,
-    RECORD,
-    RED,
-    SHARP_X,
-    SPLAT_ID,
-    TILE_H,
-    TILE_W,
-    V_AIRLIGHT,
-    V_ALPHA_MIN,
-    V_BLUR,
-    V_CLIP_REACH,
-    V_EXTENT,
-    V_EYE_HEIGHT,
-    V_FOCAL,
-    V_GAIN,
-    V_LIT,
-    V_LOG_CUT,
-    V_MAPS,
-    V_NEAR,
-    V_PARALLEL,
-    V_RADIUS_CLIP,
-    V_SIGMA,
-    V_SIZE,
-    V_SNOW,
-    V_UP,
-    U,
-)
+from augment.render.layout import BIN_SHIFT, BLOCK, CUT, LANES, MAP, RECORD, TILE_H, TILE_W, U
 
 # ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog -----
 # Eight splats at a time for what depends on the direction alone (`prepare_colors`), one at a time
 # for the sum over its coefficients (`write_color`), which are read where they lie in the scene.
 
 MAX_FUNCTIONS = 16
-THROUGH = MAX_FUNCTIONS  # row of the smog's transmittance, after those of the SH functions
+TRANSMITTANCE = MAX_FUNCTIONS  # row of the smog's transmittance, after those of the SH functions
 COLOR_ROWS = MAX_FUNCTIONS + 1
 
 _C0 = np.float32(math.sqrt(1 / (4 * math.pi)))
@@ -134,13 +69,13 @@ def prepare_colors(dx, dy, dz, view, functions, smog, rows):
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     inverse = v8.splat(np.float32(1)) / distance
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
-    if smog != NO_SMOG:
-        tau = v8.splat(view[V_SIGMA]) * distance
-        if smog == LAYERED_SMOG:
+    if smog != L.NO_SMOG:
+        tau = v8.splat(view[L.V_SIGMA]) * distance
+        if smog == L.LAYERED_SMOG:
             tau = tau * _layered_density(dx, dy, dz, view)
         lowest = v8.splat(np.float32(-126))  # 1e-38: nothing is seen through it
         transmittance = exp2_fine(v8.maximum(tau * v8.splat(-LOG2_E), lowest))
-        v8.store(rows, U(THROUGH * LANES), transmittance)
+        v8.store(rows, U(TRANSMITTANCE * LANES), transmittance)
 
 
 @inner()
@@ -150,11 +85,11 @@ def _layered_density(dx, dy, dz, view):
     a, b: heights of eye and splat in scale heights, x = |b - a|; see weather.smog.
     """
     one, zero = v8.splat(np.float32(1)), v8.splat(np.float32(0))
-    up = v8.splat(view[V_UP + 2]) * dz
-    up = v8.fmuladd(v8.splat(view[V_UP + 1]), dy, up)
-    up = v8.fmuladd(v8.splat(view[V_UP]), dx, up)
+    up = v8.splat(view[L.V_UP + 2]) * dz
+    up = v8.fmuladd(v8.splat(view[L.V_UP + 1]), dy, up)
+    up = v8.fmuladd(v8.splat(view[L.V_UP]), dx, up)
     x = v8.maximum(up, v8.negate(up))
-    lowest = v8.splat(view[V_EYE_HEIGHT]) + v8.minimum(up, zero)
+    lowest = v8.splat(view[L.V_EYE_HEIGHT]) + v8.minimum(up, zero)
     fade = exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(np.float32(-126))))
     series = v8.fmuladd(x, v8.splat(np.float32(1 / 120)), v8.splat(np.float32(-1 / 24)))
     series = v8.fmuladd(x, series, v8.splat(np.float32(1 / 6)))
@@ -215,15 +150,15 @@ def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records
         mapped_g = _map_channel(maps, U(at_map) + U(4), r, g, b)
         b = _map_channel(maps, U(at_map) + U(8), r, g, b)
         r, g = mapped_r, mapped_g
-    if smog != NO_SMOG:
-        t = rows[U(THROUGH * LANES) + lane]
+    if smog != L.NO_SMOG:
+        t = rows[U(TRANSMITTANCE * LANES) + lane]
         hidden = np.float32(1) - t
-        r = scalar_fmuladd(t, r, hidden * view[V_AIRLIGHT])
-        g = scalar_fmuladd(t, g, hidden * view[V_AIRLIGHT + 1])
-        b = scalar_fmuladd(t, b, hidden * view[V_AIRLIGHT + 2])
-    records[slot + U(RED)] = r
-    records[slot + U(GREEN)] = g
-    records[slot + U(BLUE)] = b
+        r = scalar_fmuladd(t, r, hidden * view[L.V_AIRLIGHT])
+        g = scalar_fmuladd(t, g, hidden * view[L.V_AIRLIGHT + 1])
+        b = scalar_fmuladd(t, b, hidden * view[L.V_AIRLIGHT + 2])
+    records[slot + U(L.RED)] = r
+    records[slot + U(L.GREEN)] = g
+    records[slot + U(L.BLUE)] = b
 
 
 @inner()
@@ -275,10 +210,9 @@ def add_direction_slopes(x, y, z, functions, rows):
 
 
 # Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
-_COLOR = 0
 _X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
 _FIELDS = COLOR_ROWS + 4
-_CUTS = _FIELDS + DEPTH + 1
+_CUTS = _FIELDS + L.DEPTH + 1
 _LIGHTS = _CUTS + CUT
 _ROWS = _LIGHTS + SHADING_LINES
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
@@ -303,9 +237,9 @@ def rank_splats(addresses, sizes, views, blocks, depths, histograms):
         for block in range(total * run // runs, total * (run + 1) // runs):
             part, first, last = blocks[block]
             count = sizes[part, 0]
-            means = floats_at(addresses[part, A_MEANS], count * 3)
-            scales = floats_at(addresses[part, A_SCALES], count * 3)
-            opacities = floats_at(addresses[part, A_OPACITIES], count)
+            means = floats_at(addresses[part, L.A_MEANS], count * 3)
+            scales = floats_at(addresses[part, L.A_SCALES], count * 3)
+            opacities = floats_at(addresses[part, L.A_OPACITIES], count)
             at = block * BLOCK
             for group in range(first, last, LANES):
                 for lane in range(LANES):
@@ -332,26 +266,27 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     # No direction of an ellipsoid is longer than its longest axis, and no blur wider than 2 px.
     longest = v8.maximum(s0, v8.maximum(s1, s2))
     reach = longest * inverse
-    far_x = v8.fmuladd(v8.splat(view[V_GAIN]), reach, two)
-    far_y = v8.fmuladd(v8.splat(view[V_GAIN + 1]), reach, two)
+    far_x = v8.fmuladd(v8.splat(view[L.V_GAIN]), reach, two)
+    far_y = v8.fmuladd(v8.splat(view[L.V_GAIN + 1]), reach, two)
     seen = v8.both(
-        v8.at_least(z, v8.splat(view[V_NEAR])), v8.at_least(opacity, v8.splat(view[V_ALPHA_MIN]))
+        v8.at_least(z, v8.splat(view[L.V_NEAR])),
+        v8.at_least(opacity, v8.splat(view[L.V_ALPHA_MIN])),
     )
     seen = v8.both(seen, v8.at_least(x + far_x, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE]) - x + far_x, zero))
+    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE]) - x + far_x, zero))
     seen = v8.both(seen, v8.at_least(y + far_y, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE + 1]) - y + far_y, zero))
-    height, size = height_of(d, view), v8.splat(view[V_EXTENT]) * longest
+    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE + 1]) - y + far_y, zero))
+    height, size = height_of(d, view), v8.splat(view[L.V_EXTENT]) * longest
     seen = v8.both(seen, v8.at_least(height + size, zero))
-    seen = v8.both(seen, v8.at_least(v8.splat(view[V_CLIP_REACH]), height - size))
-    if view[V_RADIUS_CLIP] > np.float32(0):
+    seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_CLIP_REACH]), height - size))
+    if view[L.V_RADIUS_CLIP] > np.float32(0):
         seen = v8.both(seen, _may_exceed_clip(opacity, reach, view))
     v8.store(depths, at, v8.select(seen, z, zero))
     # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
     squares = s0 * s1 + s1 * s2 + s0 * s2
-    focal = v8.splat(view[V_FOCAL] * view[V_FOCAL + 1] * np.float32(2 * math.pi / 3))
+    focal = v8.splat(view[L.V_FOCAL] * view[L.V_FOCAL + 1] * np.float32(2 * math.pi / 3))
     area = v8.fmuladd(focal * squares, inverse * inverse, two) * opacity
-    v8.store(areas, U(0), v8.minimum(area, v8.splat(view[V_SIZE] * view[V_SIZE + 1])))
+    v8.store(areas, U(0), v8.minimum(area, v8.splat(view[L.V_SIZE] * view[L.V_SIZE + 1])))
 
 
 @inner()
@@ -363,33 +298,21 @@ def _may_exceed_clip(opacity, reach, view):
     thousand times what rounding may take off.
     """
     k = v8.splat(np.float32(0.5) * LOG2_E)
-    budget = v8.maximum(log2(opacity) - v8.splat(view[V_LOG_CUT]), v8.splat(np.float32(0))) / k
-    gain = max(view[V_GAIN], view[V_GAIN + 1]) / view[V_EXTENT]
+    budget = v8.maximum(log2(opacity) - v8.splat(view[L.V_LOG_CUT]), v8.splat(np.float32(0))) / k
+    gain = max(view[L.V_GAIN], view[L.V_GAIN + 1]) / view[L.V_EXTENT]
     axis = v8.splat(gain) * reach
-    square = (budget + v8.splat(np.float32(1e-3))) * v8.fmuladd(axis, axis, v8.splat(view[V_BLUR]))
-    clip = view[V_RADIUS_CLIP]
+    square = (budget + v8.splat(np.float32(1e-3))) * v8.fmuladd(
+        axis, axis, v8.splat(view[L.V_BLUR])
+    )
+    clip = view[L.V_RADIUS_CLIP]
     return v8.greater(square, v8.splat(clip * clip * np.float32(1 - 1e-3)))
 
 
 @kernel
 def project_slice(
-    addresses,
-    sizes,
-    views,
-    blocks,
-    first_ids,
-    depth_bits,
-    bins,
-    open_sums,
-    modes,
-    records,
-    rects,
-    keys,
-    found,
-    counts,
-    cuts,
-    lights,
-):
+    addresses, sizes, views, blocks, first_ids, depth_bits, bins, open_sums, modes, records, rects,
+    keys, found, counts, cuts, lights,
+):  # fmt: skip
     """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
     Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
@@ -406,16 +329,18 @@ def project_slice(
         base = block * BLOCK
         taken = _pick_bins(depth_bits, base, first, last, bins, picked)
         count, functions = sizes[part]
-        means = floats_at(addresses[part, A_MEANS], count * 3)
-        quats = floats_at(addresses[part, A_QUATS], count * 4)
-        scales = floats_at(addresses[part, A_SCALES], count * 3)
-        opacities = floats_at(addresses[part, A_OPACITIES], count)
-        sh = floats_at(addresses[part, A_SH], count * functions * 3)
-        slopes = floats_at(addresses[part, A_SLOPES], count * 3 if views[part, V_LIT] > 0 else 1)
-        map_count = np.int64(views[part, V_MAPS])
-        maps = floats_at(addresses[part, A_MAPS], max(map_count, 1) * MAP)
-        map_rows = shorts_at(addresses[part, A_ROWS], count if map_count > 1 else 1)
-        used = min(modes[M_FUNCTIONS], functions)
+        means = floats_at(addresses[part, L.A_MEANS], count * 3)
+        quats = floats_at(addresses[part, L.A_QUATS], count * 4)
+        scales = floats_at(addresses[part, L.A_SCALES], count * 3)
+        opacities = floats_at(addresses[part, L.A_OPACITIES], count)
+        sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
+        slopes = floats_at(
+            addresses[part, L.A_SLOPES], count * 3 if views[part, L.V_LIT] > 0 else 1
+        )
+        map_count = np.int64(views[part, L.V_MAPS])
+        maps = floats_at(addresses[part, L.A_MAPS], max(map_count, 1) * MAP)
+        map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
+        used = min(modes[L.M_FUNCTIONS], functions)
         slot = U(base)
         for at in range(U(0), U(taken), U(LANES)):
             _project_eight(
@@ -427,22 +352,22 @@ def project_slice(
                 splat = picked[at + lane]
                 record = slot * U(RECORD)
                 _write_record(rows, lane, first_ids[part] + splat, records, record)
-                records[record + U(IS_SNOW)] = views[part, V_SNOW]
-                if modes[M_COLOR]:
+                records[record + U(L.IS_SNOW)] = views[part, L.V_SNOW]
+                if modes[L.M_COLOR]:
                     from_sh = U(splat) * U(functions * 3)
                     at_map = _map_of(map_rows, splat, map_count)
                     write_color(
-                        sh, from_sh, used, maps, at_map, views[part], modes[M_SMOG], rows, lane,
+                        sh, from_sh, used, maps, at_map, views[part], modes[L.M_SMOG], rows, lane,
                         records, record,
                     )  # fmt: skip
-                if modes[M_CLIP]:
-                    for field in range(U(C_REACH + 1)):
+                if modes[L.M_CLIP]:
+                    for field in range(U(L.C_REACH + 1)):
                         cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
-                if modes[M_LIGHT]:
+                if modes[L.M_LIGHT]:
                     _write_lights(
-                        slopes, splat, modes[M_SMOG], views[part], rows, lane, lights, slot
+                        slopes, splat, modes[L.M_SMOG], views[part], rows, lane, lights, slot
                     )
-                keys[slot] = np.float32(records[record + U(DEPTH)]).view(np.uint32)
+                keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
                 slot += U(1)
         found[block] = slot - U(base)
         for z_bin in range(counts.shape[1]):
@@ -494,23 +419,23 @@ def _touches_open(rows, lane, open_sums, rects, slot):
 
 @inner()
 def _write_record(rows, lane, number, records, record):
-    for field in range(U(DEPTH + 1)):
+    for field in range(U(L.DEPTH + 1)):
         records[record + field] = rows[(U(_FIELDS) + field) * U(LANES) + lane]
-    records[record + U(SPLAT_ID)] = np.int32(number).view(np.float32)
+    records[record + U(L.SPLAT_ID)] = np.int32(number).view(np.float32)
 
 
 @inner()
 def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
     first = slot * U(SHADING_LINES)
-    if not view[V_LIT] > np.float32(0):
+    if not view[L.V_LIT] > np.float32(0):
         for line in range(U(SHADING_LINES)):
             lights[first + line] = np.float32(0)
         return
     for line in range(U(L_RED)):
         lights[first + line] = rows[(U(_LIGHTS) + line) * U(LANES) + lane]
     transmittance = np.float32(1)
-    if smog != NO_SMOG:
-        transmittance = rows[U(THROUGH * LANES) + lane]
+    if smog != L.NO_SMOG:
+        transmittance = rows[U(TRANSMITTANCE * LANES) + lane]
     for channel in range(U(3)):
         slope = slopes[U(splat) * U(3) + channel]
         lights[first + U(L_RED) + channel] = transmittance * slope
@@ -520,23 +445,23 @@ def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
 def _project_eight(means, quats, scales, opacities, view, picked, at, functions, modes, rows):
     """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
     d = from_eye(means, picked, at, view)
-    if modes[M_COLOR]:
-        towards = rotation_row(view, U(2)) if view[V_PARALLEL] > 0 else d
-        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[M_SMOG], rows)
+    if modes[L.M_COLOR]:
+        towards = rotation_row(view, U(2)) if view[L.V_PARALLEL] > 0 else d
+        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[L.M_SMOG], rows)
     x, y, z = to_camera(d, view)
     inverse = inverse_divisor(z, view)
     xx, xy, yy, minors = image_covariance(quats, scales, picked, at, x, y, inverse, view)
 
     one, half = v8.splat(np.float32(1)), v8.splat(np.float32(0.5))
-    blur, k = v8.splat(view[V_BLUR]), v8.splat(np.float32(0.5) * LOG2_E)
+    blur, k = v8.splat(view[L.V_BLUR]), v8.splat(np.float32(0.5) * LOG2_E)
     blurred_x, blurred_y = xx + blur, yy + blur
     inverse_y, inverse_x = one / blurred_y, one / blurred_x
     # Variance along a row, det / yy. minors = det / yy before the blur, so nothing overflows.
     along = blur + v8.fmuladd(blur * xx, inverse_y, minors)
     log_opacity = log2(v8.gather(opacities, picked, at, U(1), U(0)))
-    if modes[M_ANTIALIASED]:
+    if modes[L.M_ANTIALIASED]:
         log_opacity = v8.fmuladd(half, log2(minors / along), log_opacity)
-    log_cut = v8.splat(view[V_LOG_CUT])
+    log_cut = v8.splat(view[L.V_LOG_CUT])
     budget = v8.maximum(log_opacity - log_cut, v8.splat(np.float32(0))) / k
     radius_x, radius_y = v8.sqrt(budget * blurred_x), v8.sqrt(budget * blurred_y)
 
@@ -545,21 +470,21 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
     larger = v8.maximum(radius_x, radius_y)
-    drawn = v8.both(drawn, v8.greater(larger, v8.splat(view[V_RADIUS_CLIP])))
-    if modes[M_CLIP]:
+    drawn = v8.both(drawn, v8.greater(larger, v8.splat(view[L.V_RADIUS_CLIP])))
+    if modes[L.M_CLIP]:
         partly, offset, lx, ly, gx, gy, deep = cut_eight(
             quats, scales, picked, at, d, x, y, inverse, view
         )
         drawn = v8.both(drawn, partly)
-        v8.store(rows, U((_CUTS + C_AT) * LANES), offset)
-        v8.store(rows, U((_CUTS + C_X) * LANES), lx)
-        v8.store(rows, U((_CUTS + C_Y) * LANES), ly)
-        v8.store(rows, U((_CUTS + C_RIGHT) * LANES), gx)
-        v8.store(rows, U((_CUTS + C_DOWN) * LANES), gy)
-        v8.store(rows, U((_CUTS + C_REACH) * LANES), deep)
-    if modes[M_LIGHT] and view[V_LIT] > np.float32(0):
+        v8.store(rows, U((_CUTS + L.C_AT) * LANES), offset)
+        v8.store(rows, U((_CUTS + L.C_X) * LANES), lx)
+        v8.store(rows, U((_CUTS + L.C_Y) * LANES), ly)
+        v8.store(rows, U((_CUTS + L.C_RIGHT) * LANES), gx)
+        v8.store(rows, U((_CUTS + L.C_DOWN) * LANES), gy)
+        v8.store(rows, U((_CUTS + L.C_REACH) * LANES), deep)
+    if modes[L.M_LIGHT] and view[L.V_LIT] > np.float32(0):
         zero = v8.splat(np.float32(0))
-        ray = (zero, zero, one) if view[V_PARALLEL] > 0 else (x, y, z)
+        ray = (zero, zero, one) if view[L.V_PARALLEL] > 0 else (x, y, z)
         lines = light_eight(rotation_from_quats(quats, picked, at), ray, view)
         v8.store(rows, U((_LIGHTS + L_FACING) * LANES), lines[0])
         v8.store(rows, U((_LIGHTS + L_X) * LANES), lines[1])
@@ -567,19 +492,19 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
         v8.store(rows, U((_LIGHTS + L_WRAP) * LANES), lines[3])
         v8.store(rows, U((_LIGHTS + L_LEAN_X) * LANES), lines[4])
         v8.store(rows, U((_LIGHTS + L_LEAN_Y) * LANES), lines[5])
-    _write_box(mean_x, radius_x, v8.splat(view[V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
-    _write_box(mean_y, radius_y, v8.splat(view[V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
-    _write(rows, U(MEAN_X), mean_x)
-    _write(rows, U(MEAN_Y), mean_y)
-    _write(rows, U(LEAN_X), xy * inverse_y)
-    _write(rows, U(SHARP_X), v8.sqrt(k / along))
-    _write(rows, U(FALL_Y), k * inverse_y)
-    _write(rows, U(LOG_OPACITY), log_opacity)
-    _write(rows, U(RADIUS_Y), radius_y)
-    _write(rows, U(FALL_X), k * inverse_x)
-    _write(rows, U(LEAN_Y), xy * inverse_x)
-    _write(rows, U(BLUNT_Y), v8.sqrt(along * blurred_y * inverse_x / k))
-    _write(rows, U(DEPTH), z)
+    _write_box(mean_x, radius_x, v8.splat(view[L.V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
+    _write_box(mean_y, radius_y, v8.splat(view[L.V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
+    _write(rows, U(L.MEAN_X), mean_x)
+    _write(rows, U(L.MEAN_Y), mean_y)
+    _write(rows, U(L.LEAN_X), xy * inverse_y)
+    _write(rows, U(L.SHARP_X), v8.sqrt(k / along))
+    _write(rows, U(L.FALL_Y), k * inverse_y)
+    _write(rows, U(L.LOG_OPACITY), log_opacity)
+    _write(rows, U(L.RADIUS_Y), radius_y)
+    _write(rows, U(L.FALL_X), k * inverse_x)
+    _write(rows, U(L.LEAN_Y), xy * inverse_x)
+    _write(rows, U(L.BLUNT_Y), v8.sqrt(along * blurred_y * inverse_x / k))
+    _write(rows, U(L.DEPTH), z)
 
 
 @inner()

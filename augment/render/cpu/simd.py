@@ -9,6 +9,7 @@ Indices are uint64 into flat contiguous arrays; nothing checks them.
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 
@@ -152,187 +153,92 @@ def gather(typingctx, array, rows, first, stride, column):
     return float8(array, rows, types.uint64, types.uint64, types.uint64), codegen
 
 
-@intrinsic
-def splat(typingctx, value):
-    """The same number in all lanes."""
+def _operation(result, *kinds):
+    """Makes a function for kernels of emit(builder, *values), which writes its instructions."""
 
-    def codegen(context, builder, sig, args):
-        return _broadcast(builder, args[0], _F8)
+    def wrap(emit):
+        def codegen(context, builder, sig, args):
+            return emit(builder, *args)
 
-    return float8(types.float32), codegen
+        def define(typingctx, *values):
+            return result(*kinds), codegen
 
+        names = ("typingctx", *"abcdefgh"[: len(kinds)])
+        define.__name__ = emit.__name__
+        define.__signature__ = inspect.Signature(
+            [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+        )
+        return intrinsic(define)
 
-@intrinsic
-def lane_numbers(typingctx):
-    """0, 1, ... 7."""
-
-    def codegen(context, builder, sig, args):
-        return ir.Constant(_F8, [float(lane) for lane in range(LANES)])
-
-    return float8(), codegen
-
-
-@intrinsic
-def fmuladd(typingctx, a, b, c):
-    """a b + c, rounded once."""
-
-    def codegen(context, builder, sig, args):
-        return _call(builder, "fmuladd", args)
-
-    return float8(float8, float8, float8), codegen
+    return wrap
 
 
-@intrinsic
-def sqrt(typingctx, a):
-    def codegen(context, builder, sig, args):
-        return _call(builder, "sqrt", args)
+_unary, _binary = _operation(float8, float8), _operation(float8, float8, float8)
+_ternary, _comparison = _operation(float8, *[float8] * 3), _operation(mask8, float8, float8)
 
-    return float8(float8), codegen
-
-
-@intrinsic
-def floor(typingctx, a):
-    def codegen(context, builder, sig, args):
-        return _call(builder, "floor", args)
-
-    return float8(float8), codegen
-
-
-@intrinsic
-def negate(typingctx, a):
-    def codegen(context, builder, sig, args):
-        return builder.fneg(args[0])
-
-    return float8(float8), codegen
+# The same number in all lanes; 0, 1, ... 7; a b + c, rounded once.
+splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, _F8))
+lane_numbers = _operation(float8)(lambda b: ir.Constant(_F8, [float(i) for i in range(LANES)]))
+fmuladd = _ternary(lambda b, *args: _call(b, "fmuladd", args))
+sqrt = _unary(lambda b, value: _call(b, "sqrt", [value]))
+floor = _unary(lambda b, value: _call(b, "floor", [value]))
+negate = _unary(lambda b, value: b.fneg(value))
+# a where a < b (a > b), else b, so b where a is NaN.
+minimum = _binary(lambda b, *args: b.select(b.fcmp_ordered("<", *args), *args))
+maximum = _binary(lambda b, *args: b.select(b.fcmp_ordered(">", *args), *args))
+# Lanes where a > b, or a >= b; never where either is NaN. Lanes that are in both masks.
+greater = _comparison(lambda b, *args: b.fcmp_ordered(">", *args))
+at_least = _comparison(lambda b, *args: b.fcmp_ordered(">=", *args))
+both = _operation(mask8, mask8, mask8)(lambda b, *masks: b.and_(*masks))
+# a in the lanes of the mask, b in the others: select(mask, a, b).
+select = _operation(float8, mask8, float8, float8)(lambda b, *args: b.select(*args))
 
 
-@intrinsic
-def minus_abs(typingctx, a):
+@_unary
+def minus_abs(builder, value):
     """-|a|: a with its sign bit set."""
-
-    def codegen(context, builder, sig, args):
-        bits = builder.or_(builder.bitcast(args[0], _I8), _all(-(2**31)))
-        return builder.bitcast(bits, _F8)
-
-    return float8(float8), codegen
+    return builder.bitcast(builder.or_(builder.bitcast(value, _I8), _all(-(2**31))), _F8)
 
 
-@intrinsic
-def absolute(typingctx, a):
+@_unary
+def absolute(builder, value):
     """|a|: a with its sign bit clear."""
-
-    def codegen(context, builder, sig, args):
-        bits = builder.and_(builder.bitcast(args[0], _I8), _all(2**31 - 1))
-        return builder.bitcast(bits, _F8)
-
-    return float8(float8), codegen
+    return builder.bitcast(builder.and_(builder.bitcast(value, _I8), _all(2**31 - 1)), _F8)
 
 
-@intrinsic
-def totals(typingctx, a, b, c, d, e, f, g, h):
+@_operation(float8, *[float8] * LANES)
+def totals(builder, *rows):
     """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
 
-    def codegen(context, builder, sig, args):
-        def fold(left, right, low, high):
-            low, high = (
-                builder.shuffle_vector(left, right, ir.Constant(_I8, picked))
-                for picked in (low, high)
-            )
-            return builder.fadd(low, high)
-
-        pairs = [
-            fold(args[i], args[i + 1], [0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15])
-            for i in range(0, LANES, 2)
+    def fold(left, right, low, high):
+        halves = [
+            builder.shuffle_vector(left, right, ir.Constant(_I8, lanes)) for lanes in (low, high)
         ]
-        fours = [
-            fold(*pairs[i : i + 2], [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
-            for i in (0, 2)
-        ]
-        return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
+        return builder.fadd(*halves)
 
-    return float8(*[float8] * LANES), codegen
-
-
-@intrinsic
-def minimum(typingctx, a, b):
-    """a where a < b, else b (so b where a is NaN)."""
-
-    def codegen(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return float8(float8, float8), codegen
+    pairs = [
+        fold(rows[i], rows[i + 1], [0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15])
+        for i in range(0, LANES, 2)
+    ]
+    fours = [
+        fold(*pairs[i : i + 2], [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
+        for i in (0, 2)
+    ]
+    return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
 
 
-@intrinsic
-def maximum(typingctx, a, b):
-    """a where a > b, else b (so b where a is NaN)."""
-
-    def codegen(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return float8(float8, float8), codegen
-
-
-@intrinsic
-def greater(typingctx, a, b):
-    """Lanes where a > b."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fcmp_ordered(">", *args)
-
-    return mask8(float8, float8), codegen
-
-
-@intrinsic
-def at_least(typingctx, a, b):
-    """Lanes where a >= b; never where either is NaN."""
-
-    def codegen(context, builder, sig, args):
-        return builder.fcmp_ordered(">=", *args)
-
-    return mask8(float8, float8), codegen
-
-
-@intrinsic
-def both(typingctx, a, b):
-    """Lanes that are in both masks."""
-
-    def codegen(context, builder, sig, args):
-        return builder.and_(*args)
-
-    return mask8(mask8, mask8), codegen
-
-
-@intrinsic
-def select(typingctx, mask, a, b):
-    """a in the lanes of the mask, b in the others."""
-
-    def codegen(context, builder, sig, args):
-        return builder.select(*args)
-
-    return float8(mask8, float8, float8), codegen
-
-
-@intrinsic
-def any_not_negative(typingctx, a):
+@_operation(types.boolean, float8)
+def any_not_negative(builder, value):
     """Whether the sign bit of any lane is clear."""
-
-    def codegen(context, builder, sig, args):
-        clear = builder.icmp_signed(">=", builder.bitcast(args[0], _I8), _all(0))
-        return builder.icmp_unsigned("!=", builder.bitcast(clear, ir.IntType(8)), ir.IntType(8)(0))
-
-    return types.boolean(float8), codegen
+    clear = builder.icmp_signed(">=", builder.bitcast(value, _I8), _all(0))
+    return builder.icmp_unsigned("!=", builder.bitcast(clear, ir.IntType(8)), ir.IntType(8)(0))
 
 
-@intrinsic
-def add_exponent(typingctx, a, n):
-    """a 2**k, where k stands in the low bits of n's bit pattern; overflow is not looked for."""
-
-    def codegen(context, builder, sig, args):
-        bits, power = (builder.bitcast(arg, _I8) for arg in args)
-        return builder.bitcast(builder.add(bits, builder.shl(power, _all(23))), _F8)
-
-    return float8(float8, float8), codegen
+@_binary
+def add_exponent(builder, *args):
+    """a 2**k, where k stands in the low bits of b's bit pattern; overflow is not looked for."""
+    bits, power = (builder.bitcast(arg, _I8) for arg in args)
+    return builder.bitcast(builder.add(bits, builder.shl(power, _all(23))), _F8)
 
 
 def _exponent_bits(builder, value):
@@ -340,25 +246,17 @@ def _exponent_bits(builder, value):
     return builder.ashr(above, _all(23))
 
 
-@intrinsic
-def exponent(typingctx, a):
+@_unary
+def exponent(builder, value):
     """The k for which a / 2**k lies in [sqrt(1/2), sqrt(2)); a > 0 and normal."""
-
-    def codegen(context, builder, sig, args):
-        return builder.sitofp(_exponent_bits(builder, args[0]), _F8)
-
-    return float8(float8), codegen
+    return builder.sitofp(_exponent_bits(builder, value), _F8)
 
 
-@intrinsic
-def mantissa(typingctx, a):
+@_unary
+def mantissa(builder, value):
     """a / 2**exponent(a)."""
-
-    def codegen(context, builder, sig, args):
-        power = builder.shl(_exponent_bits(builder, args[0]), _all(23))
-        return builder.bitcast(builder.sub(builder.bitcast(args[0], _I8), power), _F8)
-
-    return float8(float8), codegen
+    power = builder.shl(_exponent_bits(builder, value), _all(23))
+    return builder.bitcast(builder.sub(builder.bitcast(value, _I8), power), _F8)
 
 
 @intrinsic
@@ -380,14 +278,12 @@ def prefetch(typingctx, array, index):
 LOG2_E = np.float32(math.log2(math.e))
 _ROUND = np.float32(1.5 * 2**23)  # adding it leaves the nearest integer in the low bits
 # 2**x on [-0.5, 0.5], least maximal relative error (2.6e-6), lowest power first.
-_EXP0 = np.float32(0.999999261)
-_EXP1 = np.float32(0.693121815)
-_EXP2 = np.float32(0.240247448)
-_EXP3 = np.float32(0.0559178609)
-_EXP4 = np.float32(0.00957010198)
+_COARSE = tuple(
+    np.float32(c) for c in (0.999999261, 0.693121815, 0.240247448, 0.0559178609, 0.00957010198)
+)
 # 2**x likewise with 2**0 exactly 1 (9e-8).
 _FINE = tuple(
-    np.float32(c) for c in (0.693146978, 0.240222421, 0.0555073374, 0.00967151266, 0.00132647272)
+    np.float32(c) for c in (1, 0.693146978, 0.240222421, 0.0555073374, 0.00967151266, 0.00132647272)
 )
 # log2((1 + s) / (1 - s)) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...)
 _LOG1, _LOG3, _LOG5, _LOG7 = (np.float32(2 / math.log(2) / n) for n in (1, 3, 5, 7))
@@ -398,11 +294,10 @@ def exp2(x):
     """2**x, eight at once, for |x| <= 126; any bits at all elsewhere. Relative error 3e-6."""
     shifted = x + splat(_ROUND)
     f = x - (shifted - splat(_ROUND))
-    p = fmuladd(splat(_EXP4), f, splat(_EXP3))
-    p = fmuladd(p, f, splat(_EXP2))
-    p = fmuladd(p, f, splat(_EXP1))
-    p = fmuladd(p, f, splat(_EXP0))
-    return add_exponent(p, shifted)
+    p = fmuladd(splat(_COARSE[4]), f, splat(_COARSE[3]))
+    p = fmuladd(p, f, splat(_COARSE[2]))
+    p = fmuladd(p, f, splat(_COARSE[1]))
+    return add_exponent(fmuladd(p, f, splat(_COARSE[0])), shifted)
 
 
 @inner()
@@ -410,12 +305,11 @@ def exp2_fine(x):
     """2**x as `exp2`, to float32's precision and exact at 0."""
     shifted = x + splat(_ROUND)
     f = x - (shifted - splat(_ROUND))
-    p = fmuladd(splat(_FINE[4]), f, splat(_FINE[3]))
+    p = fmuladd(splat(_FINE[5]), f, splat(_FINE[4]))
+    p = fmuladd(p, f, splat(_FINE[3]))
     p = fmuladd(p, f, splat(_FINE[2]))
     p = fmuladd(p, f, splat(_FINE[1]))
-    p = fmuladd(p, f, splat(_FINE[0]))
-    p = fmuladd(p, f, splat(np.float32(1)))
-    return add_exponent(p, shifted)
+    return add_exponent(fmuladd(p, f, splat(_FINE[0])), shifted)
 
 
 @inner()
@@ -431,32 +325,21 @@ def log2(x):
     return fmuladd(p, s, exponent(x))
 
 
-@intrinsic
-def scalar_fmuladd(typingctx, a, b, c):
+@_operation(types.float32, *[types.float32] * 3)
+def scalar_fmuladd(builder, *args):
     """a b + c of scalars, rounded once where the processor has fused multiply-add."""
-
-    def codegen(context, builder, sig, args):
-        single = ir.FloatType()
-        kind = ir.FunctionType(single, [single] * 3)
-        return builder.call(builder.module.declare_intrinsic("llvm.fmuladd.f32", (), kind), args)
-
-    return types.float32(types.float32, types.float32, types.float32), codegen
+    kind = ir.FunctionType(ir.FloatType(), [ir.FloatType()] * 3)
+    return builder.call(builder.module.declare_intrinsic("llvm.fmuladd.f32", (), kind), args)
 
 
-@intrinsic
-def _float_pointer(typingctx, address):
-    def codegen(context, builder, sig, args):
-        return builder.inttoptr(args[0], ir.FloatType().as_pointer())
-
-    return types.CPointer(types.float32)(types.uint64), codegen
+def _pointer_to(number, bits):
+    """From an address to a pointer."""
+    to = _operation(types.CPointer(number), types.uint64)
+    return to(lambda b, address: b.inttoptr(address, bits.as_pointer()))
 
 
-@intrinsic
-def _short_pointer(typingctx, address):
-    def codegen(context, builder, sig, args):
-        return builder.inttoptr(args[0], ir.IntType(16).as_pointer())
-
-    return types.CPointer(types.int16)(types.uint64), codegen
+_float_pointer = _pointer_to(types.float32, ir.FloatType())
+_short_pointer = _pointer_to(types.int16, ir.IntType(16))
 
 
 @inner()

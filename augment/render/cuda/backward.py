@@ -11,20 +11,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.buffers import RGB, RenderOutput
+from augment.render.buffers import EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda import blend_kernels as kernels
 from augment.render.cuda.driver import blend, list_tiles, project
 from augment.render.cuda.runtime import launch, resident
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
-from augment.render.gsplat_backend import rasterize_gsplat, tracked_geometry
+from augment.render.gsplat_backend import draw_with_gsplat, tracked_geometry
 from augment.render.layout import M_FUNCTIONS, VIEW
 from augment.scene import PosedGaussians
 
@@ -61,39 +61,19 @@ def color_gradients(
         return d_colors
     shares = torch.zeros(3, entries, device=device)
     launch(
-        kernels.share_colors,
-        (tiles.columns * tiles.rows,),
-        splats.records,
-        tiles.tile_splat_ids,
-        tiles.tile_offsets,
-        d_rgb.contiguous(),
-        shares,
-        camera.width,
-        camera.height,
-        tiles.columns,
-        settings.alpha_max,
-        math.log2(ALPHA_MIN),
-        min(settings.transmittance_stop, TRANSMITTANCE_STOP),
-        settings.transmittance_stop,
-        BATCH=_BATCH,
-        num_warps=_TILE_WARPS,
-    )
+        kernels.share_colors, (tiles.columns * tiles.rows,), splats.records, tiles.tile_splat_ids,
+        tiles.tile_offsets, d_rgb.contiguous(), shares, camera.width, camera.height, tiles.columns,
+        settings.alpha_max, math.log2(ALPHA_MIN),
+        min(settings.transmittance_stop, TRANSMITTANCE_STOP), settings.transmittance_stop,
+        BATCH=_BATCH, num_warps=_TILE_WARPS,
+    )  # fmt: skip
     owners, order = torch.sort(tiles.tile_splat_ids, stable=True)  # lists are tile after tile
     bounds = torch.arange(count + 1, dtype=owners.dtype, device=device)
     launch(
-        kernels.sum_shares,
-        (-(-count // _SPLATS),),
-        shares,
-        order,
-        torch.searchsorted(owners, bounds),
-        splats.records,
-        d_colors,
-        count,
-        entries,
-        SPLATS=_SPLATS,
-        LANES=_LANES,
-        num_warps=1,
-    )
+        kernels.sum_shares, (-(-count // _SPLATS),), shares, order,
+        torch.searchsorted(owners, bounds), splats.records, d_colors, count, entries,
+        SPLATS=_SPLATS, LANES=_LANES, num_warps=1,
+    )  # fmt: skip
     return d_colors
 
 
@@ -110,18 +90,10 @@ def sh_gradients(
     values = 3 * functions
     d_sh = torch.empty(len(means), functions, 3, device=means.device)
     launch(
-        kernels.spread_to_sh,
-        (-(-len(means) // _SH_SPLATS),),
-        means,
-        view,
-        d_colors,
-        d_sh,
-        len(means),
-        used,
-        SPLATS=_SH_SPLATS,
-        VALUES=values,
-        COLUMNS=1 << (values - 1).bit_length(),
-    )
+        kernels.spread_to_sh, (-(-len(means) // _SH_SPLATS),), means, view, d_colors, d_sh,
+        len(means), used,
+        SPLATS=_SH_SPLATS, VALUES=values, COLUMNS=1 << (values - 1).bit_length(),
+    )  # fmt: skip
     return d_sh
 
 
@@ -140,15 +112,15 @@ def rasterize_with_gradients(
         BackendUnavailable: geometry asks for gradients, and gsplat is not installed.
     """
     if tracked_geometry(parts):
-        return rasterize_gsplat(parts, camera, buffers, settings)
+        drawn = draw_with_gsplat(parts, camera, settings, with_depth=EXPECTED_DEPTH in buffers)
+        return RenderOutput(**{name: getattr(drawn, name) for name in buffers})
     names = tuple(sorted(buffers))
     setting = _Setting(tuple(_detached(part) for part in parts), camera, settings, names)
     images = _Rasterize.apply(setting, *[part.gaussians.sh for part in parts])
     return RenderOutput(**dict(zip(names, images, strict=True)))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Setting:
+class _Setting(NamedTuple):
     """What an operation is told besides its tensors."""
 
     parts: tuple[PosedGaussians, ...]

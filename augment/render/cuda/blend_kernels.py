@@ -191,16 +191,9 @@ def spread_to_sh(
 
 @triton.jit(do_not_specialize=["count", "columns"])
 def count_tiles(
-    order,
-    counts,
-    rects,
-    sums,
-    sorted_counts,
-    count,
-    columns,
-    IS_PARTIAL: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    order, counts, rects, sums, sorted_counts, count, columns,
+    IS_PARTIAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """How many tiles each splat is listed in, nearest splat first.
 
     order: int64 [count], rows of CudaSplats. counts, rects: as there. sums: int32 [rows + 1,
@@ -229,20 +222,9 @@ def count_tiles(
 
 @triton.jit(do_not_specialize=["pairs", "count", "steps", "columns", "none"])
 def list_pairs(
-    order,
-    ends,
-    rects,
-    wanted,
-    tiles,
-    owners,
-    pairs,
-    count,
-    steps,
-    columns,
-    none,
-    IS_PARTIAL: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    order, ends, rects, wanted, tiles, owners, pairs, count, steps, columns, none,
+    IS_PARTIAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Every pair of a splat and a tile, nearest splat first, the tiles of each row by row.
 
     order: as above. ends: int64 [count], how many pairs there are up to each splat, itself
@@ -375,41 +357,14 @@ MARGIN = tl.constexpr(0.0625)
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def blend_blocks(
-    records,
-    tile_splat_ids,
-    tile_offsets,
-    cuts,
-    lights,
-    rgb,
-    alpha,
-    expected,
-    median,
-    ids,
-    mode,
-    snow,
-    width,
-    height,
-    columns,
-    alpha_max,
-    log_cut,
-    least,
-    end,
-    parallel,
-    floor,
-    inverse_fx2,
+    records, tile_splat_ids, tile_offsets, cuts, lights, rgb, alpha, expected, median, ids, mode,
+    snow, width, height, columns, alpha_max, log_cut, least, end, parallel, floor, inverse_fx2,
     inverse_fy2,
-    HAS_CUTS: tl.constexpr,
-    HAS_LIGHTS: tl.constexpr,
-    HAS_RGB: tl.constexpr,
-    HAS_EXPECTED: tl.constexpr,
-    HAS_MEDIAN: tl.constexpr,
-    HAS_IDS: tl.constexpr,
-    HAS_MODE: tl.constexpr,
-    HAS_SNOW: tl.constexpr,
-    IS_COARSE: tl.constexpr,
-    BLOCK_W: tl.constexpr,
+    HAS_CUTS: tl.constexpr, HAS_LIGHTS: tl.constexpr, HAS_RGB: tl.constexpr,
+    HAS_EXPECTED: tl.constexpr, HAS_MEDIAN: tl.constexpr, HAS_IDS: tl.constexpr,
+    HAS_MODE: tl.constexpr, HAS_SNOW: tl.constexpr, IS_COARSE: tl.constexpr, BLOCK_W: tl.constexpr,
     BLOCK_H: tl.constexpr,
-):
+):  # fmt: skip
     """Blend one block of BLOCK_W x BLOCK_H pixels of a tile; a tile's blocks are neighbours.
 
     records, cuts, lights: as in CudaSplats. tile_splat_ids, tile_offsets: as in CudaTiles. rgb to

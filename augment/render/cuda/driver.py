@@ -69,43 +69,27 @@ def project(inputs: CudaInputs) -> CudaSplats:
         lights=floats(shading.LINES) if modes[layout.M_LIGHT] else None,
     )
     launch(
-        project_gaussians,
-        (len(inputs.block_parts),),
-        inputs.table,
-        inputs.views,
-        inputs.block_parts,
-        splats.records,
-        splats.keys,
-        splats.rects,
-        splats.counts,
-        splats.cuts,
+        project_gaussians, (len(inputs.block_parts),), inputs.table, inputs.views,
+        inputs.block_parts, splats.records, splats.keys, splats.rects, splats.counts, splats.cuts,
         splats.lights,
-        COLOR=modes[layout.M_COLOR],
-        FUNCTIONS=modes[layout.M_FUNCTIONS],
-        ANTIALIASED=modes[layout.M_ANTIALIASED],
-        SMOG=modes[layout.M_SMOG],
-        CLIP=modes[layout.M_CLIP],
-        LIGHT=modes[layout.M_LIGHT],
-        BLOCK=BLOCK,
-        num_warps=BLOCK // 32,
-    )
+        COLOR=modes[layout.M_COLOR], FUNCTIONS=modes[layout.M_FUNCTIONS],
+        ANTIALIASED=modes[layout.M_ANTIALIASED], SMOG=modes[layout.M_SMOG],
+        CLIP=modes[layout.M_CLIP], LIGHT=modes[layout.M_LIGHT], BLOCK=BLOCK, num_warps=BLOCK // 32,
+    )  # fmt: skip
     return splats
 
 
-# ---- Tile lists on the GPU: which splats every tile blends, nearest first, ties by index ---------
+# ---- Tile lists: which splats every tile blends, nearest first, ties by index --------------------
 #     order    of the Gaussians by the bits of z                                stable sort
 #     expand   every splat to its pairs with tiles, in that order               list_pairs
 #     group    the pairs by tile, which leaves each tile's in order of depth    stable sort
-#
-# Both sorts are torch's, radix sorts on a GPU. Pairs are spread evenly over programs, however many
-# tiles a splat touches.
 
 _SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of four pairs at once
 _MAX_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
 
 
 def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) -> CudaTiles:
-    """The lists of all tiles. wanted: bool [H, W]; tiles without a pixel of the mask get none.
+    """The lists of all tiles. pixel_mask: bool [H, W]; tiles without a pixel of it get none.
 
     Waits for the GPU once, to learn how many pairs there are.
 
@@ -122,18 +106,10 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     order = torch.sort(splats.keys, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     runtime.launch(
-        count_tiles,
-        (-(-count // _SPLATS),),
-        order,
-        splats.counts,
-        splats.rects,
-        none if is_drawn is None else _sums_from_corner(is_drawn),
-        counts,
-        count,
-        columns,
-        IS_PARTIAL=is_drawn is not None,
-        BLOCK=_SPLATS,
-    )
+        count_tiles, (-(-count // _SPLATS),), order, splats.counts, splats.rects,
+        none if is_drawn is None else _sums_from_corner(is_drawn), counts, count, columns,
+        IS_PARTIAL=is_drawn is not None, BLOCK=_SPLATS,
+    )  # fmt: skip
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     pairs = int(ends[-1]) if count else 0
     if pairs > _MAX_PAIRS:
@@ -148,22 +124,11 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     tile_of = torch.empty(pairs, dtype=numbers, device=device)
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     runtime.launch(
-        list_pairs,
-        (-(-pairs // _PAIRS),),
-        order,
-        ends,
-        splats.rects,
-        none if is_drawn is None else is_drawn,
-        tile_of,
-        owners,
-        pairs,
-        count,
-        count.bit_length(),
-        columns,
-        tiles,
-        IS_PARTIAL=is_drawn is not None,
-        BLOCK=_PAIRS,
-    )
+        list_pairs, (-(-pairs // _PAIRS),), order, ends, splats.rects,
+        none if is_drawn is None else is_drawn, tile_of, owners, pairs, count, count.bit_length(),
+        columns, tiles,
+        IS_PARTIAL=is_drawn is not None, BLOCK=_PAIRS,
+    )  # fmt: skip
     grouped, index = torch.sort(tile_of, stable=True)
     edges = torch.arange(tiles + 1, dtype=numbers, device=device)
     tile_offsets = torch.searchsorted(grouped, edges, out_int32=True)
@@ -214,38 +179,19 @@ def blend(
     per_tile = (TILE // _BLOCK_W) * (TILE // _BLOCK_H)
     none = images[ALPHA]  # stands for what is not there; nothing is read or written
     runtime.launch(
-        blend_blocks,
-        (tiles.columns * tiles.rows * per_tile,),
-        splats.records,
-        tiles.tile_splat_ids,
-        tiles.tile_offsets,
-        none if splats.cuts is None else splats.cuts,
+        blend_blocks, (tiles.columns * tiles.rows * per_tile,), splats.records,
+        tiles.tile_splat_ids, tiles.tile_offsets, none if splats.cuts is None else splats.cuts,
         none if splats.lights is None else splats.lights,
-        *(images.get(name, none) for name in BUFFERS),
-        camera.width,
-        camera.height,
-        tiles.columns,
-        settings.alpha_max,
-        math.log2(ALPHA_MIN),
-        least,
-        settings.transmittance_stop,
-        float(camera.is_orthographic),
-        settings.mode_depth_floor_m,
-        camera.fx**-2,
-        camera.fy**-2,
-        HAS_CUTS=splats.cuts is not None,
-        HAS_LIGHTS=splats.lights is not None and RGB in images,
-        HAS_RGB=RGB in images,
-        HAS_EXPECTED=EXPECTED_DEPTH in images,
-        HAS_MEDIAN=MEDIAN_DEPTH in images,
-        HAS_IDS=SPLAT_IDS in images,
-        HAS_MODE=MODE_DEPTH in images,
-        HAS_SNOW=SNOW in images,
-        IS_COARSE=settings.transmittance_stop > least,
-        BLOCK_W=_BLOCK_W,
-        BLOCK_H=_BLOCK_H,
+        *(images.get(name, none) for name in BUFFERS), camera.width, camera.height, tiles.columns,
+        settings.alpha_max, math.log2(ALPHA_MIN), least, settings.transmittance_stop,
+        float(camera.is_orthographic), settings.mode_depth_floor_m, camera.fx**-2, camera.fy**-2,
+        HAS_CUTS=splats.cuts is not None, HAS_LIGHTS=splats.lights is not None and RGB in images,
+        HAS_RGB=RGB in images, HAS_EXPECTED=EXPECTED_DEPTH in images,
+        HAS_MEDIAN=MEDIAN_DEPTH in images, HAS_IDS=SPLAT_IDS in images,
+        HAS_MODE=MODE_DEPTH in images, HAS_SNOW=SNOW in images,
+        IS_COARSE=settings.transmittance_stop > least, BLOCK_W=_BLOCK_W, BLOCK_H=_BLOCK_H,
         num_warps=1,
-    )
+    )  # fmt: skip
     return {name: images[name] for name in buffers}
 
 

@@ -19,8 +19,7 @@ from augment.scene import PosedGaussians
 from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, RequestedImages, ViewImages
 
-# --------------------------------------------------------------------------------------------------
-# Launches of the passes over finished images on the GPU. Images are float32, without gradients.
+# ---- Passes over finished images, float32 without gradients --------------------------------------
 # Definitions: augment.render.composite, augment.effects.smog, augment.render.rasterize.
 
 BLOCK = 128  # pixels of a program: one a thread, which needs few registers and no exchange
@@ -33,9 +32,8 @@ def composite_color(
     """rgb + (1 - alpha) color. color: read on the host, so it had better lie there."""
     rgb, alpha = rgb.detach().contiguous(), alpha.detach().contiguous()
     out = torch.empty_like(rgb)
-    count = alpha.numel()
-    given = (rgb, alpha, out, count, *color.tolist())
-    launch(kernels.composite_color, _grid(count), *given, BLOCK=BLOCK)
+    given = (rgb, alpha, out, alpha.numel(), *color.tolist())
+    launch(kernels.composite_color, _grid(alpha.numel()), *given, BLOCK=BLOCK)
     return out
 
 
@@ -196,7 +194,8 @@ def _places(names: Sequence[str], camera: Camera) -> dict[str, _Place]:
 def _make(images: dict[str, Tensor], requested: RequestedImages, camera: Camera) -> None:
     looked_up = requested.semantic or requested.instance
     parts = requested.parts if looked_up else ()
-    classes = [_resident_classes(part) for part in parts]  # kept until the launch
+    semantics = [part.gaussians.semantic for part in parts]
+    classes = [None if own is None else resident(own) for own in semantics]  # kept until the launch
     table = upload(_table_of(parts, classes)) if looked_up else None
     shown = requested.shown
     pose = camera.world_from_camera
@@ -223,11 +222,6 @@ def _make(images: dict[str, Tensor], requested: RequestedImages, camera: Camera)
         IN_AIR=requested.plane_z_m is not None,
         BLOCK=QUANTIZE_BLOCK,
     )
-
-
-def _resident_classes(part: PosedGaussians) -> Tensor | None:
-    semantic = part.gaussians.semantic
-    return None if semantic is None else resident(semantic)
 
 
 def _table_of(parts: Sequence[PosedGaussians], classes: Sequence[Tensor | None]) -> np.ndarray:

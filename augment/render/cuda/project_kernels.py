@@ -417,23 +417,10 @@ RECORD = tl.constexpr(layout.RECORD)
 
 @triton.jit
 def project_gaussians(
-    table,
-    views,
-    block_parts,
-    records,
-    keys,
-    rects,
-    counts,
-    cuts,
-    lights,
-    COLOR: tl.constexpr,
-    FUNCTIONS: tl.constexpr,
-    ANTIALIASED: tl.constexpr,
-    SMOG: tl.constexpr,
-    CLIP: tl.constexpr,
-    LIGHT: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    table, views, block_parts, records, keys, rects, counts, cuts, lights,
+    COLOR: tl.constexpr, FUNCTIONS: tl.constexpr, ANTIALIASED: tl.constexpr, SMOG: tl.constexpr,
+    CLIP: tl.constexpr, LIGHT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Splats of the Gaussians of every part; each program takes BLOCK of one part.
 
     table, views, block_parts: see splats. The rest: of splats, and written; cuts and
