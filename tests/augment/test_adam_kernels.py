@@ -330,22 +330,6 @@ def test_a_gradient_that_is_not_finite_leaves_its_splat_as_it_was(column, number
         assert np.array_equal(array, expected), name
 
 
-def test_gradients_of_zero_move_nothing_but_momentum():
-    splats = some_splats()
-    config = dataclasses.replace(CONFIG, loss=LossWeights())
-    update = random_update(splats, 0)
-    for gradients in update.gradients.values():
-        gradients[:] = 0
-    before = copied(splats)
-    apply_update(splats, update, config)
-    for name in ("means", "scales", "sh"):
-        assert np.array_equal(getattr(splats, name), before[name]), name
-    # normalised anew, and through the odds and back: a rounding each
-    np.testing.assert_allclose(splats.quats, before["quats"], rtol=0, atol=2e-7)
-    np.testing.assert_allclose(splats.opacities, before["opacities"], rtol=0, atol=2e-7)
-    assert splats.age.max() == 1
-
-
 def test_quaternions_stay_unit_and_turn_along_the_sphere():
     splats = some_splats()
     for seed in range(30):
@@ -430,15 +414,6 @@ def test_a_splat_that_was_updated_very_often_counts_as_unbiased():
 # ---- step sizes ------------------------------------------------------------------------------
 
 
-def test_bias_corrections():
-    table = kernels.bias_corrections(BETA1, BETA2)
-    assert table.shape == (kernels.CORRECTED + 1, 2) and np.isfinite(table).all()
-    np.testing.assert_allclose(table[1], [10, 1000], rtol=1e-6)
-    n = 17
-    np.testing.assert_allclose(table[n], [1 / (1 - 0.9**n), 1 / (1 - 0.999**n)], rtol=1e-6)
-    assert 1 <= table[-1, 1] < 1 + 1e-4 and table[-1, 0] == 1
-
-
 def test_step_sizes_fall_over_the_run_and_no_further():
     camera, rates = camera_ahead(64, 48), CONFIG.rates
     first, last, after = (
@@ -458,12 +433,6 @@ def test_step_sizes_fall_over_the_run_and_no_further():
         assert first[column] == pytest.approx(rate)
         assert last[column] == pytest.approx(rate * rates.late)
     assert first.dtype == np.float32 and len(first) == kernels.RATES
-
-
-def test_a_rate_of_zero_freezes_the_means():
-    rates = dataclasses.replace(FASTER, means=0.0)
-    values = splat_rates(dataclasses.replace(CONFIG, rates=rates), 10, camera_ahead(), EXTENT_M)
-    assert np.isfinite(values).all() and values[G_MEAN] == 0
 
 
 # ---- sky and colour maps ---------------------------------------------------------------------
@@ -486,20 +455,6 @@ def test_dense_adam_follows_torch():
         expected.step()
     # moments are float64; values are rounded to float32 at each of twenty steps
     np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=0, atol=2e-6)
-
-
-def test_color_adam_follows_torch_where_all_rows_are_seen():
-    rng = np.random.default_rng(1)
-    values = rng.uniform(0.3, 0.7, (3000, 3)).astype(np.float32)  # three runs of rows
-    parameter, expected = torch_adam(values, 0.005)
-    adam = ColorAdam(values)
-    for _ in range(15):
-        gradient = (rng.normal(size=(3000, 3)) * 1e-3).astype(np.float32)
-        adam.update(np.arange(3000, dtype=np.int32), gradient, 0.005)
-        parameter.grad = torch.from_numpy(gradient).double()
-        expected.step()
-    # moments in float32: some 1e-6 of each step of 0.005, and rounding of the values
-    np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=0, atol=1e-6)
 
 
 def test_color_adam_counts_every_row_for_itself():

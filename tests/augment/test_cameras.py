@@ -68,11 +68,6 @@ def test_impossible_cameras_are_refused(changes, message):
         camera(**changes)
 
 
-def test_scale_must_be_positive(unchecked):
-    with pytest.raises(ValueError, match="scale must be a finite number > 0; got 0"):
-        camera().scaled(0)
-
-
 def test_a_resized_view_spans_the_same_angles():
     camera = camera_ahead(33, 21)
     square = camera.resized(12, 12)

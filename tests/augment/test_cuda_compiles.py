@@ -72,6 +72,7 @@ def test_what_is_wrong_with_a_kernel_is_seen():
 
 
 @interpreted
+@pytest.mark.long
 def test_kernels_of_views_compile_into_what_they_should():
     """One of each kernel of a few views, since compiling takes seconds; all of them below."""
     launches = {each.name: each for each in record_views("clean", "style folded into SH",
@@ -100,6 +101,7 @@ def test_kernels_of_all_views_compile_into_what_they_should():
 
 
 @interpreted
+@pytest.mark.long
 def test_the_next_frame_compiles_nothing_new():
     """Counts and places that change from frame to frame are none of a kernel's constants."""
     scene = small_scene()

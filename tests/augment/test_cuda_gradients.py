@@ -99,12 +99,6 @@ def test_colours_gradients_are_those_of_the_definition(settings):
     assert_close(sh_gradients(parts, camera, "cuda", settings), expected, 2e-5)
 
 
-def test_colours_gradients_are_those_of_the_cpu_backend():
-    parts, camera = small_scene(60), camera_ahead(11, 13, 11.0)
-    expected = sh_gradients(parts, camera, "cpu", buffers=(RGB, ALPHA))
-    assert_close(sh_gradients(parts, camera, "cuda"), expected, 1e-5)
-
-
 def test_a_colour_held_by_its_clamp_has_no_gradient():
     dark = one_gaussian(rgb=(-0.2, 0.4, 0.9))
     (found,) = sh_gradients([PosedGaussians(dark)], camera_ahead(9, 9, 9.0), "cuda")

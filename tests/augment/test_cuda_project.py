@@ -14,7 +14,6 @@ import pytest
 import torch
 from hypothesis import given
 
-from augment.effects.smog import SmogMedium
 from augment.render import layout
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
@@ -130,8 +129,7 @@ def test_settings(settings):
     assert_close(actual, drawn_splats(in_float64([part]), camera, settings), flips=0)
 
 
-@pytest.mark.parametrize("most", [0, 1, 2, None])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "most"), [(0, None), (1, None), (2, 1), (3, None), (3, 0)])
 def test_spherical_harmonics_of_every_degree(degree, most):
     camera, settings = camera_ahead(), RasterSettings(sh_degree=most)
     part = PosedGaussians(random_gaussians(40, seed=3, sh_degree=degree))
@@ -240,49 +238,7 @@ def test_many_parts_are_the_cpus_in_one_launch(weather):
     assert bool((actual.lights[drawn & lit][:, 6:].amax(1) > 0).all())
 
 
-def test_parts_do_not_touch_each_other():
-    """A part's splats have the same bits wherever in the list it stands."""
-    camera, parts = camera_ahead(), street_of_parts()
-    together = splats_of(parts, camera)
-    first = 0
-    for part in parts:
-        last = first + len(part.gaussians)
-        alone = splats_of([part], camera)
-        ours = together.records[first:last]
-        assert torch.equal(together.rects[first:last], alone.rects)
-        assert torch.equal(together.keys[first:last], alone.keys)
-        others = [field for field in range(layout.RECORD) if field != layout.SPLAT_ID]
-        assert torch.equal(bits(ours[:, others]), bits(alone.records[:, others]))
-        first = last
-
-
 # ---- what must not change a bit ------------------------------------------------------------------
-
-
-def test_smog_that_is_not_there_changes_nothing():
-    camera, parts = camera_ahead(), street_of_parts()[3:]
-    clear = splats_of(parts, camera)
-    for scale_height in (None, 2.0):
-        none = SmogMedium(0.0, (0.8, 0.7, 0.5), scale_height_m=scale_height)
-        foggy = splats_of(parts, camera, smog=none)
-        assert torch.equal(bits(foggy.records), bits(clear.records))
-        assert foggy.lights is not None and clear.lights is not None
-        assert torch.equal(bits(foggy.lights), bits(clear.lights))
-
-
-def test_places_do_not_depend_on_what_else_is_asked_for():
-    camera, parts = camera_ahead(), street_of_parts()[3:]
-    clear = splats_of(parts, camera)
-    colours = [layout.RED, layout.GREEN, layout.BLUE]
-    places = [field for field in range(layout.RECORD) if field not in colours]
-    for other in (
-        splats_of(parts, camera, with_color=False),
-        splats_of(parts, camera, clip=UNCUT),
-        splats_of(parts, camera, smog=SMOGS["layered"]),
-    ):
-        assert torch.equal(bits(other.records[:, places]), bits(clear.records[:, places]))
-        assert torch.equal(other.keys, clear.keys) and torch.equal(other.rects, clear.rects)
-    assert splats_of(parts, camera, with_color=False).lights is None
 
 
 def test_ties_stay_ties():
@@ -322,13 +278,6 @@ def test_whatever_is_drawn_is_finite(gaussians):
 def test_nothing_at_all():
     splats = splats_of([PosedGaussians(Gaussians.empty(3))], camera_ahead())
     assert len(splats.keys) == 0 and splats.records.shape == (0, layout.RECORD)
-
-
-def test_nothing_that_is_seen():
-    behind = one_gaussian((-4.0, 0.0, 0.0))
-    faint = one_gaussian(opacity=0.003)
-    splats = splats_of([PosedGaussians(stack(behind, faint))], camera_ahead())
-    assert splats.counts.tolist() == [0, 0] and splats.keys.tolist() == [HIDDEN, HIDDEN]
 
 
 # ---- on a GPU ------------------------------------------------------------------------------------

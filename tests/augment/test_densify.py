@@ -155,15 +155,6 @@ def test_small_ones_are_cloned_and_let_through_what_one_did() -> None:
             assert not getattr(grown, name)[first + 1].any()
 
 
-def test_all_others_stay_as_they_are() -> None:
-    splats = pulled(splats_of(*PARTS), [3, 35], radius=0.5)
-    grown, _ = round_of(splats, grow_fraction=1.0)
-    from_row = origins(grown, splats)
-    others = ~np.isin(from_row, [3, 35])
-    kept = rebuild(splats, np.delete(np.arange(len(splats)), [3, 35]))
-    assert same(rebuild(grown, np.flatnonzero(others)), kept)
-
-
 def test_large_ones_are_split_within_their_own_shape() -> None:
     splats = pulled(splats_of(*PARTS), [7], radius=0.2)
     grown, report = round_of(splats, grow_fraction=1.0, split="sampled")
@@ -226,14 +217,6 @@ def test_the_budget_goes_to_the_best() -> None:
     assert_sound(grown, report, splats)
     rows, counts = np.unique(origins(grown, splats), return_counts=True)
     assert rows[counts == 2].tolist() == [9, 20, 45]
-
-
-def test_equal_scores_grow_the_earlier_ones() -> None:
-    splats = splats_of(40)
-    splats.grads[:] = (1, 1, 0.002)
-    grown, report = round_of(splats)
-    assert report.added == 2
-    assert origins(grown, splats)[:4].tolist() == [0, 0, 1, 1]
 
 
 @pytest.mark.parametrize(("limit", "added"), [(53, 3), (50, 0), (10, 0)])
@@ -407,13 +390,6 @@ def test_no_splat_is_spread_until_its_copies_are_dead() -> None:
     living = np.isin(origins(grown, splats), [50, 51])
     assert living.sum() == 35 and (grown.opacities[living] >= 0.02).all()
     assert_composition_kept(grown, splats)
-
-
-def test_opaque_splats_take_copies() -> None:
-    splats = splats_of(40, opacity=1.0)
-    grown, report = round_of(splats, method="mcmc", grow_fraction=0.1, prune_opacity=0.0)
-    assert_sound(grown, report, splats)
-    assert report.added == 4 and (grown.opacities[grown.age == 0] < 1).all()
 
 
 def test_unusable_ones_are_moved_first_and_never_stay() -> None:

@@ -38,14 +38,7 @@ from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
 from tests.augment.examples import drawing
-from tests.augment.hard_scenes import (
-    KINDS,
-    OPACITIES,
-    SMOGS,
-    hard_gaussians,
-    in_float64,
-    wide_camera,
-)
+from tests.augment.hard_scenes import KINDS, SMOGS, hard_gaussians, in_float64, wide_camera
 from tests.augment.loss_definition import reference_loss
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -83,7 +76,7 @@ def assert_finite(found: dict) -> None:
         assert value is not None and bool(torch.isfinite(torch.as_tensor(value)).all()), name
 
 
-@drawing(12)
+@drawing(8)
 @given(kinds, seeds, fovs, sizes, st.booleans())
 def test_of_the_cpu_rasteriser(kind, seed, fov_deg, size, antialiased):
     camera = wide_camera(fov_deg, size)
@@ -93,7 +86,7 @@ def test_of_the_cpu_rasteriser(kind, seed, fov_deg, size, antialiased):
 
 
 @pytest.mark.parametrize("smog", SMOGS)
-@drawing(4)
+@drawing(2)
 @given(kinds, seeds, fovs, st.booleans(), st.booleans())
 def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
     camera = wide_camera(fov_deg, (16, 9))
@@ -108,14 +101,13 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["plain", "edges", "near"])
 def test_of_a_view_of_nothing(kind, backend):
     """Zeros, by both backends: a training step that sees no splat is no error."""
     gaussians = hard_gaussians(kind, wide_camera(60.0), 30)
     away = wide_camera(60.0, (16, 9), at=(1e3, 0.0, 0.0))
     found = gradients(gaussians, away, backend=backend, seed=0)
-    if kind in ("plain", "edges", "near"):  # the others reach back to the camera
-        assert all(not value.any() for value in found.values())
+    assert all(not value.any() for value in found.values())
     assert_finite(found)
 
 
@@ -172,7 +164,7 @@ def loss_arrays(loss: ViewLoss) -> dict[str, np.ndarray]:
 views = st.sampled_from(((1, 1), (1, 40), (23, 17))), fovs, st.booleans()
 
 
-@drawing(10)
+@drawing(6)
 @given(seeds, *views)
 def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
     """By the kernels and by their definition, in float32 as they and in float64."""
@@ -189,7 +181,7 @@ def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
         assert_finite({name: grad for name, grad in grads.items() if grad is not None})
 
 
-@drawing(8)
+@drawing(5)
 @given(seeds, *views)
 def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
     arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
@@ -204,7 +196,7 @@ def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
     assert np.isfinite(faces).all() and faces.min() >= 0 and faces.max() <= 1
 
 
-@drawing(10)
+@drawing(5)
 @given(kinds, seeds, fovs, st.sampled_from((0.0, 1e-30, 1.0, 1e10)))
 def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
     """Adam keeps logarithms of scales and logits of opacities within what can be drawn."""
@@ -258,8 +250,9 @@ def plain(name: str, px: int = 32, count: int = 2) -> torch.Tensor:
     return torch.tensor(PLAIN[name])[None, :, None, None].expand(count, 3, px, px).clone()
 
 
-@pytest.mark.parametrize("second", PLAIN)
-@pytest.mark.parametrize("first", ["black", "red", "grey"])
+@pytest.mark.parametrize(
+    ("first", "second"), [("black", "white"), ("red", "red"), ("grey", "black")]
+)
 def test_of_the_style_losses_of_plain_pictures(first, second):
     """Pictures, features and colours without any variance, and equal ones without a difference."""
     one, other = plain(first).requires_grad_(), plain(second)
@@ -311,9 +304,3 @@ def test_closed_forms_of_plain_pictures(one, other, narrow, wide, method, streng
         assert torch.isfinite(value).all()
         # Of gains at most 3 (closed_form.Limits), and the least contrast beside them.
         assert torch.linalg.matrix_norm(value[..., :3], 2).max() < 3.5
-
-
-def test_opacities_at_the_thresholds_are_among_the_extremes():
-    camera = wide_camera(60.0)
-    found = set(hard_gaussians("edges", camera, 300).opacities.tolist())
-    assert found == set(OPACITIES.tolist())

@@ -12,7 +12,7 @@ import torch
 from augment.cameras import Camera
 from augment.effects.smog import SmogMedium
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
-from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
+from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, RGB
 from augment.render.composite import composite_sky
 from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.render.cpu import backward as cpu_backward
@@ -110,12 +110,6 @@ def test_a_window_of_the_view_is_the_same_image(backend):
     assert_images_close(part.rgb, whole.rgb[11:36, 7:37], p999=1e-5, max_flips=1)
 
 
-def test_scaling_keeps_the_field_of_view():
-    camera = map_camera(60, 40)
-    half = camera.scaled(0.5)
-    assert half.is_orthographic and (half.width, half.fx) == (30, camera.fx / 2)
-
-
 def test_the_image_covariance_is_the_worlds():
     scene, camera = random_gaussians(200, dtype=torch.float64), map_camera()
     splats = project_parts([PosedGaussians(scene)], camera, RasterSettings())
@@ -172,15 +166,6 @@ def test_kernels_match_the_definition(seed, clip):
     assert float(error.flatten().quantile(0.98)) < 2e-4
 
 
-def test_posed_parts():
-    parts = [PosedGaussians(random_gaussians(300)), PosedGaussians(random_gaussians(100, seed=3))]
-    parts[1] = dataclasses.replace(parts[1], world_from_part=random_pose(1, (3.0, 0.0, 0.0)))
-    doubled = [dataclasses.replace(p, gaussians=in_float64(p.gaussians)) for p in parts]
-    actual, expected = render(parts, map_camera()), render(doubled, map_camera(), "reference")
-    assert_images_close(actual.rgb, expected.rgb, p999=1e-5, max_flips=2)
-    assert_images_close(actual.median_depth, expected.median_depth, p999=1e-4, max_flips=4)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_it_is_the_limit_of_a_long_lens_far_away(backend):
     """Ten times as far through a lens ten times as long: ten times nearer to parallel rays."""
@@ -210,7 +195,7 @@ def test_it_is_the_limit_of_a_long_lens_far_away(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("slope", [0.0, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("slope", [0.3, 2.0])
 def test_a_tilted_discs_surface_is_its_plane(slope, backend):
     scene, normal = disc(slope)
     camera = down(60, 60, 20.0)
@@ -258,30 +243,6 @@ def test_a_tilted_view_is_cut_at_the_height(backend):
     assert float(above.alpha[rows > edge + 1.5].max()) < 1e-3
 
 
-def test_colours_are_those_seen_along_the_axis():
-    """View-dependent colour is that of parallel rays: the same wherever a splat stands."""
-    scene = random_gaussians(1, seed=3)
-    copies = scene.select(torch.zeros(9, dtype=torch.long))
-    means = torch.tensor([[x, y, 0.0] for x in (1.0, 4.0, 7.0) for y in (-2.0, 0.0, 2.0)])
-    copies = dataclasses.replace(copies, means=means)
-    colors = project_parts([PosedGaussians(copies)], map_camera(), RasterSettings()).colors
-    assert torch.equal(colors, colors[:1].expand_as(colors))
-    image = render(copies, map_camera(), buffers=EXACT)
-    hit = image.alpha > 0.05
-    shown = (image.rgb / image.alpha.clamp_min(1e-9)[..., None])[hit]
-    torch.testing.assert_close(shown, colors[:1].expand_as(shown), rtol=0, atol=1e-5)
-
-
-def test_what_is_behind_or_beside_is_not_drawn():
-    camera = down(20, 20, 10.0)
-    for mean in ((0.0, 0.0, 20.5), (3.0, 0.0, 0.0), (0.0, -3.0, 0.0)):
-        assert not render(one_gaussian(mean), camera).alpha.any()
-    far = render(one_gaussian((0.0, 0.0, -5e3)), camera)
-    near = render(one_gaussian((0.0, 0.0, 19.0)), camera)
-    assert torch.equal(far.alpha, near.alpha)  # size does not depend on distance
-    assert float(far.median_depth.max()) == pytest.approx(5020.0)
-
-
 def test_smog_and_skies_are_refused():
     camera, scene = map_camera(), one_gaussian()
     with pytest.raises(ValueError, match="orthographic: there is no eye"):
@@ -310,10 +271,3 @@ def test_training_refuses_it():
     inputs = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
     with pytest.raises(ValueError, match="gradients are of pinhole cameras only"):
         cpu_backward.record(inputs, camera, RasterSettings(), Scratch(), with_depth=False)
-
-
-def test_median_depth_is_along_the_axis():
-    camera = down(9, 9, 10.0)
-    scene = stack(one_gaussian((0.0, 0.0, 3.0), 0.5, 0.3), one_gaussian((0.0, 0.0, 1.0), 0.5, 0.9))
-    image = render(scene, camera, buffers=EXACT | {MEDIAN_DEPTH})
-    assert float(image.median_depth[4, 4]) == pytest.approx(19.0)

@@ -6,7 +6,6 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
-from augment.reconstruct import kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, view_loss
 from augment.reconstruct.view import RecordedView
@@ -255,8 +254,8 @@ def test_impossible_depths_count_nothing():
     assert not used[[0, 1, 2, 4, 5]].any() and used[3] and used[6:].all()
 
 
-@pytest.mark.parametrize("many", [4096, 9001])
-def test_many_depth_priors(many):
+def test_many_depth_priors():
+    many = 9001  # of which chunks are summed
     arguments = case(100, 130)
     rng = np.random.default_rng(0)
     arguments = with_view(
@@ -285,13 +284,12 @@ def test_weights_of_zero_switch_depth_and_sky_off():
     assert unasked.total == loss.total and (unasked.d_expected_depth == 0).all()
 
 
-@pytest.mark.parametrize("texels", [1, 2, 7])
-@pytest.mark.parametrize("seed", range(4))
-def test_the_sky_learns_on_every_face(texels, seed):
-    arguments = case(40, 40, texels=texels, seed=seed)
+@pytest.mark.parametrize("texels", [1, 7])
+def test_the_sky_learns_on_every_face(texels):
+    arguments = case(40, 40, texels=texels, seed=0)
     arguments["alpha"] *= 0.5
     # A pixel whose direction lies within float32 rounding of an edge between faces may take
-    # either; none of these seeds has one.
+    # either; here none does.
     loss = assert_matches_reference(arguments)
     assert loss.d_sky is not None
     texel = loss.d_sky.texels
@@ -327,21 +325,6 @@ def test_the_same_bits_for_any_threads_and_with_reused_buffers():
         limit_threads(None)
 
 
-def test_a_call_after_an_interrupted_one_starts_clean(monkeypatch):
-    arguments, scratch = case(21, 23), LossScratch()
-    expected = dense_sky(view_loss(**arguments), arguments["sky_faces"])
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sky_kernels, "gather_sky", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            view_loss(**arguments, scratch=scratch)
-    got = dense_sky(view_loss(**arguments, scratch=scratch), arguments["sky_faces"])
-    np.testing.assert_array_equal(got, expected)
-
-
 def test_a_picture_of_nan_shows_and_leaves_nothing_behind():
     arguments, scratch = case(21, 23), LossScratch()
     expected = view_loss(**arguments)
@@ -362,13 +345,6 @@ def test_read_only_and_strided_arrays_are_fine():
     for value in (*locked.values(), rgb):
         value.flags.writeable = False
     assert view_loss(**with_view({**arguments, "rgb": rgb}, **locked)).total == expected.total
-
-
-def test_colours_far_beyond_the_range_stay_finite():
-    arguments = case(21, 23)
-    arguments["rgb"] *= 1000  # a splat may be learnt far too bright for a while
-    loss = view_loss(**arguments)
-    assert np.isfinite(loss.total) and np.isfinite(loss.d_rgb).all()
 
 
 @pytest.mark.parametrize(

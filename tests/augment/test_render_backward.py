@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Frame
 from augment.effects.smog import SmogMedium
-from augment.plan import make_plan
 from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, RGB
 from augment.render.composite import composite_sky, map_colors
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky
-from augment.views import render_buffers
-from recipes.schema import Output, Recipe
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose, stack
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -154,13 +150,12 @@ def drawn_nowhere(gaussians: Gaussians) -> Gaussians:
 # ---- the definition --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("size", [(37, 21), (17, 33), (16, 16)], ids=str)
+@pytest.mark.parametrize(("size", "antialiased"), [((37, 21), False), ((17, 33), True)], ids=str)
 def test_random_gaussians(size, antialiased):
     settings = RasterSettings(antialiased=antialiased)
     camera = camera_ahead(*size, 28.0, position=(0.02, -0.1, 0.07), yaw=0.1)
     assert_gradients_match(
-        [PosedGaussians(random_gaussians(300, seed=size[0]), slight_pose())],
+        [PosedGaussians(random_gaussians(200, seed=size[0]), slight_pose())],
         camera,
         settings,
         max_flips=2,
@@ -180,12 +175,9 @@ def test_settings_that_leave_splats_out():
     assert 20 < (np.abs(small).reshape(300, -1).any(1)).sum() < 250
 
 
-def test_an_image_of_one_pixel():
-    assert_gradients_match(posed(random_gaussians(200, size=0.6)), camera_ahead(1, 1, 2.0))
-
-
-@pytest.mark.parametrize("limit", [None, 0, 1, 2, 3])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    ("degree", "limit"), [(0, None), (1, None), (2, 1), (3, None), (3, 2), (2, 0)]
+)
 def test_every_sh_degree(degree, limit):
     gaussians = random_gaussians(60, seed=degree, sh_degree=degree, size=0.5)
     settings = RasterSettings(sh_degree=limit)
@@ -196,9 +188,7 @@ def test_every_sh_degree(degree, limit):
 
 
 @pytest.mark.parametrize(
-    "buffers",
-    [{RGB}, {ALPHA}, {EXPECTED_DEPTH}, {RGB, ALPHA}],
-    ids=lambda names: "+".join(sorted(names)),
+    "buffers", [{RGB}, {ALPHA}, {EXPECTED_DEPTH}], ids=lambda names: "+".join(sorted(names))
 )
 def test_every_buffer_alone(buffers):
     found = assert_gradients_match(
@@ -223,10 +213,10 @@ def test_parts_in_their_own_frames():
 
 def test_more_gaussians_than_a_block_holds():
     """Blocks of 2048, of two parts, each with its own rows of gradients."""
-    small = random_gaussians(5000, seed=4, sh_degree=0, size=0.03)
-    parts = [PosedGaussians(small), PosedGaussians(random_gaussians(2100, seed=5, size=0.05))]
-    # 7000 Gaussians, most of a few pixels: a dozen of their pixels lie within 1e-6 of a cut-off.
-    assert_gradients_match(parts, camera_ahead(49, 35, 45.0), max_flips=12)
+    small = random_gaussians(2100, seed=4, sh_degree=0, size=0.03)
+    parts = [PosedGaussians(small), PosedGaussians(random_gaussians(300, seed=5, size=0.05))]
+    # Most Gaussians are of a few pixels, some of which lie within 1e-6 of a cut-off.
+    assert_gradients_match(parts, camera_ahead(33, 25, 30.0), max_flips=12)
 
 
 def test_one_gaussian_has_the_gradients_of_its_formula():
@@ -270,19 +260,18 @@ def crowd(count: int, *, opacity: float, seed: int = 0) -> Gaussians:
     )
 
 
-@pytest.mark.parametrize("opacity", [0.999, 0.7])
-def test_tiles_that_close_long_before_their_list_ends(opacity):
+def test_tiles_that_close_long_before_their_list_ends():
     camera = camera_ahead(37, 21)
-    gaussians = crowd(3000, opacity=opacity)
+    gaussians = crowd(1500, opacity=0.999)
     assert float(rasterize(posed(gaussians), camera).alpha.min()) > 0.97
     # What lies behind a splat is known to a few 1e-7 of the pixel, and transmittance falls to 1e-4:
     # the last splats of a pixel, whose gradients are that small, keep two or three digits of them.
     found = assert_gradients_match(posed(gaussians), camera, tolerance=1e-4, max_flips=8)
-    hidden = ~np.abs(found[0]["sh"]).reshape(3000, -1).any(1)
-    assert hidden.sum() > 1000  # what closed tiles hide gets exactly nothing
+    hidden = ~np.abs(found[0]["sh"]).reshape(1500, -1).any(1)
+    assert hidden.sum() > 300  # what closed tiles hide gets exactly nothing
 
 
-@pytest.mark.parametrize("count", [31, 32, 33, 64, 65, 200])
+@pytest.mark.parametrize("count", [32, 33, 100])
 def test_lists_about_as_long_as_a_batch(count):
     """Faint splats that all cover both tiles: no pixel closes before the end of the list."""
     gaussians = dataclasses.replace(
@@ -292,14 +281,6 @@ def test_lists_about_as_long_as_a_batch(count):
     )
     found = assert_gradients_match(posed(gaussians), camera_ahead(24, 16))
     assert np.abs(found[0]["opacities"]).all()
-
-
-def test_tiles_without_any_splat():
-    near_corner = one_gaussian(mean=(4.0, 1.6, 1.0), scale=0.1)
-    camera = camera_ahead(65, 49, 40.0)
-    assert int((rasterize(posed(near_corner), camera).alpha > 0).sum()) < 100
-    assert_gradients_match(posed(near_corner), camera, buffers={RGB, ALPHA})
-    assert_gradients_match(posed(near_corner), camera, tolerance=HARDLY_COVERED)
 
 
 def degenerate() -> dict[str, Gaussians]:
@@ -334,8 +315,15 @@ def degenerate() -> dict[str, Gaussians]:
     }
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("kind", degenerate())
+@pytest.mark.parametrize(
+    ("kind", "antialiased"),
+    [
+        *((kind, False) for kind in degenerate()),
+        ("needles", True),
+        ("specks", True),
+        ("flat", True),
+    ],
+)
 def test_degenerate_gaussians(kind, antialiased):
     camera = camera_ahead(37, 21)
     settings = RasterSettings(antialiased=antialiased)
@@ -426,14 +414,7 @@ def test_same_bits_for_any_number_of_threads_and_every_time():
                 assert np.array_equal(actual[name], expected[name]), name
 
 
-def test_auto_takes_the_kernels():
-    camera = camera_ahead()
-    parts, weights = posed(random_gaussians(100)), weighting(camera)
-    auto, cpu = (gradients(parts, camera, weights, backend=name)[0] for name in ("auto", "cpu"))
-    assert all(np.array_equal(auto[name], cpu[name]) for name in FIELDS)
-
-
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", ["means", "sh"])
 def test_one_tracked_tensor_of_one_part_is_enough(field):
     camera = camera_ahead(21, 15)
     parts = posed(random_gaussians(80), random_gaussians(60, seed=1))
@@ -499,7 +480,7 @@ def test_images_may_be_changed_in_place_before_the_gradients():
         assert np.array_equal(actual, expected[name]), name  # by 2 and 1/2: exact
 
 
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", ["means", "sh"])
 def test_changing_a_tensor_before_its_gradients_raises(field):
     tracked = leaves(posed(random_gaussians(50)))
     total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.sum()
@@ -522,13 +503,12 @@ def test_second_derivatives_are_refused():
     ("arguments", "what"),
     [
         ({"smog": SmogMedium(0.05, (0.5, 0.6, 0.7))}, "gradients through smog are asked for"),
-        ({"buffers": [RGB, "median_depth"]}, "gradients of median_depth are asked for"),
         (
             {"buffers": [RGB, "median_depth", "splat_ids"]},
             "gradients of median_depth, splat_ids are asked for",
         ),
     ],
-    ids=["smog", "median depth", "splat ids too"],
+    ids=["smog", "median depth and splat ids"],
 )
 def test_what_the_kernels_have_no_gradients_of(arguments, what):
     """Naming the backend raises; auto takes the definition, to the bit."""
@@ -573,15 +553,3 @@ def test_gradients_through_sky_and_colour_map():
     for name in FIELDS:
         difference = (found[0][name] - found[1][name]).norm() / found[1][name].norm()
         assert float(difference) < 1e-4, name  # as in assert_gradients_match: a flip is smaller
-
-
-def test_gradients_through_a_planned_picture():
-    gaussians = leaves(posed(random_gaussians(100)))[0].gaussians
-    camera = camera_ahead(33, 21)
-    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"ahead": camera})
-    maps = {"ahead": torch.eye(3, 4) * 0.9}
-    scene = Scene("s", "test:s", gaussians, (), sky(), (frame,), color_maps=maps)
-    plan = make_plan(Recipe(output=Output(depth="expected", semantic=False, instance=False)), scene)
-    view = render_buffers(scene, camera, plan, backend="cpu")
-    view.rgb.sum().backward()
-    assert bool(gaussians.means.grad.any())

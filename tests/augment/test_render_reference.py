@@ -213,15 +213,6 @@ def test_equal_depths_keep_the_order_of_the_parts():
         assert bool((together.rgb[..., front] > together.rgb[..., 2 - front]).all())
 
 
-def test_copies_of_a_splat_are_ties_wherever_they_stand():
-    """In a long list too, where a matrix product would treat its last rows differently."""
-    copies = random_gaussians(61, seed=2).select(torch.arange(61).repeat(7))
-    splats = project_parts([PosedGaussians(copies)], camera_ahead(yaw=0.3), DEFAULT)
-    ordered = order_by_depth(splats).ids.reshape(-1, 7)
-    expected = ordered[:, :1] + 61 * torch.arange(7)
-    assert torch.equal(ordered, expected)
-
-
 def test_order_is_by_float32_depth_in_float64_too():
     """Depths that differ by less than float32 resolves are ties, whatever the dtype."""
     far = one_gaussian((4.0 + 1e-9, 0, 0), rgb=(1, 0, 0), dtype=torch.float64)
@@ -273,23 +264,6 @@ def test_splats_no_larger_than_the_radius_clip_are_left_out(orthographic):
     for clip, is_drawn in ((0.0, True), (radius - 1e-4, True), (radius + 1e-4, False)):
         output = render(ball, camera, settings=RasterSettings(radius_clip_px=clip))
         assert bool(output.alpha.any()) == is_drawn
-
-
-def test_the_stop_itself_is_not_reached():
-    splats = project_parts([PosedGaussians(wall(2, 0.5))], camera_ahead(6, 4), DEFAULT)
-    centre = splats.means2d.T.contiguous()
-    for before, weight in ((2e-4, 0.0), (2.0001e-4, 1.00005e-4)):
-        weights, after = reference.blend_weights(
-            splats, centre, torch.tensor([before], dtype=torch.float64), DEFAULT
-        )
-        assert float(after) == before / 2
-        assert float(weights) == pytest.approx(weight, rel=1e-12)
-
-
-def test_alpha_is_clamped_by_the_settings():
-    for limit in (0.999, 0.99):
-        output = render(wall(2, 1.0), camera_ahead(6, 4), settings=RasterSettings(alpha_max=limit))
-        np.testing.assert_allclose(output.alpha, limit, atol=1e-12)
 
 
 def test_median_depth_is_where_less_than_half_the_light_is_left():
