@@ -114,9 +114,8 @@ MAX_ENTRIES = 200_000  # files and folders, for one pattern: a second or two
 def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
     """Every scene once, in the order of the job; those of a pattern in the order of their paths.
 
-    An entry whose path has `*`, `**` or `[...]` stands for all that match, as in a shell (a `?`
-    begins the query); each keeps the entry's query, frames, cameras and recipes. folder: where
-    relative paths start."""
+    An entry whose path has `*`, `**` or `[...]` stands for all that match (a `?` begins the query),
+    each with the entry's query, frames, cameras and recipes. folder: where relative paths start."""
     scenes: dict[str, JobScene] = {}
     for entry in entries:
         found = _expanded(entry, folder)

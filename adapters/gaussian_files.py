@@ -149,9 +149,8 @@ class GroundFound:
 
 
 def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundFound | None:
-    """The plane that is most like a ground; None where nothing is flat.
-
-    near: a unit vector within 45 degrees of which up must be, such as the cameras' mean."""
+    """The plane that is most like a ground; None where nothing is flat. near: a unit vector within
+    45 degrees of which up must be, such as the cameras' mean."""
     points = solid_points(gaussians)
     points = points[in_bulk(points, 3.0)]
     if len(points) < _MIN_POINTS:

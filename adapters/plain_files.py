@@ -221,12 +221,11 @@ def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def inside(root: Path, name: str, where: str) -> Path:
-    """The file of a dataset that a table names relative to the dataset's folder.
+    """The file of a dataset that a table names relative to the dataset's folder; where: the table
+    and row, for messages. Absolute names and '..' are refused.
 
-    Links inside the folder are followed as long as they stay in it; so are the folder's own
-    entries, which people link to where their disks are.
-
-    where: the table and row, for messages."""
+    Links are followed as long as they stay in the folder; so are the folder's own entries, which
+    people link to where their disks are."""
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
         raise AdapterError(

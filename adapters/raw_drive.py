@@ -112,18 +112,16 @@ class DriveOptions(UriOptions):
 
 def drive_origin(positions_m: np.ndarray) -> np.ndarray:
     """What to subtract from the dataset's coordinates so that float32 keeps its digits, float64
-    [3]: zero for a drive near the dataset's origin, else whole metres near its start.
-
-    positions_m: float64 [F, 3], where the car was."""
+    [3]: zero near the dataset's origin, else whole metres near the first of the car's positions [F,
+    3]."""
     far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
     return np.round(positions_m[0]) if far else np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The usable returns of one frame in the scene's world.
-
-    points: float32 [N, 3]. timestamps_ns: int64 [N]. semantic: int16 [N], SemanticClass values."""
+    """The usable returns of one frame: points float32 [N, 3] in the scene's world, timestamps_ns
+    int64 [N], semantic int16 [N], SemanticClass values."""
 
     points: np.ndarray
     timestamps_ns: np.ndarray
@@ -280,8 +278,7 @@ def class_table(names: Mapping[int, str], meaning: Mapping[str, int]) -> np.ndar
 
 
 def classes_of(sweep: LidarSweep, table: np.ndarray) -> np.ndarray | None:
-    """The SemanticClass of each return, or NO_SURFACE, from the dataset's class numbers in the
-    column `semantic`; None for a sweep without classes."""
+    """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
     classes = sweep.columns.get("semantic")
     if classes is None:
         return None

@@ -79,9 +79,8 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
 
 
 def storable(scene: Scene) -> Scene:
-    """An opened scene with what belongs into another saved scene: where the recording of a saved
-    scene is not found today, that is no fact about the scene, and a relative path to it stays one
-    to the same place."""
+    """An opened scene as it belongs into another saved scene: a recording that is not found today
+    is no fact about the scene, and a relative path to it still leads there."""
     scheme, path, _ = parse_uri(scene.source)
     if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
         return scene

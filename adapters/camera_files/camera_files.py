@@ -27,12 +27,11 @@ _ORTHONORMAL_TOLERANCE = 1e-4  # as in Camera: poses written with four decimals 
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """One posed image in the file's own world (its axes, its unit of length).
+    """One posed image in the file's own world (its axes, its unit of length); fx, fy, cx, cy in
+    pixels.
 
-    name: the image's name in the file. fx, fy, cx, cy: pixels. world_from_camera: float64 [4, 4],
-    OpenCV axes (x right, y down, z forward). image_path: where the image lies, if it does.
-    camera, frame: its camera's name and its frame's number where the file says; both or neither.
-    timestamp_ns: since the scene's first frame; None where the file has no times."""
+    world_from_camera: float64 [4, 4], OpenCV axes. camera, frame: where the file says, both or
+    neither. timestamp_ns: since the scene's first frame; None where the file has no times."""
 
     name: str
     width: int
@@ -95,9 +94,8 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
 def look_at_pose(
     position: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray, *, where: str
 ) -> np.ndarray:
-    """world_from_camera of an upright camera at `position` that looks at `target` (world +z up).
-
-    Straight up or down, where upright means nothing, the top of the image points to world +y."""
+    """world_from_camera of an upright camera (world +z up) that looks at `target`; straight up or
+    down, the top of its image points to world +y."""
     eye, forward = np.asarray(position, np.float64), np.subtract(target, position, dtype=np.float64)
     length = np.linalg.norm(forward)
     if not (np.isfinite(length) and length > 1e-9):

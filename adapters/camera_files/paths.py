@@ -46,16 +46,13 @@ _MIN_KNOWN = 6  # of 25 cells: ground is not spread beyond the content's edge
 
 
 def solid_points(gaussians: Gaussians) -> np.ndarray:
-    """Centres [N, 3] of solid Gaussians, or of all where hardly any is solid; float64.
-
-    Large scenes are thinned evenly to a few hundred thousand."""
+    """Centres [N, 3] of solid Gaussians, or of all where hardly any is, thinned evenly; float64."""
     return gaussians.means[_solid(gaussians)].double().numpy()
 
 
 def solid_points_and_areas(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """The same centres, and the area [N] each hides: opacity times 2 pi times its two larger
-    scales, which is what it takes from a wide beam across its face. Thinned areas make up for
-    those left out."""
+    """The same centres, and the area [N] each hides from a wide beam: opacity times 2 pi times its
+    two larger scales. Thinned areas make up for those left out."""
     index = _solid(gaussians)
     count = int((gaussians.opacities > SOLID_OPACITY).sum())
     scales = gaussians.scales[index].sort(dim=1).values
@@ -84,10 +81,8 @@ def in_bulk(points: np.ndarray, reach: float) -> np.ndarray:
 def ground_under(
     points: np.ndarray, positions: np.ndarray, *, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ground heights [P'] under positions [P, 3], and the positions [P', 3] they belong to.
-
-    Points within `radius` horizontally and below the position count. Positions with too few of
-    them are left out; long paths are thinned evenly."""
+    """Ground heights [P'] under positions [P, 3], and the positions [P', 3] they belong to: those
+    with enough points within `radius` in plan below them. Long paths are thinned evenly."""
     kept, heights = [], []
     for position in positions[:: 1 + len(positions) // _MAX_PLACES]:
         offset = points[:, :2] - position[:2]
@@ -104,9 +99,8 @@ def road_heights(
 ) -> np.ndarray:
     """Heights [P] that hold the most surface around places [P, 2 or 3]; NaN where nothing is near.
 
-    low: [P], heights of what lies low there, which a road may lie above: files have foundations,
-    and strays below the ground. Coarse splats lie under fine ones, so none counts for many.
-    unit: a metre's length."""
+    low: [P], what lies low there, such as foundations and strays. Coarse splats lie under fine
+    ones, so none counts for many. unit: a metre's length."""
     layer = unit * _ROAD_LAYER_M
     heights, areas = np.full(len(places), np.nan), np.minimum(areas, np.median(areas))
     for number, (place, least) in enumerate(zip(places, low, strict=True)):
@@ -132,9 +126,8 @@ def lowest_ground(points: np.ndarray, positions: np.ndarray, *, radius: float) -
 
 @dataclass(frozen=True, eq=False)
 class GroundGrid:
-    """Ground heights on square cells. height: [X, Y], NaN where nothing is near.
-
-    corner: x, y of the first cell's corner. cell: side length."""
+    """Ground heights [X, Y] on square cells, NaN where nothing is near. corner: x, y of the
+    first."""
 
     corner: np.ndarray
     cell: float
@@ -156,9 +149,7 @@ class GroundGrid:
 
 def ground_grid(points: np.ndarray, *, cell: float) -> GroundGrid:
     """Ground heights over the bulk of the points: the low quantile of each cell, then the third
-    lowest tenth of the 5x5 cells around it, which a car, a bush or a canopy alone does not lift.
-
-    cell: metres; larger where the scene would need more than _CELLS_A_SIDE cells."""
+    lowest tenth of the 5x5 cells around it, which no car or bush lifts. cell: metres at least."""
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0)
     cell = max(cell, float((high - low).max()) / _CELLS_A_SIDE)
     shape = np.floor((high - low) / cell).astype(int) + 1
@@ -244,11 +235,9 @@ def _is_wide_and_flat(points: np.ndarray) -> bool:
 def _longest_free_line(
     points: np.ndarray, areas: np.ndarray, grid: GroundGrid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends [2] of the straight line with the most ground under it and the least in its way.
-
-    Every half metre of a line (more in scenes of more than half a kilometre) counts +1 over known
-    ground, -1 elsewhere, and less by the share of a car's front that Gaussians there hide; of every
-    line the best stretch is taken."""
+    """Ends [2] of the straight line with the most ground under it and the least in its way: each
+    step counts +1 over known ground, -1 elsewhere, less the share of a car's front that Gaussians
+    hide."""
     worth, cell = _worth_of_cells(points, areas, grid)
     middle = grid.corner + 0.5 * grid.cell * np.array(grid.height.shape)
     reach = 0.5 * grid.cell * float(np.hypot(*grid.height.shape))
@@ -303,8 +292,7 @@ def _worth_of_cells(
 def _is_detailed(
     points: np.ndarray, areas: np.ndarray, corner: np.ndarray, cell: float, shape: np.ndarray
 ) -> np.ndarray:
-    """Where Gaussians are not much larger than usual: scenes are sharp where their cameras drove,
-    and a path far from there would look into a blur."""
+    """Where Gaussians are not much larger than usual: near where the training cameras drove."""
     size = np.log(np.maximum(areas, 1e-12))
     reach = round(_DETAIL_REACH_M / cell)
     total = _sum_around(_sum_in_cells(points, size, corner, cell, shape), reach)
@@ -445,10 +433,9 @@ def frames_from_views(
     views: Sequence[PosedView], change: WorldChange, *, start_ns: int = 0
 ) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     """Frames in order of time (or of their names), and sentences on what could not be kept.
+    world_from_ego stands at the front camera, level.
 
-    change: from the views' world to the scene's. start_ns: what times in the views count from, and
-    the time of the first frame where they have none. world_from_ego stands at the front camera,
-    level, x along its optical axis."""
+    change: from the views' world to the scene's. start_ns: what times in the views count from."""
     keys, problems = _keys_of_views(views)
     order = sorted(set(frame for _, frame in keys), key=_natural)
     numbers = _frame_numbers(order)
@@ -579,11 +566,8 @@ def frames_from_path_file(path: str | Path, scene: Scene) -> tuple[Frame, ...]:
 
 
 def with_camera_path(scene: Scene, path: str | Path) -> Scene:
-    """The scene with the frames of a path file in place of its own, and without the labels, which
-    belong to the frames it had. Its `source` opens it again, path included.
-
-    Raises:
-        AdapterError: as for frames_from_path_file."""
+    """The scene with the frames of a path file in place of its own and without the labels, which
+    belong to those. Its `source` opens it again, path included."""
     frames, problems = _frames_and_problems(Path(path), scene)
     return dataclasses.replace(
         scene,

@@ -438,11 +438,8 @@ def _usable_images(
     size: tuple[int, int] | None,
     problems: list[str],
 ) -> tuple[dict[int, Path], tuple[int, int]]:
-    """The camera's images of the frames, all decoded once to be sure of them, and their width and
-    height.
-
-    names: the camera's files by frame. size: what the calibration says; None: that of most images.
-    """
+    """The camera's images `names` of the frames, all decoded once to be sure of them, and their
+    width and height: `size` by the calibration, else that of most images."""
     present = [number for number in numbers if number in names]
     missing = [number for number in numbers if number not in names]
     faults = [f"camera {camera}: {some(missing)} without an image"] if missing else []

@@ -63,10 +63,8 @@ _POOR_FITNESS = 0.5
 
 
 def kitti_root(path: str | Path) -> tuple[Path, Path]:
-    """The folder of the drive, and the folder of its calibration.
-
-    path: a raw drive, whose calibration lies in it or above; or a folder of the object benchmark,
-    or the one that holds its training/, whose calibration is its calib/."""
+    """The folder of a raw drive and that of its calibration (the same or the one above); or a
+    folder of the object benchmark, given itself or above its training/, and its calib/."""
     root = Path(path)
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a KITTI drive or object folder")

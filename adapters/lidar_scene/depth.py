@@ -18,14 +18,13 @@ _SAME_DRIVE_NS = 10_000_000_000  # times further from the frame's count from som
 
 
 def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
-    """int64 [N] nanoseconds from the column timestamp_ns, or t in seconds; None where there is
-    neither, where t has gaps, or where the times are not of the drive that the frame is of (such as
-    times that count from the sweep's start).
-
-    frame_ns: the frame's timestamp.
+    """int64 [N] nanoseconds from the column timestamp_ns, or t in seconds; None without either,
+    with gaps in t, or where the times are not of the drive of frame_ns (as those from a sweep's
+    start).
 
     Raises:
-        ValueError: timestamp_ns holds anything but whole numbers or dates."""
+        ValueError: timestamp_ns holds anything but whole numbers or dates.
+    """
     times = sweep.columns.get("timestamp_ns")
     if times is None:
         seconds = sweep.columns.get("t")
@@ -39,10 +38,8 @@ def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
 
 
 def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
-    """A column of whole numbers, or of dates (nanoseconds since 1970), as int64.
-
-    Raises:
-        ValueError: it holds anything else, or gaps."""
+    """A column of whole numbers, or of dates (nanoseconds since 1970), as int64; ValueError for
+    anything else, or gaps."""
     if len(column) == 0:  # Arrow's type of an empty column may be anything
         return np.zeros(0, np.int64)
     if column.dtype.kind == "M" and not np.isnat(column).any():
@@ -87,10 +84,8 @@ def nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SparseDepth:
-    """Depth at M pixels of one image, at most one a pixel, in order of rows.
-
-    uv: int32 [M, 2], column and row. depth_m: float32 [M], along the optical axis.
-    timestamp_ns: int64 [M], when the LiDAR saw the point."""
+    """Depth at M pixels of one image, at most one a pixel, by rows. uv: int32 [M, 2], column and
+    row. depth_m: float32 [M], along the optical axis. timestamp_ns: int64 [M], of the return."""
 
     uv: np.ndarray
     depth_m: np.ndarray
@@ -114,12 +109,11 @@ class FrameReturns:
 
 
 def lidar_depth(scene: Scene, frame_index: int, camera: Camera) -> SparseDepth:
-    """The frame's sweep as the camera would see it, the nearest return of each pixel.
+    """The frame's sweep as the camera would see it, the nearest return of each pixel; none without.
 
-    Returns on a moving object are carried along its track from their own time to the camera's, and
-    left out if the object is not there then; the lowest FLOOR_M of its box counts as ground.
-    Without a sweep the result is empty. LiDAR and camera look from different places: a pixel may
-    show the depth of something that a nearer object hides from the camera."""
+    Returns on a moving object are carried along its track to the camera's time, and left out if it
+    is not there then; the lowest FLOOR_M of its box counts as ground. A pixel may show the depth of
+    something that a nearer object hides from the camera."""
     returns = read_returns(scene, frame_index)
     if returns is None:
         return SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
@@ -130,9 +124,7 @@ def read_returns(
     scene: Scene, frame_index: int, *, without_semantic: Collection[int] = ()
 ) -> FrameReturns | None:
     """The part of `lidar_depth` that all cameras of a frame share; None without a sweep.
-
-    without_semantic: the dataset's class numbers of returns that are no surface, such as mirror
-    images."""
+    without_semantic: class numbers of returns that are no surface, such as mirror images."""
     sweep = scene.lidar(frame_index)
     if sweep is None:
         return None

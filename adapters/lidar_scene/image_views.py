@@ -90,9 +90,8 @@ def observe_views(
     """The colour of every body's surfels, and a sentence for each image that cannot be decoded.
 
     In each image the bodies as they stood then are drawn into a z-buffer; a surfel at its front
-    takes the image's colour there. A camera's nearest and most frontal observations count, by
-    their median; cameras are averaged with weights that fall towards an image's border, so that
-    unlike exposures meet softly. What no surfel covers goes to the sky."""
+    takes the image's colour there. A camera's best observations count by their median; cameras are
+    averaged with weights that fall towards the border. What nothing covers goes to the sky."""
     names = list(dict.fromkeys(view.camera.name for view in views))
     stores = [Observations.empty(len(body.surfels)) for body in bodies]
     problems: list[str] = []

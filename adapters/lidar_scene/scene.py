@@ -130,10 +130,9 @@ def without_points(tracks: Sequence[ObjectTrack], scene: Scene) -> tuple[str, ..
 
 
 def low_height(points: PointSet, path: np.ndarray) -> float | None:
-    """The lowest height under the path where no road was found, metres in the world of the points.
-
-    At each position of the path (float [P, 3]) it is a low quantile of the returns there. The reach
-    widens until there are enough to trust: what is nearest is the recording car and spray."""
+    """The lowest height under the path [P, 3] where no road was found, metres: a low quantile of
+    the returns around each position. The reach widens until there are enough to trust: what is
+    nearest is the recording car and spray."""
     widest = _REACHES_M[-1]
     low, high = path.min(axis=0) - widest, path.max(axis=0) + widest
     near = points.points[indices_between(points.points, low, high)]

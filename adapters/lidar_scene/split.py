@@ -116,9 +116,8 @@ class ObjectTrack:
 def join_tracks(samples: Sequence[BoxSample]) -> tuple[ObjectTrack, ...]:
     """One track an object, siblings taken together, in order of first appearance.
 
-    The boxes that one frame holds of an object (one a sensor, each at its sensor's own moment)
-    become one sample at the mean time with the mean pose: on a straight path at constant speed
-    that lies on the path, and it keeps centimetres of disagreement from becoming jerks."""
+    The boxes that one frame holds of an object (one a sensor, at its own moment) become one sample
+    of mean time and pose: on a straight path that lies on it, and disagreement makes no jerks."""
     names = _unite(samples)
     groups: dict[str, list[BoxSample]] = defaultdict(list)
     for sample in samples:
@@ -198,10 +197,8 @@ def is_flat(semantic: np.ndarray) -> np.ndarray:
 def split_sweeps(
     sweeps: Sequence[Sweep], tracks: Sequence[ObjectTrack]
 ) -> tuple[PointSet, tuple[PointSet, ...]]:
-    """The static world, and one set a track in the actor's frame.
-
-    Each return is compared with every box as it stood at the return's own time. Ground inside a
-    box is ground; where classes are unknown the lowest FLOOR_M of a box is given to nobody."""
+    """The static world, and one set a track in the actor's frame, by the box as it stood at each
+    return's own time. Ground in a box is ground; without classes the lowest FLOOR_M is nobody's."""
     static: list[PointSet] = []
     actors: list[list[PointSet]] = [[] for _ in tracks]
     for sweep in sweeps:

@@ -44,10 +44,9 @@ _MIN_THICKNESS_M = 0.005
 def thin_points(
     points: PointSet, path: np.ndarray, *, voxel_m: float
 ) -> tuple[PointSet, np.ndarray]:
-    """The mean point and commonest class of every occupied voxel, and the voxels' edges in metres.
-
-    path: float [P, 3], positions in the frame of the points. The edge is voxel_m within NEAR_M of
-    the path and grows with the power GROWTH of the distance beyond."""
+    """The mean point and commonest class of every occupied voxel, and the voxels' edges in metres:
+    voxel_m within NEAR_M of the path (float [P, 3]), beyond it growing with the power GROWTH of the
+    distance."""
     if len(points) == 0:
         return points, np.zeros(0, np.float32)
     level = _levels(points.points, np.ascontiguousarray(path, np.float32))
@@ -176,12 +175,11 @@ class Surfels:
 def surfels_from_points(
     points: np.ndarray, edge_m: np.ndarray, *, semantic: np.ndarray | None = None
 ) -> Surfels:
-    """A surfel for every point.
+    """A surfel for every point float32 [N, 3], thinned to the distance edge_m [N]; normals are
+    principal axes of the nearest points.
 
-    points: float32 [N, 3]. edge_m: float32 [N], distance that the points were thinned to there.
-    semantic: int16 [N], SemanticClass: says how wide a gap may be closed, that ground has no rim,
-    and which way a lone ring faces: up on the ground, sideways on a building. Normals come from the
-    principal axes of the nearest points."""
+    semantic: int16 [N]: says how wide a gap may be closed, that ground has no rim, and which way a
+    lone ring faces: up on the ground, sideways on a building."""
     count = len(points)
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
@@ -296,11 +294,8 @@ def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma:
 
 @dataclass(frozen=True)
 class SplatShape:
-    """How a surfel becomes a Gaussian.
-
-    sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
-    a lattice visible, 0.6 blurs. opacity: of every splat; high, so that a surface hides
-    what lies behind it."""
+    """sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
+    a lattice visible, 0.6 blurs. opacity: high, so that a surface hides what lies behind it."""
 
     sigma_per_spacing: float = 0.5
     opacity: float = 0.95
@@ -336,9 +331,8 @@ def gaussians_from_surfels(
 def borrow_colours(
     points: np.ndarray, colours: np.ndarray, seen: np.ndarray, reach_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours for unseen points from the nearest seen one within reach, and who has a colour now.
-
-    points: float32 [N, 3]. colours: float32 [N, 3]. seen: bool [N]. reach_m: float32 [N]."""
+    """Colours [N, 3] for unseen points [N, 3] from the nearest seen one within reach_m [N], and who
+    has a colour now."""
     if seen.all() or not seen.any():
         return colours, seen
     unseen = np.flatnonzero(~seen)
@@ -378,8 +372,7 @@ _STEEP = 0.35  # height over distance that ground can have from one cell to the 
 
 def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
     """The new points only, on walls, fences and boards, or without classes on any upright surface.
-
-    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points."""
+    edge_m: float32 [N], distance that the points were thinned to."""
     wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.SIGN, Class.UNKNOWN))
     wall &= np.abs(surfels.normals[:, 2]) < _MAX_UPWARD
     some, edges, classes = points.points[wall], edge_m[wall], points.semantic[wall]
@@ -424,9 +417,7 @@ def _fill(points, edges, classes, column, widest, sparser):  # pragma: no cover 
 
 
 def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
-    """The new points only.
-
-    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points."""
+    """The new points only. edge_m: float32 [N], distance that the points were thinned to."""
     widest = np.full(64, _MAX_OTHER_GAP_M, np.float32)
     for semantic, width in _MAX_GAP_M.items():
         widest[semantic] = width

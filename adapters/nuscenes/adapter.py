@@ -229,9 +229,7 @@ def read_sweeps(
     held_out: Collection[int] = frozenset(),
 ) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
     """The usable returns of every frame that has a file and is not held out, in the scene's world,
-    and what was missing, one sentence each.
-
-    Left out: returns of the recording car itself, of no surface (lidarseg's noise), not finite."""
+    and what was missing. Left out: returns of the recording car, of no surface, not finite."""
     sweeps, problems, missing = [], [], []
     used = [frame for frame in frames if frame.index not in held_out]
     table = _class_table(tables)
@@ -459,8 +457,7 @@ def read_tracks(
     """The moving objects around the given frames, in the scene's world.
 
     An object moves if any of its boxes in the whole scene says so, or if it travels. Boxes are
-    those of the keyframes among the frames' times and of the next on either side, each at the time
-    that the LiDAR met it; between them the Track interpolates."""
+    those of the keyframes around the frames' times, each at the time that the LiDAR met it."""
     annotations = [box for sample in tables.samples for box in sample.annotations]
     moving = {b.instance for b in annotations if any(name in _MOVING for name in b.attributes)}
     moving |= objects_that_travel((box.instance, box.center_m) for box in annotations)

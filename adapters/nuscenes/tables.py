@@ -54,11 +54,8 @@ _MAX_NAMES = 10  # that a message lists
 
 @dataclass(frozen=True)
 class Row:
-    """One row. path: its table. fields: as in the file; further ones than are asked for may be
-    there, as later editions of the dataset have them.
-
-    All readers raise AdapterError, naming table, row and field, where a field is missing or wrong.
-    """
+    """One row. path: its table. fields: as in the file, of which later editions may have more. All
+    readers raise AdapterError, naming table, row and field, where a field is missing or wrong."""
 
     path: Path
     number: int
@@ -565,13 +562,12 @@ class FrameToken:
 def scene_frames(
     tables: SceneTables, *, sweeps: bool
 ) -> tuple[tuple[FrameFiles, ...], tuple[str, ...]]:
-    """The frames of a scene, numbered from 0 in order of time, and a sentence for each camera that
-    has images in none of them.
+    """The frames of a scene, numbered in order of time, and a sentence for each camera with images
+    in none of them.
 
-    sweeps: one frame a LiDAR file, of keyframes and between them (20 a second; cameras take 12
-    images a second, so most frames lack some); else one a keyframe. A keyframe has its own images,
-    those of its sample; each other image goes to the nearest frame in time that has none of its
-    camera yet, nearest pairs first, and to no second one."""
+    sweeps: one frame a LiDAR file (20 a second; cameras take 12 images), else one a keyframe. A
+    keyframe has its own images; each other image goes to the nearest frame that has none of its
+    camera yet, nearest pairs first."""
     chosen = [file for file in tables.lidar if sweeps or file.is_key_frame]
     images: list[dict[str, SensorFile]] = [{} for _ in chosen]
     problems = []
@@ -593,9 +589,8 @@ def scene_frames(
 
 
 def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameToken]]:
-    """What every frame of a scene is in the dataset's tables: frame number (Frame.index) to channel
-    (LIDAR_TOP among them) to row of sample_data. Frames that frames= leaves out are there too, and
-    so are files that the tables name but that are missing."""
+    """What every frame of a scene is in the dataset's tables: by frame number (Frame.index, those
+    too that frames= leaves out) and channel (LIDAR_TOP among them), missing files included."""
     options = NuScenesOptions.from_query("nuscenes", query)
     tables = read_tables(Path(path), options.version, options.scene)
     frames, _ = scene_frames(tables, sweeps=options.sweeps == "1")

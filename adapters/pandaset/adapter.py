@@ -127,12 +127,11 @@ class Drive:
 def read_drive(
     sequence: Sequence, frames: Seq[int], *, held_out: Collection[int] = frozenset()
 ) -> Drive:
-    """Sweeps and moving boxes of the given frames.
+    """Sweeps and moving boxes of the frames; missing files of single frames are problems. Left out
+    are returns of smoke, exhaust, spray, mirror images and the recording car.
 
-    held_out: frames whose sweeps only tell at what moment their boxes were seen, so that the tracks
-    are those of the whole drive.
-    Left out: returns of smoke, exhaust, spray and mirror images, and of the recording car itself.
-    Missing files of single frames are problems, not errors."""
+    held_out: frames whose sweeps only tell when their boxes were seen, so that tracks stay
+    whole."""
     table = semantic_table(sequence.root)
     sweeps, samples, problems = [], [], []
     cuboids = {frame: read_cuboids(sequence.root, frame) for frame in frames}
@@ -244,10 +243,8 @@ def _time_seen(
     frame: int,
     otherwise: int,
 ) -> int:
-    """When the box's sensor saw it: boxes were drawn around returns that took 0.1 s to collect.
-
-    The median time of its returns in the box; without any, the time of the return whose bearing
-    from the car is nearest to the box's."""
+    """When the box's sensor saw it, as boxes were drawn around returns of 0.1 s: the median time of
+    its returns in the box, else the time of the return of nearest bearing from the car."""
     reach = float(np.linalg.norm(size_m))
     near = indices_between(sweep.points, pose[:3, 3] - reach, pose[:3, 3] + reach)
     if sensor >= 0:

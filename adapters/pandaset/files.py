@@ -101,9 +101,8 @@ def read_sequence(root: Path) -> Sequence:
 
 
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """world_from_ego [F, 4, 4] in the dataset's own world, and the times [F] of the sweeps' ends.
-
-    Remembered as long as the files stay as they are."""
+    """world_from_ego [F, 4, 4] in the dataset's own world and the times [F] of the sweeps' ends,
+    remembered as long as the files stay as they are."""
     files = [root / "lidar" / name for name in ("poses.json", "timestamps.json")]
     state = tuple((f.stat().st_mtime_ns, f.stat().st_size) if f.exists() else None for f in files)
     return _ego_track(root, state)
@@ -327,11 +326,9 @@ _CLASSES: tuple[tuple[str, int], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """The objects of a sequence. names: by uuid, the object's name: that of its best box. ranks: by
-    uuid, which of an object's boxes to keep of those that a frame has: the lowest.
-
-    The best is the one with boxes in most frames, so that a track keeps to one sensor; then the
-    spinning sensor's, which sees all around; then the first in the files."""
+    """names: by uuid, the object's name: that of its best box, the one with boxes in most frames,
+    then the spinning sensor's, then the first in the files. ranks: by uuid; of an object's boxes in
+    one frame the lowest is kept."""
 
     names: Mapping[str, str]
     ranks: Mapping[str, int]
@@ -352,9 +349,8 @@ def sensors_of(table: pd.DataFrame) -> list[int]:
 
 
 def read_objects(root: Path) -> Objects:
-    """The objects of all frames of a sequence; remembered as long as its files stay as they are.
-
-    A table that cannot be read says nothing here: it is an error of its own frame."""
+    """The objects of all frames, remembered as long as the files stay as they are. A table that
+    cannot be read is an error of its own frame, not here."""
     paths = sorted((root / "annotations" / "cuboids").glob("*.pkl.gz"))
     frames = [(int(path.name[:-7]), path.stat()) for path in paths if path.name[:-7].isdecimal()]
     return _read_objects(root, tuple((n, s.st_mtime_ns, s.st_size) for n, s in frames))
@@ -374,12 +370,9 @@ def _read_objects(root: Path, state: tuple[tuple[int, int, int], ...]) -> Object
 
 
 def find_objects(tables: Mapping[int, pd.DataFrame]) -> Objects:
-    """The objects in the cuboids of some frames, by frame.
-
-    By links in both directions, then by those in one, then, of boxes without a partner, by overlap:
-    of one class, of both sensors where the tables name these, and MIN_OVERLAP at least on average
-    over the frames that have both. A tie is refused where it would make two boxes of one sensor in
-    one frame the same object."""
+    """The objects in the cuboids of some frames: tied by links in both directions, then in one,
+    then, without a partner, by overlap: boxes of one class and both sensors that share MIN_OVERLAP
+    on average. No tie makes two boxes of one sensor in one frame the same object."""
     boxes = _Boxes.of(tables)
     group = {uuid: [uuid] for uuid in boxes.frames}
     for a, b in [*_links(tables, boxes), *_overlapping(tables, boxes)]:
@@ -573,10 +566,8 @@ def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -
 
 
 def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
-    """A frame's cuboids as boxes.
-
-    PandaSet's box has its length along y and its width along x, turned by yaw from world axes;
-    here x is forward, so the heading is a quarter turn more and the first two sizes swap."""
+    """A frame's cuboids as boxes. PandaSet's have their length along y and their width along x: the
+    heading is a quarter turn more than yaw and the first two sizes swap."""
     half = (table["yaw"].to_numpy(dtype=np.float64) + np.pi / 2) / 2
     zero = np.zeros_like(half)
     dimensions = [table[f"dimensions.{axis}"].to_numpy(dtype=np.float64) for axis in "yxz"]

@@ -514,10 +514,8 @@ def _best_scene(
     objects: RecordedObjects,
     build: Callable[..., Scene],
 ) -> Scene:
-    """The scene from LiDAR, else from depth images, else from guesses.
-
-    used: the frames that are not held out. build: from sweeps, options, the highest elevation in
-    degrees that the sensor looks at, and what was missing."""
+    """The scene from LiDAR, else from depth images, else from guesses. used: frames not held out.
+    build: from sweeps, options, the sensor's highest elevation in degrees, and what was missing."""
     lidar = read_lidar_drive(root, calibration, used)
     if len(lidar) >= _MIN_RETURNS:
         return build(lidar.sweeps, options, lidar.top_deg, lidar.problems)
@@ -575,9 +573,8 @@ def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...]
 
 
 def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
-    """Points of a depth image [H, W], at most about _POINTS_PER_IMAGE, on a regular grid of pixels.
-
-    Left out: no depth, far depth, and pixels on edges between near and far."""
+    """Points of a depth image [H, W], about _POINTS_PER_IMAGE at most, on a regular grid of pixels;
+    none without depth, far away, or on edges between near and far."""
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
     usable = (depth_m > 0) & (depth_m < _MAX_DEPTH_M)
     usable[1:-1] &= _is_straight(inverse[:-2], inverse[1:-1], inverse[2:])
@@ -620,10 +617,8 @@ def check_cameras_above(path: Path, frames: Sequence[Frame], road: np.ndarray) -
 def guess_surfaces(
     road: np.ndarray, moving: Sequence[BoxSample], still: Sequence[BoxSample]
 ) -> tuple[Sweep, ...]:
-    """Points on the ground around the path and on the sides and tops of all boxes.
-
-    road: float64 [F, 3], see `ground_heights`. Where the ground is between poses is the nearest
-    pose's height."""
+    """Points on the ground around the path (road: float64 [F, 3], the nearest pose's height counts)
+    and on the sides and tops of all boxes."""
     once = {box.object_id: box for box in reversed(moving)}
     things = [(_ground(road), _NEVER_NS)]
     things += [(_box_surface(box), _NEVER_NS) for box in still]
@@ -632,10 +627,8 @@ def guess_surfaces(
 
 
 def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussians:
-    """At most about `count` Gaussians at the distances _SHELLS_M along rays of the images.
-
-    Each ray gets one of the distances, its neighbours others. Nothing where the car drove, under
-    the ground, or where an image cannot be decoded."""
+    """About `count` Gaussians at the distances _SHELLS_M along rays of the images, neighbours at
+    different ones; none where the car drove, under the ground, or without an image."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))]
     tree = cKDTree(road[:, :2])
     parts = []

@@ -65,9 +65,8 @@ _INTENSITY, _SENSOR = ("intensity", "i"), ("sensor", "d")
 @dataclass(frozen=True)
 class CameraOffset:
     """Where a camera's images lie beside the LiDAR's returns, pixels at `width_px` columns.
-
-    angle_deg: the same as an angle. is_sure: the shift stands out, lies within the range searched,
-    and two halves of the frames agree on it."""
+    is_sure: the shift stands out, lies within the range searched, and two halves of the frames
+    agree."""
 
     camera: str
     right_px: float
@@ -96,9 +95,8 @@ class Points(NamedTuple):
 def measure_offset(
     returns: Mapping[int, Returns], views: RecordedViews, cameras: Mapping[ViewKey, Camera]
 ) -> CameraOffset | None:
-    """The shift of one camera's images; None if fewer than 3000 returns are seen.
-
-    returns: by frame. cameras: the views to compare, at any resolution."""
+    """The shift of one camera's images; None if fewer than 3000 returns (by frame) are seen.
+    cameras: the views to compare, at any resolution."""
     seen = [
         project_returns(
             returns[key.frame], views, key, camera,
@@ -409,10 +407,8 @@ def _offset_problem(offset: CameraOffset) -> list[str]:
 
 
 def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
-    """A sentence for each sudden change of brightness between neighbouring images of a camera.
-
-    The change is the median, over blocks of the image, of the logarithm of their ratio, so that
-    what moves through the image hardly counts."""
+    """A sentence for each sudden change of brightness between neighbouring images of a camera: the
+    median, over blocks, of the logarithm of their ratio, so that what moves hardly counts."""
     if len(keys) < 3:
         return []
     levels = [_block_stops(views.image(key)) for key in keys]

@@ -375,11 +375,8 @@ def hidden_returns(
 
 
 def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
-    """Which returns the camera sees too, bool [M].
-
-    The LiDAR stands elsewhere and looks past objects that hide what is behind them from the camera.
-    A return counts as hidden if clearly nearer ones are among its neighbours on three sides. Those
-    hidden just behind an edge are not found."""
+    """Which returns the camera sees too, bool [M]: those without clearly nearer ones among their
+    neighbours on three sides. Those hidden just behind an edge are not found."""
     if len(seen) == 0:
         return np.zeros(0, np.bool_)
     pixels = seen.uv[:, 1] * np.int32(camera.width) + seen.uv[:, 0]

@@ -65,9 +65,8 @@ _WHITE = 128
 
 
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
-    """Highest elevation that the LiDAR looks at, as cameras see it; None without enough returns.
-
-    Measured from the returns of the given frames: it is too low where nothing tall stood near."""
+    """Highest elevation that the LiDAR looks at, as cameras see it, from the frames' returns (too
+    low where nothing tall stood near); None without enough of them."""
     tops = []
     for index in frames:
         frame = scene.frame(index)
@@ -87,10 +86,9 @@ def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
 def sky_mask(
     scene: Scene, camera: Camera, rgb: np.ndarray, returns: np.ndarray, lidar_top_rad: float | None
 ) -> np.ndarray:
-    """Pixels of the view that surely show sky, bool [H, W]; none where nothing can be known.
-
-    scene: as initialised from LiDAR. rgb: uint8 [H, W, 3], the recorded image. returns:
-    int [M], flat indices of pixels with a LiDAR return."""
+    """Pixels of the view that surely show sky, bool [H, W]; none where nothing can be known. scene:
+    as initialised from LiDAR. rgb: uint8 [H, W, 3]. returns: int [M], pixels with a LiDAR
+    return."""
     none = np.zeros((camera.height, camera.width), np.bool_)
     if lidar_top_rad is None:
         return none
@@ -121,9 +119,8 @@ def _above_surfaces(camera: Camera, drawn: np.ndarray, lidar_top_rad: float) -> 
 
 
 def looks_like_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Pixels that are smooth and about as bright as the bright part of the candidates, bool [H, W].
-
-    Clouds pass; walls, foliage and wires do not, unless they are as bright and as smooth."""
+    """Pixels as smooth and about as bright as the bright part of the candidates, bool [H, W]:
+    clouds pass; walls, foliage and wires seldom do."""
     if not candidates.any():
         return np.zeros_like(candidates)
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -154,11 +151,9 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 
 
 def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
-    """Pixels that show the recording car, bool [H, W], from one camera's images over time.
-
-    cameras, images: as the car moved, in order (see `moving_frames`), of one size; uint8
-    [H, W, 3]. Nothing is found in fewer than six images, above the horizon, or where the car shows
-    no edge across the direction of motion."""
+    """Pixels that show the recording car, bool [H, W], from one camera's images uint8 [H, W, 3] in
+    the order in which the car moved (see `moving_frames`). Nothing is found in fewer than six,
+    above the horizon, or where the car shows no edge across the motion."""
     height, width = images[0].shape[:2] if images else (0, 0)
     if len(images) < _MIN_IMAGES:
         return np.zeros((height, width), np.bool_)
@@ -225,10 +220,8 @@ def _evidence(images: Sequence[np.ndarray], size: tuple[int, int], flow: np.ndar
 
 
 def _car_tops(evidence: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """The first row of the car in each column, int [W]; the height where there is none.
-
-    A column's score is the sum of the evidence from the bottom up to there; of all lines through
-    the columns the one of most score and fewest steps is found (Viterbi)."""
+    """The first row of the car in each column, int [W]; the height where there is none: of all
+    lines through the columns that of most evidence below it and fewest steps (Viterbi)."""
     height, width = evidence.shape
     first = int((~unknown).any(axis=1).argmax())  # the rows above cannot be the car
     evidence, unknown = evidence[first:], unknown[first:]

@@ -85,10 +85,8 @@ class Rims:
 
 @dataclass(frozen=True, eq=False)
 class WallView:
-    """A view at COARSE_WIDTH or less, H x W.
-
-    rgb: uint8 [H, W, 3]. depth_m: float32 [H, W]: z of the surface drawn; above a surface that
-    probably goes on, minus the z of its vertical continuation; infinite where nothing is.
+    """A view at COARSE_WIDTH or less. rgb: uint8 [H, W, 3]. depth_m: float32 [H, W]: z of the
+    surface drawn; minus that of its vertical continuation above it; infinite where nothing is.
     used: bool [H, W]. sky_counts: float32 [_SIDE^3], how often each coarse colour is sure sky."""
 
     camera: Camera
@@ -119,10 +117,8 @@ def colour_cells(rgb: np.ndarray) -> np.ndarray:
 
 
 def sky_colours(own: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Which coarse colours look like sky in an image, bool [_SIDE^3].
-
-    own: counts of the image's sure sky; others: of all images of its camera, for an image that
-    shows too little sky. Without any sky only white is taken for it."""
+    """Which coarse colours look like sky, bool [_SIDE^3], by the image's own counts, or those of
+    its camera where it shows too little. Without any sky only white does."""
     counts = own if own.sum() >= _ENOUGH_SKY else others
     if counts.sum() < _ENOUGH_SKY:
         luma = np.indices((_SIDE,) * 3).reshape(3, -1).min(axis=0)
@@ -346,11 +342,8 @@ def _without_holes(
 
 
 def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) -> Gaussians:
-    """Degree-0 Gaussians that continue the background above the LiDAR's view; perhaps none.
-
-    scene: as initialised from LiDAR. source: recorded views whose `sky` masks tell what sky looks
-    like and whose `weight` masks out the recording car. lidar_top_deg: highest elevation that the
-    LiDAR looks at. Deterministic."""
+    """Degree-0 Gaussians that continue the background above the LiDAR's view; perhaps none. source:
+    views whose `sky` tells what sky looks like and whose `weight` masks out the recording car."""
     every = max(1, math.ceil(len(source.train) / MAX_VIEWS))
     by_camera: dict[str, list[ViewKey]] = defaultdict(list)
     for key in source.train:
@@ -558,10 +551,8 @@ def _median_colours(
 
 def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points on the rays through pixels of the grid, float64 [N, 3] in the camera's frame, and the
-    distance from one to the next, float64 [N].
-
-    They lie on a level surface below the camera, such as a roof, as far away as a car's width
-    allows; where a ray does not go down, on an upright one."""
+    distance from one to the next [N]: on a level surface below the camera, such as a roof, as far
+    as a car's width allows; where a ray does not go down, on an upright one."""
     x = (columns + 0.5 - grid.cx) / grid.fx
     y = (rows + 0.5 - grid.cy) / grid.fy
     far_m = float(np.clip(_HALF_WIDTH_M / max(np.abs(x).max(), 1e-6), _BODY_NEAR_M, _BODY_FAR_M))
