@@ -102,27 +102,6 @@ def test_effects_without_strength_change_no_bit_of_another_effect(effect: str, d
     assert_same_bits(render_view(scene, camera, zero), render_view(scene, camera, recipe))
 
 
-@drawing(3)
-@given(cameras(), recipes(frozenset({"smog"})), st.sampled_from(("sky", "mirrored")))
-def test_water_below_everything_changes_no_bit(camera: Camera, recipe: Recipe, tier: str):
-    scene = Place(nothing(), sky=3, on_street=True).scene()
-    flood = {"level_m": -10.0, "reference": "absolute", "reflection": tier}
-    flooded = render_view(scene, camera, with_effects(recipe, {"flood": flood}))
-    assert_same_bits(flooded, render_view(scene, camera, recipe))
-    assert flooded.water is not None and not flooded.water.any()
-
-
-@drawing(3)
-@given(places(), recipes(frozenset()), st.sampled_from((0.05, 1.0)))
-def test_water_behind_the_camera_changes_no_bit(place: Place, recipe: Recipe, level_m: float):
-    """Above the water and looking up, no ray meets it."""
-    camera = camera_at((2.0, 0.0, 1.2), pitch_deg=60, fov_deg=80)
-    flood = {"level_m": level_m, "reference": "absolute"}
-    scene = place.scene()
-    flooded = render_view(scene, camera, with_effects(recipe, {"flood": flood}))
-    assert_same_bits(flooded, render_view(scene, camera, recipe))
-
-
 @pytest.mark.parametrize("tier", ["sky", "screen_space", "mirrored"])
 def test_waves_without_height_are_still_water(tier: str):
     scene = Place(nothing(), sky=3, on_street=True).scene()

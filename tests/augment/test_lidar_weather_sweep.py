@@ -15,8 +15,7 @@ from augment.cameras import Camera
 from augment.effects.lidar import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.effects.lidar.beam import origins_of, weathered_sweep
 from augment.errors import OutputError
-from augment.jobs.files import has_lidar
-from augment.jobs.manifest import lidar_notes, read_manifest
+from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
@@ -148,6 +147,7 @@ def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarS
     return np.abs(z[seen] - view.depth_m[at])[(view.snow[at] == 255) & (view.depth_m[at] > 0)]
 
 
+@pytest.mark.long
 def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
     scene = open_street(LABELLED_STREET)
     deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
@@ -205,18 +205,3 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
     assert failed == 1 and shown[1] == (None, None) and shown[0][0] == "weather"
     with pytest.raises(OutputError, match="recipe hash there"):
         outcome(strict, tmp_path / "out")
-
-
-def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
-    clean = {"lidar": True, "depth": "none"}
-    snowy = [make_recipe("snowy", n, snow=Snow(depth_m=0.1 + n), **clean) for n in range(3)]
-    dry, wet = make_recipe("dry", **clean), make_recipe("wet", flood=Flood(level_m=0.1))
-    assert lidar_notes([*snowy, dry, wet]) == [
-        "snowy-000: LiDAR passes through clean: snow 0.1 m deep in images and depth, not in sweeps "
-        "(output: {lidar: true, surface: solid}), and 2 more likewise",
-        "wet-000: LiDAR meets the weather: water in images and sweeps, not in depth "
-        "(output: {lidar: auto, surface: solid})",
-    ]
-    scene = open_fake("fake:street")
-    assert has_lidar(scene, [3, 0]) and not has_lidar(scene, [3])
-    assert not has_lidar(dataclasses.replace(scene, labels=None), [0])

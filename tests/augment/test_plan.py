@@ -29,35 +29,32 @@ def plan_of(smog: Smog | None = None, **output) -> Plan:
     return make_plan(Recipe(weather=Weather(smog=smog), output=Output(**output)), scene())
 
 
-def running(plan: Plan) -> set[str]:
-    return {step.name for step in plan.steps if step.runs}
+RGBA, DRAWN = {"rgb", "alpha"}, {"rasterise", "sky"}
 
 
-def test_no_weather_asks_for_colour_and_nothing_else():
-    plan = plan_of()
-    assert plan.buffers == {"rgb", "alpha"}
-    assert plan.smog is None
-    assert running(plan) == {"rasterise", "sky"}
-
-
-def test_smog_without_density_is_the_clean_plan():
-    clean, nothing = plan_of(), plan_of(Smog(extinction_per_m=0.0))
-    assert nothing.buffers == clean.buffers and nothing.smog is None
-    assert running(nothing) == running(clean)
-
-
-def test_smog_per_gaussian_needs_no_depth_and_uniform_smog_no_sky():
-    plan = plan_of(Smog(visibility_m=100))
-    assert plan.buffers == {"rgb", "alpha"}
-    assert running(plan) == {"rasterise", "smog per Gaussian"}
-    assert plan.smog_in_splats is not None
-    assert plan.smog_in_splats.sigma_per_m == pytest.approx(0.03912)
-
-
-def test_deferred_smog_needs_expected_depth():
-    plan = plan_of(Smog(visibility_m=100, model="deferred"))
-    assert plan.buffers == {"rgb", "alpha", "expected_depth"}
-    assert plan.smog_in_splats is None and plan.smog_on_buffers is not None
+@pytest.mark.parametrize(
+    ("smog", "output", "buffers", "steps"),
+    [
+        (None, {}, RGBA, DRAWN),
+        (Smog(extinction_per_m=0.0), {}, RGBA, DRAWN),
+        (Smog(visibility_m=100), {}, RGBA, {"rasterise", "smog per Gaussian"}),
+        (Smog(visibility_m=100, scale_height_m=30), {}, RGBA, {*DRAWN, "smog per Gaussian"}),
+        (
+            Smog(visibility_m=100, model="deferred"),
+            {},
+            {*RGBA, "expected_depth"},
+            {"rasterise", "smog on buffers"},
+        ),
+        (None, {"depth": "median"}, {*RGBA, "median_depth"}, {*DRAWN, "depth image"}),
+        (None, {"depth": "expected"}, {*RGBA, "expected_depth"}, {*DRAWN, "depth image"}),
+        (None, {"semantic": True}, {*RGBA, "splat_ids"}, {*DRAWN, "semantic image"}),
+        (None, {"instance": True}, {*RGBA, "splat_ids"}, {*DRAWN, "instance image"}),
+    ],
+)
+def test_a_plan_asks_for_what_the_picture_needs(smog, output, buffers, steps):
+    plan = plan_of(smog, **output)
+    assert plan.buffers == buffers
+    assert {step.name for step in plan.steps if step.runs} == steps
 
 
 class Labels:
@@ -97,17 +94,10 @@ def test_instance_images_need_the_depth_and_class_of_boxes_without_an_actor():
     assert make_plan(recipe, scene()).buffers == {"rgb", "alpha", "splat_ids"}
 
 
-def test_smog_with_a_scale_height_stands_on_the_road_and_shows_sky():
+def test_smog_stands_on_the_road():
     plan = plan_of(Smog(visibility_m=100, scale_height_m=30, base_height_m=2))
-    assert running(plan) == {"rasterise", "smog per Gaussian", "sky"}
     assert plan.smog is not None and plan.smog.base_z_m == 2.25
-
-
-def test_outputs_ask_for_their_buffer():
-    assert plan_of(depth="median").buffers == {"rgb", "alpha", "median_depth"}
-    assert plan_of(depth="expected").buffers == {"rgb", "alpha", "expected_depth"}
-    assert plan_of(semantic=True).buffers == {"rgb", "alpha", "splat_ids"}
-    assert plan_of(instance=True).buffers == {"rgb", "alpha", "splat_ids"}
+    assert plan.smog.sigma_per_m == pytest.approx(0.03912)
 
 
 def test_a_scale_height_over_an_unknown_road_is_an_error_that_says_what_to_do():

@@ -382,26 +382,6 @@ def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
         assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())
 
 
-def test_two_cameras_see_one_surface():
-    waves = SETS["24"]  # 0.4 m and longer
-    first = camera_at([0.0, 0, 2.0], down_deg=30, focal=400.0)
-    row, column = 40, 33
-    ray = first.ray_directions(torch.float64)[row, column]
-    point = first.centre - first.centre[2] / ray[2] * ray
-    second = camera_at([7.0, -1, 3.0], down_deg=25, yaw_deg=140, roll_deg=8, focal=500.0)
-    x, y, z = (second.camera_from_world @ torch.cat([point, torch.ones(1)]))[:3].tolist()
-    assert z > 0
-    # The principal point is moved until the centre of pixel (20, 50) is where the point appears.
-    second = dataclasses.replace(second, cx=50.5 - second.fx * x / z, cy=20.5 - second.fy * y / z)
-    expected = wave_normals(waves, point[:2], NOW)[:2].tolist()
-    for backend in ("cpu", "reference", "cuda"):
-        for camera, i, j in ((first, row, column), (second, 20, 50)):
-            alone = camera.cropped(0, i, camera.width, 1)
-            field = fields_of(waves, alone, backend=backend)[:, 0, j]
-            assert field[2] == 0  # nothing is faded
-            assert field[:2].tolist() == pytest.approx(expected, abs=1e-5)  # the contract
-
-
 def test_the_distance_does_not_glitter():
     waves = make_waves(Waves(preset="wind"), seed=0, depth_m=0.5)
     camera = camera_at([0.0, 0, 1.5], down_deg=1.0, size=(9, 400), focal=900.0)
