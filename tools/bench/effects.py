@@ -384,7 +384,6 @@ OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}
 EDGE_PX = 3  # pixels this close to the water's border show two surfaces; splats overhang as far
 DARK, LIT = 2 / 255, 8 / 255  # a black pixel, and what it is compared with when it should not be
 BLOCK = 32
-REACH_M = 80.0  # farther out a pixel is metres long and shows many things at once
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
 
 
@@ -415,7 +414,15 @@ def flood_tables(case: EffectCase, repeats: int) -> list[Table]:
     columns = ("view", "picture", "PSNR dB", "p99", "black", f"worst {BLOCK}x{BLOCK}", "at")
     title = f"Errors inside the water, channels in 1/255: {case.street}"
     masks = water_masks(street, truth, case.frames, scale=case.scale / 2)
-    return [*tables, Table(title, columns, rows), *masks]
+    return [
+        *tables,
+        Table(title, columns, rows),
+        Table(
+            "Masks of water against the truth: shares of pixels",
+            ("view", "agreeing", "away from silhouettes", "which are"),
+            masks,
+        ),
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -556,64 +563,24 @@ def fresnel_by_angles(cosine: np.ndarray, index: float) -> np.ndarray:
     return np.where(steep, ((index - 1) / (index + 1)) ** 2, share)
 
 
-@dataclass(frozen=True, eq=False)
-class WaterView:
-    """One camera's mask and the truth. drawn, true [H, W]: water is first. depth [H, W]: z of the
-    plane, infinite where the ray does not meet it.
-    """
-
-    camera: Camera
-    drawn: np.ndarray
-    true: np.ndarray
-    depth: np.ndarray
-
-
-def water_view(scene: Scene, truth: StreetTruth, camera: Camera, recipe: Recipe) -> WaterView:
-    medium = make_plan(recipe, scene).flood
-    assert medium is not None
-    depth = plane_depth(camera, medium.level_z_m).numpy()
-    true = np.isfinite(depth) & (truth.render(camera).depth > depth)
-    return WaterView(camera, draw_picture(scene, camera, recipe).water, true, depth)
-
-
-def mask_error(view: WaterView) -> dict[str, float]:
-    """Share of a view's pixels whose mask is the true one, and of those away from silhouettes,
-    beyond which splats reach a little.
-    """
-    same, clear = view.drawn == view.true, inside(view.true) | inside(~view.true)
-    return {
-        "agreeing": float(same.mean()),
-        "agreeing_off_silhouettes": float(same[clear].mean()),
-        "clear_share": float(clear.mean()),
-    }
-
-
 def water_masks(
     scene: Scene, truth: StreetTruth, frames: Sequence[int], *, scale: float
-) -> list[Table]:
-    """Masks of every camera against the truth. Of points of the plane that two views of one moment
-    truly see, away from silhouettes: the share that both masks show as water.
+) -> list[list[str | float]]:
+    """By view: the share of its pixels whose mask of water is the true one; the same away from
+    silhouettes, beyond which splats reach a little; and how many of the pixels those are.
     """
-    views: dict[Camera, WaterView] = {}
-
-    def seen(camera: Camera) -> MaskedView:
-        view = views[camera] = water_view(scene, truth, camera, flood_recipe("sky"))
-        near = inside(view.true) & (view.depth <= REACH_M)
-        depth = np.where(np.isfinite(view.depth), view.depth, 0.0)
-        shown = DepthView(camera, np.zeros((*depth.shape, 3)), depth, near.astype(np.float64))
-        return MaskedView(shown, view.drawn)
-
-    agreement = [row[:4] for row in mask_agreement(view_pairs(scene, frames, scale), seen)]
-    errors = [
-        [f"{camera.name} at {camera.timestamp_ns} ns", *mask_error(view).values()]
-        for camera, view in views.items()
-    ]
-    title, columns = "Masks of water against the truth: shares of pixels", ("view", "agreeing")
-    pairs = ("other view", "points", "agreeing", "worst pair")
-    return [
-        Table(title, (*columns, "away from silhouettes", "which are"), errors),
-        Table("Masks of two views, where both truly see the water", pairs, agreement),
-    ]
+    rows: list[list[str | float]] = []
+    recipe = flood_recipe("sky")
+    medium = make_plan(recipe, scene).flood
+    assert medium is not None
+    for camera in (c.scaled(scale) for n in frames for c in scene.frame(n).cameras.values()):
+        depth = plane_depth(camera, medium.level_z_m).numpy()
+        true = np.isfinite(depth) & (truth.render(camera).depth > depth)
+        same = draw_picture(scene, camera, recipe).water == true
+        clear = inside(true) | inside(~true)
+        shares = (same.mean(), same[clear].mean(), clear.mean())
+        rows.append([f"{camera.name} at {camera.timestamp_ns} ns", *map(float, shares)])
+    return rows
 
 
 # ---- snow: placement, what it covers and should not, its height ----------------------------------
@@ -663,24 +630,23 @@ def snow_tables(case: EffectCase, repeats: int) -> list[Table]:
 
 
 def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
-    """Seconds of finding where snow can lie for all cameras, by stage, and of snow laid on it."""
+    """Seconds of finding where snow can lie for all cameras, and of snow laid on it."""
     scene = open_scene(uri)
     cameras = all_cameras(scene)
     settings = placement_settings(Snow(depth_m=0, cell_m=case.cell_m))
-    supports = [place_snow_support(scene, cameras, settings) for _ in range(1 + min(repeats, 3))]
-    stages = {
-        stage: [each.seconds[stage] for each in supports[1:]] for stage in supports[0].seconds
-    }
+    support = place_snow_support(scene, cameras, settings)
+    find = functools.partial(place_snow_support, scene, cameras, settings)
+    stages = rounds({"all": find}, min(repeats, 3))
     depths_m = itertools.cycle((0.05, 0.1, 0.3))  # what was laid last does not help the next
 
     def lay(shading: str) -> object:
         snow = Snow.model_validate({"depth_m": next(depths_m), "shading": shading})
-        return build_snow_layer(supports[0], scene, snow, illumination_of(scene, snow), seed=0)
+        return build_snow_layer(support, scene, snow, illumination_of(scene, snow), seed=0)
 
     laid = rounds({name: functools.partial(lay, name) for name in SHADINGS}, repeats)
     stages |= {f"another depth, {name}": seconds for name, seconds in laid.items()}
     mib = peak_mib_in_subprocess(_placement_of, (uri, case.cell_m)) if case.memory else None
-    support, on_vehicles = supports[0], sum(map(len, supports[0].actors.values()))
+    on_vehicles = sum(map(len, support.actors.values()))
     return Table(
         f"Placement: {uri}, {len(cameras)} cameras, cells of {case.cell_m:g} m",
         ("stage", "seconds", "least"),

@@ -17,7 +17,6 @@ import itertools
 import math
 import statistics
 import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -464,25 +463,14 @@ def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
     """Seconds of finding where snow can lie, for all cameras, on the host's clock."""
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
-    stages: dict[str, list[float]] = defaultdict(list)
-    cells = 0
-
-    def place() -> None:
-        nonlocal cells
-        found = place_snow_support(scene, cameras, settings, backend=BACKEND)
-        cells = len(found.ground)
-        for name, seconds in found.seconds.items():
-            stages[name].append(seconds)
-
-    seconds = rounds({"place": place}, PLACEMENTS)["place"]
+    place = functools.partial(place_snow_support, scene, cameras, settings, backend=BACKEND)
     return {
         "scene": scene.name,
         "uri": uri,
         "gaussians": len(scene.background) + sum(len(a.gaussians) for a in scene.actors),
         "cameras": len(cameras),
-        "cells": cells,
-        "place_s": spread(seconds),
-        "stages_s": {name: statistics.median(each[1:]) for name, each in stages.items()},
+        "cells": len(place().ground),
+        "place_s": spread(rounds({"place": place}, PLACEMENTS)["place"]),
         "peak_mib": peak_gpu_mib(place)[0],
     }
 
@@ -732,12 +720,12 @@ def gpu_tables(found: Figures) -> list[Table]:
         title = f"Street, {frames['gaussians']:,} Gaussians, {frames['camera']}"
         tables.append(Table(title, columns, rows))
     if "scenes" in found["placement"]:
-        columns, rows = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90", "slowest"), []
-        for each in found["placement"]["scenes"]:
-            slowest = sorted(each["stages_s"].items(), key=lambda item: -item[1])[:3]
-            stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in slowest)
-            counts = (each["gaussians"], each["cameras"], each["cells"])
-            rows.append((each["scene"], *counts, *each["place_s"].values(), stages))
+        columns = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90")
+        keys = ("scene", "gaussians", "cameras", "cells")
+        rows = [
+            (*map(each.get, keys), *each["place_s"].values())
+            for each in found["placement"]["scenes"]
+        ]
         tables.append(Table("Where snow lies, once a scene", columns, rows))
     if "frames" in found["agreement"]:
         each = found["agreement"]
