@@ -514,7 +514,7 @@ def _actors(
             f"{owners.min()} to {owners.max()}"
         )
     instances = read_instances(run.data)
-    identities = identify(poses, instances or (), model_from_dataset(run), run.frames)
+    identities = identify(poses, list(instances.values()), model_from_dataset(run), run.frames)
     unknown = [f"rigid-{i}" for i, identity in enumerate(identities) if identity is None]
     if unknown:
         reason = "" if instances else f" ({run.data} holds no instances/instances_info.json)"

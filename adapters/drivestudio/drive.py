@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from pydantic import (
+    AliasPath,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -618,83 +619,64 @@ def _rows(*shape: int) -> BeforeValidator:
     return BeforeValidator(parse)
 
 
-class _Annotations(BaseModel):
+def _in_file(name: str) -> Any:
+    return Field(validation_alias=AliasPath("frame_annotations", name))
+
+
+class Instance(BaseModel):
+    """One object over the data's frames, in the dataset's world and its boxes' axes.
+
+    frames: int64 [T], each once, ascending. poses: float64 [T, 4, 4]. sizes_m: float64 [T, 3] along
+    the box's x, y and z.
+    """
+
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
-    frame_idx: Annotated[np.ndarray, _rows()]
-    obj_to_world: Annotated[np.ndarray, _rows(4, 4)]
-    box_size: Annotated[np.ndarray, _rows(3)]
+    track_id: Annotated[str, BeforeValidator(str)] = Field(alias="id")
+    label: Any = Field(None, alias="class_name")
+    frames: Annotated[np.ndarray, _rows()] = _in_file("frame_idx")
+    poses: Annotated[np.ndarray, _rows(4, 4)] = _in_file("obj_to_world")
+    sizes_m: Annotated[np.ndarray, _rows(3)] = _in_file("box_size")
 
     @model_validator(mode="after")
-    def _fits(self) -> _Annotations:
-        counts = len(self.frame_idx), len(self.obj_to_world), len(self.box_size)
+    def _fits(self) -> Instance:
+        counts = len(self.frames), len(self.poses), len(self.sizes_m)
         if len(set(counts)) != 1:
             raise ValueError(
                 f"frame_idx, obj_to_world and box_size must be of equal length; got {counts}"
             )
-        numbers = self.frame_idx.astype(np.int64)
-        if (numbers != self.frame_idx).any() or (np.diff(np.sort(numbers), prepend=-1) < 1).any():
+        order = np.argsort(self.frames, kind="stable")
+        numbers = self.frames.astype(np.int64)[order]
+        if (numbers != self.frames[order]).any() or (np.diff(numbers, prepend=-1) < 1).any():
             raise ValueError("frame_idx must list frame numbers, each once")
-        rotations = self.obj_to_world[:, :3, :3]
+        rotations = self.poses[:, :3, :3]
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(initial=0)
-        if error > 1e-3 or (np.linalg.det(rotations) < 0).any() or (self.box_size <= 0).any():
+        if error > 1e-3 or (np.linalg.det(rotations) < 0).any() or (self.sizes_m <= 0).any():
             raise ValueError(
                 "obj_to_world must be rotations and translations, and box_size > 0 (metres)"
             )
+        self.frames, self.poses, self.sizes_m = numbers, self.poses[order], self.sizes_m[order]
+        if not (isinstance(self.label, str) and self.label):
+            self.label = "unknown"
         return self
 
 
-class _Object(BaseModel):
-    id: Any
-    class_name: Any = None
-    frame_annotations: _Annotations
-
-
-class _Objects(RootModel[dict[Annotated[str, Field(pattern="^[0-9]{1,9}$")], _Object]]):
+class _Instances(RootModel[dict[Annotated[int, Field(ge=0, lt=10**9)], Instance]]):
     pass
 
 
-@dataclass(frozen=True, eq=False)
-class Instance:
-    """One object over the data's frames, in the dataset's world and its boxes' axes.
-
-    number: its key in the file. frames: int64 [T], each once, ascending. poses: float64 [T, 4, 4].
-    sizes_m: float64 [T, 3] along the box's x, y and z.
-    """
-
-    number: int
-    track_id: str
-    label: str
-    frames: np.ndarray
-    poses: np.ndarray
-    sizes_m: np.ndarray
-
-
-def read_instances(data: Path) -> tuple[Instance, ...] | None:
-    """All objects, by their numbers; None without the file."""
+def read_instances(data: Path) -> dict[int, Instance]:
+    """All objects by their numbers, which are their keys in the file; none without the file."""
     path = data / "instances" / "instances_info.json"
-    return _read_instances(path, path.stat().st_mtime_ns) if path.is_file() else None
+    return _read_instances(path, path.stat().st_mtime_ns) if path.is_file() else {}
 
 
 @functools.lru_cache(maxsize=2)  # labels ask for one frame after the other
-def _read_instances(path: Path, _written_ns: int) -> tuple[Instance, ...]:
-    instances = []
-    for key, entry in validate(_Objects, read_json(path), path, "table of objects").root.items():
-        notes, label = entry.frame_annotations, entry.class_name
-        order = np.argsort(notes.frame_idx, kind="stable")
-        instances.append(
-            Instance(
-                number=int(key),
-                track_id=str(entry.id),
-                label=label if isinstance(label, str) and label else "unknown",
-                frames=notes.frame_idx[order].astype(np.int64),
-                poses=notes.obj_to_world[order],
-                sizes_m=notes.box_size[order],
-            )
-        )
-    if len({found.track_id for found in instances}) != len(instances):
+def _read_instances(path: Path, _written_ns: int) -> dict[int, Instance]:
+    instances = validate(_Instances, read_json(path), path, "table of objects").root
+    if len({found.track_id for found in instances.values()}) != len(instances):
         raise AdapterError(f"{path}: ids of objects repeat; process the data again")
-    return tuple(sorted(instances, key=lambda found: found.number))
+    return dict(sorted(instances.items()))
 
 
 # ---- Boxes and LiDAR of the processed data a run was trained on, in the scene's world ------------
@@ -719,22 +701,23 @@ class DriveStudioLabels:
         scene = scene_from_dataset(self.run)
         object_from_actor = self.run.convention.object_from_actor
         found = [
-            (instance, int(at[0]))
-            for instance in read_instances(self.run.data) or ()
+            (number, instance, int(at[0]))
+            for number, instance in read_instances(self.run.data).items()
             if len(at := np.flatnonzero(instance.frames == frame_index))
         ]
         if not found:
             return Boxes.empty()
-        poses = scene @ np.stack([instance.poses[at] for instance, at in found])
+        numbers, instances, rows = zip(*found, strict=True)
+        poses = scene @ np.stack([i.poses[row] for i, row in zip(instances, rows, strict=True)])
         rotations = poses[:, :3, :3] @ object_from_actor
-        sizes = np.stack([instance.sizes_m[at] for instance, at in found])
+        sizes = np.stack([i.sizes_m[row] for i, row in zip(instances, rows, strict=True)])
         return Boxes(
-            track_ids=tuple(instance.track_id for instance, _ in found),
-            labels=tuple(instance.label for instance, _ in found),
+            track_ids=tuple(instance.track_id for instance in instances),
+            labels=tuple(instance.label for instance in instances),
             centers_m=poses[:, :3, 3].copy(),
             sizes_m=sizes @ np.abs(object_from_actor),
             quats=quat_from_rotmat(torch.from_numpy(rotations)).numpy(),
-            attributes={"instance": np.array([instance.number for instance, _ in found])},
+            attributes={"instance": np.array(numbers)},
         )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:

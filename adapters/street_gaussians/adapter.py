@@ -62,7 +62,6 @@ from adapters.street_gaussians.model import (
     is_dataset,
     read_checkpoint,
     read_ply_model,
-    rotations_of,
 )
 from adapters.training_views.byte_cache import ByteCache
 from adapters.uri import format_uri
@@ -70,7 +69,7 @@ from adapters.world import with_class_of
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError
-from augment.geometry import quat_from_rotmat
+from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Actor, ColorWaves, Scene, Track
 from augment.semantics import SemanticClass
@@ -238,7 +237,7 @@ def make_actor(
     )
     images = [data.images[i] for i in shown]
     ego_from_actor = np.tile(np.eye(4), (len(shown), 1, 1))
-    ego_from_actor[:, :3, :3] = rotations_of(poses.quats)
+    ego_from_actor[:, :3, :3] = rotmat_from_quat(torch.from_numpy(poses.quats)).numpy()
     ego_from_actor[:, :3, 3] = poses.positions
     world_from_ego = np.stack([image.world_from_ego for image in images])
     world_from_actor = np.linalg.inv(camera_changes[shown]) @ world_from_ego @ ego_from_actor

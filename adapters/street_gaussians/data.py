@@ -12,12 +12,13 @@ trained. Vehicle frame: x forward, y left, z up. Times are seconds as the datase
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -92,11 +93,9 @@ class ModelConfig(BaseModel):
         return pair
 
 
-@dataclass(frozen=True, eq=False)
-class Lens:
-    """camera_from_ego: float64 [4, 4], OpenCV axes. path: of the intrinsics, for messages."""
+class Lens(NamedTuple):
+    """camera_from_ego: float64 [4, 4], OpenCV axes."""
 
-    path: Path
     fx: float
     fy: float
     cx: float
@@ -118,9 +117,7 @@ class StreetImage:
     path: Path | None
     timestamp_s: float
     world_from_ego: np.ndarray
-    lens: Lens
-    width: int
-    height: int
+    camera: Camera
     is_held_out: bool
     number: int
 
@@ -236,7 +233,7 @@ def read_lens(root: Path, cam: int) -> Lens:
             f"{path} must begin with fx fy cx cy in pixels, fx and fy > 0; got {values.tolist()}"
         )
     ego_from_camera = read_pose(root / "extrinsics" / f"{cam}.txt")
-    return Lens(path, *values[:4].tolist(), invert_pose(ego_from_camera))
+    return Lens(*values[:4].tolist(), invert_pose(ego_from_camera))
 
 
 def read_ego_path(root: Path) -> EgoPath:
@@ -298,38 +295,6 @@ def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarr
     return filled
 
 
-def read_camera_moments(
-    root: Path, path: EgoPath, frames: Sequence[int], cams: Sequence[int]
-) -> tuple[dict[tuple[int, int], tuple[float, np.ndarray]], tuple[str, ...]]:
-    """Seconds and dataset_from_ego by frame and camera, and a sentence on missing ones."""
-    moments: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-    missing: list[Path] = []
-    known = [frame for frame in frames if path.is_known[path.numbers.index(frame)]]
-    for frame, cam in ((frame, cam) for frame in known for cam in cams):
-        file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
-        if not file.exists():
-            missing.append(file)
-            continue
-        seconds = path.camera_times_s[CAMERA_NAMES[cam]].get(frame)
-        if seconds is None:
-            raise AdapterError(
-                f"{root / TIMES}: {CAMERA_NAMES[cam]} lacks frame {frame:06d}, of which there "
-                f"is {file}; both must be of one conversion"
-            )
-        moments[frame, cam] = seconds, read_pose(file)
-    if not moments:
-        raise AdapterError(
-            f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
-            f"frames from {frames[0]} to {frames[-1]}; copy the whole folder from the dataset"
-        )
-    if not missing:
-        return moments, ()
-    return moments, (
-        f"{len(missing)} images are left out for want of the car's pose at their time, such as "
-        f"{missing[0]}",
-    )
-
-
 # ---- Images and their sizes, told by their first bytes -------------------------------------------
 
 _NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
@@ -376,9 +341,9 @@ def find_images(
         if not (0 < lens.cx < width and 0 < lens.cy < height):
             whose = "as its images are" if counts else "assumed for want of images"
             raise AdapterError(
-                f"{lens.path}: cx, cy (its third and fourth number) must lie in the "
-                f"{width}x{height} pixels of {name}, {whose}; got {lens.cx:g}, {lens.cy:g}. If the "
-                f"images were resized, scale fx fy cx cy with them"
+                f"{root}/intrinsics/{cam}.txt: cx, cy (its third and fourth number) must lie in "
+                f"the {width}x{height} pixels of {name}, {whose}; got {lens.cx:g}, {lens.cy:g}. If "
+                f"the images were resized, scale fx fy cx cy with them"
             )
     if without_images:
         problems.append(
@@ -648,7 +613,7 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
     poses[:, :3, 3] -= origin
     rows = slice(frames[0] - path.numbers[0], frames[-1] + 1 - path.numbers[0])
     times, world_from_ego = path.times_s[rows], poses[rows]
-    images, image_problems = _images(root, path, frames, cams, config, origin)
+    images, image_problems = _images(root, path, frames, config, origin)
 
     track_path, visible_path = track_files(root, use_tracker=config.use_tracker)
     table = read_track_table(track_path)
@@ -679,29 +644,13 @@ def frames_of(data: StreetData) -> tuple[Frame, ...]:
             index=number,
             timestamp_ns=round(float(seconds) * 1e9),
             world_from_ego=torch.from_numpy(pose.copy()),
-            cameras={image.name: camera_of(image) for image in by_frame[number]},
+            cameras={image.name: image.camera for image in by_frame[number]},
             image_paths={i.name: str(i.path) for i in by_frame[number] if i.path is not None},
         )
         for number, seconds, pose in zip(
             data.frames, data.frame_times_s, data.world_from_ego, strict=True
         )
         if number in by_frame
-    )
-
-
-def camera_of(image: StreetImage) -> Camera:
-    """The camera at the moment of the image, of the recorded size."""
-    camera_from_world = image.lens.camera_from_ego @ invert_pose(image.world_from_ego)
-    return Camera(
-        name=image.name,
-        width=image.width,
-        height=image.height,
-        fx=image.lens.fx,
-        fy=image.lens.fy,
-        cx=image.lens.cx,
-        cy=image.lens.cy,
-        camera_from_world=torch.from_numpy(camera_from_world),
-        timestamp_ns=image.timestamp_ns,
     )
 
 
@@ -733,23 +682,32 @@ def _select_frames(root: Path, there: range, config: ModelConfig) -> tuple[range
 
 
 def _images(
-    root: Path,
-    path: EgoPath,
-    frames: range,
-    cams: Sequence[int],
-    config: ModelConfig,
-    origin: np.ndarray,
-) -> tuple[tuple[StreetImage, ...], tuple[str, ...]]:
+    root: Path, path: EgoPath, frames: range, config: ModelConfig, origin: np.ndarray
+) -> tuple[tuple[StreetImage, ...], list[str]]:
+    """All images of the frames with a pose, by frame, then camera, and sentences on the rest."""
+    cams = sorted(config.cameras)
     lenses = {cam: read_lens(root, cam) for cam in cams}
-    paths, sizes, size_problems = find_images(root, frames, lenses)
-    moments, problems = read_camera_moments(root, path, frames, cams)
+    paths, sizes, problems = find_images(root, frames, lenses)
     held_out = held_out_steps(len(frames), config)
-    images = []
-    for number, (frame, cam) in enumerate((frame, cam) for frame in frames for cam in cams):
-        if (frame, cam) not in moments:
+    images, missing = [], []
+    for number, (frame, cam) in enumerate(itertools.product(frames, cams)):
+        name, lens = CAMERA_NAMES[cam], lenses[cam]
+        file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
+        if not path.is_known[path.numbers.index(frame)]:
             continue
-        timestamp_s, world_from_ego = moments[frame, cam]
+        if not file.exists():
+            missing.append(file)
+            continue
+        timestamp_s = path.camera_times_s[name].get(frame)
+        if timestamp_s is None:
+            raise AdapterError(
+                f"{root / TIMES}: {name} lacks frame {frame:06d}, of which there is {file}; both "
+                f"must be of one conversion"
+            )
+        world_from_ego = read_pose(file)
         world_from_ego[:3, 3] -= origin
+        camera_from_world = torch.from_numpy(lens.camera_from_ego @ invert_pose(world_from_ego))
+        time_ns = round(timestamp_s * 1e9)
         images.append(
             StreetImage(
                 frame=frame,
@@ -757,11 +715,19 @@ def _images(
                 path=paths.get((frame, cam)),
                 timestamp_s=timestamp_s,
                 world_from_ego=world_from_ego,
-                lens=lenses[cam],
-                width=sizes[cam][0],
-                height=sizes[cam][1],
+                camera=Camera(name, *sizes[cam], *lens[:4], camera_from_world, time_ns),
                 is_held_out=frames.index(frame) in held_out,
                 number=number,
             )
         )
-    return tuple(images), (*size_problems, *problems)
+    if not images:
+        raise AdapterError(
+            f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
+            f"frames from {frames[0]} to {frames[-1]}; copy the whole folder from the dataset"
+        )
+    if missing:
+        problems.append(
+            f"{len(missing)} images are left out for want of the car's pose at their time, such as "
+            f"{missing[0]}"
+        )
+    return tuple(images), problems

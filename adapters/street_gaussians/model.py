@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from augment.files.ply import (
     iterate_rows,
     read_ply_header,
 )
+from augment.geometry import rotmat_from_quat
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, is_drawable
 
 # ---- What the URI of a trained model may ask for -----------------------------------------------
@@ -249,8 +250,7 @@ class Parameters:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class PoseChanges:
+class PoseChanges(NamedTuple):
     """What training added to the poses of each frame and column of the tracklets.
 
     positions: float64 [F, M, 3], metres, vehicle frame. half_turns: float64 [F, M], radians about
@@ -259,17 +259,6 @@ class PoseChanges:
 
     positions: np.ndarray
     half_turns: np.ndarray
-
-
-def rotations_of(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices [T, 3, 3] of wxyz quaternions [T, 4] of any length but zero."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def read_pose_changes(parameters: Parameters, *, has_actors: bool) -> PoseChanges | None:
@@ -345,7 +334,7 @@ def read_camera_changes(parameters: Parameters) -> np.ndarray | None:
             f"{parameters.path}, {name}.params: pose_correction_rots holds a quaternion of zeros"
         )
     changes = np.tile(np.eye(4), (len(centres), 1, 1))
-    changes[:, :3, :3] = rotations_of(quats)
+    changes[:, :3, :3] = rotmat_from_quat(torch.from_numpy(quats)).numpy()
     changes[:, :3, 3] = centres
     return changes
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 import yaml
+from scipy.spatial.transform import Rotation
 
 FRAMES, START, COUNT = 6, 1, 5
 CAMERAS = (0, 2, 3)  # numbers; the third is 866 pixels high in Waymo
@@ -71,13 +72,14 @@ def ego_from_opencv(position: int) -> np.ndarray:
     return pose(turn_z(yaw) @ OPENCV_AXES, [1.5, (0.0, -0.2, 0.3)[position], 1.6])
 
 
-def quat_of(m: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation: the eigenvector of a matrix of its elements (Bar-Itzhack 2000)."""
-    k = np.zeros((4, 4))
-    k[0, 0] = np.trace(m)
-    k[0, 1:] = k[1:, 0] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    k[1:, 1:] = m + m.T - np.trace(m) * np.eye(3)
-    return np.linalg.eigh(k)[1][:, -1]
+def quat_of(rotation: np.ndarray) -> np.ndarray:
+    """wxyz."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+def rotation_of(quat: np.ndarray) -> np.ndarray:
+    """Of a wxyz quaternion of any length."""
+    return Rotation.from_quat(np.roll(quat, -1)).as_matrix()
 
 
 def write_run(
@@ -216,28 +218,6 @@ def floats(values) -> torch.Tensor:
     return torch.from_numpy(np.asarray(values, np.float32).copy())
 
 
-def hamilton(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    aw, ax, ay, az = a
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    parts = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return np.stack(parts, -1)
-
-
-def rotation_of(quat: np.ndarray) -> np.ndarray:
-    """Of a wxyz quaternion of any length, by turning the axes."""
-    quat = np.asarray(quat, np.float64) / np.linalg.norm(quat)
-    columns = []
-    for axis in np.eye(3):
-        turned = hamilton(hamilton(quat, np.array([0, *axis])), quat * [1, -1, -1, -1])
-        columns.append(turned[1:])
-    return np.stack(columns, 1)
-
-
 def _write_data(data: Path, dataset: str, cars: list, cameras: list) -> None:
     is_fixed = dataset in ("waymo", "argoverse")
     for name in ("images", "extrinsics", "intrinsics", "lidar", "instances"):
@@ -292,14 +272,8 @@ def _write_objects(data: Path, rigid: dict, dataset_from_model: np.ndarray) -> N
         size = rigid["instances_size"][index].double().tolist()
         info[key] = _object(f"car-{'ab'[index]}", "Vehicle", frames, poses, size)
     (data / "instances" / "instances_info.json").write_text(json.dumps(info))
-    seen = {str(f): [int(k) for k in info if f in _frames(info[k])] for f in range(FRAMES)}
-    (data / "instances" / "frame_instances.json").write_text(json.dumps(seen))
 
 
 def _object(name: str, label: str, frames, poses: list, size: list) -> dict:
     notes = {"frame_idx": list(frames), "obj_to_world": poses, "box_size": [size] * len(poses)}
     return {"id": name, "class_name": label, "frame_annotations": notes}
-
-
-def _frames(entry: dict) -> list:
-    return entry["frame_annotations"]["frame_idx"]

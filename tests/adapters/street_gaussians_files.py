@@ -161,14 +161,13 @@ def write_dataset(
     size: tuple[int, int] = (96, 64),
     first_frame: int = 0,
     images: bool = True,
-    suffix: str = ".png",
     lidar: bool = True,
     depth: bool = False,
     castrack: bool = False,
     objects: tuple[StreetObject, ...] = OBJECTS,
 ) -> Facts:
-    """Write the drive into a folder. cameras: how many, from FRONT on. depth: also lidar_depth/,
-    sky_mask/ and dynamic_mask/. castrack: also the tracker's files, which lack the object 4."""
+    """Write the drive into a folder. cameras: how many, from FRONT on. depth: also lidar_depth/
+    and sky_mask/. castrack: also the tracker's files, which lack the object 4."""
     numbers = tuple(range(first_frame, first_frame + frames))
     facts = Facts(Path(root), numbers, tuple(range(cameras)), size, tuple(objects))
     _write_calibration(facts)
@@ -182,14 +181,15 @@ def write_dataset(
         write_point_clouds(facts.root, facts.points, facts.projections)
     for number in numbers if images or depth else ():
         for camera in facts.cameras:
-            rgb, is_sky, is_object = picture(facts, number, camera)
             stem = f"{number:06d}_{camera}"
             if images:
-                _write_image(facts.root / "images" / f"{stem}{suffix}", rgb[..., ::-1])
-            if depth:
-                _write_image(facts.root / "sky_mask" / f"{stem}.png", is_sky * 255)
-                _write_image(facts.root / "dynamic_mask" / f"{stem}.png", is_object * 255)
-                _write_depth(facts, number, camera)
+                path = facts.root / "images" / f"{stem}.png"
+                path.parent.mkdir(exist_ok=True)
+                assert cv2.imwrite(str(path), picture(facts, number, camera)[..., ::-1])
+            for name in (f"lidar_depth/{stem}.npy", f"sky_mask/{stem}.png") if depth else ():
+                path = facts.root / name
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(b"a stand-in: nothing reads it here")
     return facts
 
 
@@ -334,9 +334,8 @@ def _projections(facts: Facts, number: int) -> np.ndarray:
     return found
 
 
-def picture(facts: Facts, number: int, camera: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the camera sees: RGB uint8 [H, W, 3], and which pixels show the sky and a moving thing,
-    uint8 [H, W]."""
+def picture(facts: Facts, number: int, camera: int) -> np.ndarray:
+    """What the camera sees: RGB uint8 [H, W, 3]."""
     seconds = facts.seconds(number, camera)
     width, height = facts.image_size(camera)
     fx, fy, cx, cy = facts.intrinsics(camera)
@@ -346,22 +345,20 @@ def picture(facts: Facts, number: int, camera: int) -> tuple[np.ndarray, np.ndar
     eye = pose[:3, 3]
     nearest = np.full((height, width), np.inf)
     rgb = np.broadcast_to(np.array(SKY_RGB, np.uint8), (height, width, 3)).copy()
-    moving = np.zeros((height, width), np.uint8)
     with np.errstate(divide="ignore", invalid="ignore"):
         road = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
-        hits = [(road, ROAD_RGB, 0)]
+        hits = [(road, ROAD_RGB)]
         for side in (-WALL_Y_M, WALL_Y_M):
             reach = (side - eye[1]) / rays[..., 1]
             z = eye[2] + reach * rays[..., 2]
-            hits.append((np.where((reach > 0) & (z < WALL_TOP_M), reach, np.inf), WALL_RGB, 0))
+            hits.append((np.where((reach > 0) & (z < WALL_TOP_M), reach, np.inf), WALL_RGB))
         for found in facts.objects:
             if found.is_in(number - facts.numbers[0]):
-                reach = _box_hit(eye, rays, found, seconds)
-                hits.append((reach, found.rgb, int(np.hypot(*found.velocity_mps) > 0)))
-    for reach, colour, moves in hits:
+                hits.append((_box_hit(eye, rays, found, seconds), found.rgb))
+    for reach, colour in hits:
         nearer = reach < nearest
-        nearest[nearer], rgb[nearer], moving[nearer] = reach[nearer], colour, moves
-    return rgb, np.isinf(nearest).astype(np.uint8), moving
+        nearest[nearer], rgb[nearer] = reach[nearer], colour
+    return rgb
 
 
 def _box_hit(eye: np.ndarray, rays: np.ndarray, found: StreetObject, seconds: float) -> np.ndarray:
@@ -371,21 +368,3 @@ def _box_hit(eye: np.ndarray, rays: np.ndarray, found: StreetObject, seconds: fl
     a, b = (-half - start) / along, (half - start) / along
     enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
     return np.where((enter < leave) & (enter > 0), enter, np.inf)
-
-
-def _write_depth(facts: Facts, number: int, camera: int) -> None:
-    """lidar_depth: a pickled dictionary of a mask and the depths along the optical axis there."""
-    width, height = facts.image_size(camera)
-    uv, depth, inside = _pixels(facts, number, camera)
-    image = np.full((height, width), np.inf)
-    columns, rows = np.floor(uv[inside]).astype(int).T
-    np.minimum.at(image, (rows, columns), depth[inside])
-    mask = np.isfinite(image)
-    path = facts.root / "lidar_depth" / f"{number:06d}_{camera}.npy"
-    path.parent.mkdir(exist_ok=True)
-    np.save(path, {"mask": mask, "value": image[mask].astype(np.float32)}, allow_pickle=True)
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(exist_ok=True)
-    assert cv2.imwrite(str(path), np.ascontiguousarray(image))

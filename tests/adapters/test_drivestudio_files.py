@@ -69,22 +69,8 @@ def test_a_config_that_cannot_be_used_is_refused(numbers, key, value, message):
     assert "config.yaml" in refused(numbers, message)
 
 
-def test_a_config_that_is_none_is_refused(numbers):
-    path = numbers.folder / "config.yaml"
-    path.write_text("a: [")
-    refused(numbers, r"config.yaml:1: not valid YAML.*copy it again")
-    path.write_text("- 1")
-    refused(numbers, "must hold keys and values; got list")
-    path.write_text("!!python/object/apply:os.system ['true']")
-    refused(numbers, "tags are not allowed")
-    path.unlink()
-    refused(numbers, "config.yaml does not exist; a drivestudio run is")
-
-
 def test_options_that_cannot_be_used_are_refused(numbers):
-    refused(
-        numbers, "unknown option 'nodes'; known are data: .*; checkpoint: .*; frames:", nodes="1"
-    )
+    refused(numbers, "unknown option 'nodes'; .* data: .*; checkpoint: .*; frames:", nodes="1")
     refused(numbers, "frames must be first:stop", frames="3")
     refused(numbers, "frames must be first:stop", frames="4:2")
     refused(numbers, "frames=7: selects none of the 5 frames .1 to 5", frames="7:")
@@ -92,6 +78,8 @@ def test_options_that_cannot_be_used_are_refused(numbers):
     refused(numbers, "data must be the processed scene's folder", data="")
     refused(numbers, "does not exist; the run has checkpoint_final.pth", checkpoint="b.pth")
     refused(numbers, "without '..'", checkpoint="../b.pth")
+    (numbers.folder / "config.yaml").unlink()
+    refused(numbers, "config.yaml does not exist; a drivestudio run is")
 
 
 def test_runs_are_recognised_and_data_found(numbers, tmp_path, monkeypatch):
@@ -182,8 +170,7 @@ def drop(*keys: str):
 )
 def test_a_checkpoint_of_another_layout_is_refused(numbers, change, message):
     change_checkpoint(numbers, change)
-    said = refused(numbers, message)
-    assert "checkpoint_final.pth" in said
+    assert "checkpoint_final.pth" in refused(numbers, message)
 
 
 def test_data_that_is_missing_or_wrong_is_refused(numbers):
@@ -214,14 +201,14 @@ def test_data_of_another_scene_is_refused(numbers):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: {"a": v["0"]}, "a.*: String should match pattern"),
-        (lambda v: {"0": {"id": 1}}, "0.frame_annotations: Field required"),
+        (lambda v: {"a": v["0"]}, "a.*: Input should be a valid integer"),
+        (lambda v: {"0": {"id": 1}}, "0.frame_annotations.frame_idx: Field required"),
         (lambda v: {"0": v["0"], "1": v["0"]}, "ids of objects repeat"),
         (lambda v: {"0": notes(v["0"], frame_idx=[0])}, r"of equal length; got \(1, 6, 6\)"),
         (lambda v: {"0": notes(v["0"], frame_idx=[0] * 6)}, "frame numbers, each once"),
         (lambda v: {"0": notes(v["0"], frame_idx=[10**400] * 6)}, "frame_idx: .*must hold T numb"),
         (lambda v: {"0": notes(v["0"], box_size=[["1"] * 3] * 6)}, "must hold T x 3 numbers"),
-        (lambda v: {"9" * 5000: v["0"]}, "String should match pattern"),
+        (lambda v: {"9" * 5000: v["0"]}, "Unable to parse|unable to parse"),
         (lambda v: {"0": notes(v["0"], box_size=[[1, 2]] * 6)}, "box_size: .*must hold T x 3 numb"),
         (lambda v: {"0": notes(v["0"], box_size=[[1, 2, 0]] * 6)}, "box_size > 0"),
         (lambda v: {"0": notes(v["0"], obj_to_world=[[2.0] * 16] * 6)}, "must be rotations"),
@@ -353,7 +340,8 @@ def test_perturbed_poses_are_applied_before_the_learnt_ones(numbers):
 @pytest.mark.parametrize(
     ("dataset", "slope", "lies"),
     [
-        *[(dataset, 0.3, False) for dataset in ("waymo", "nuscenes", "pandaset", "argoverse")],
+        ("nuscenes", 0.3, False),
+        ("pandaset", 0.3, False),
         ("waymo", 0.6, True),
         ("nuscenes", np.pi / 2, True),
     ],

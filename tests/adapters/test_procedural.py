@@ -43,7 +43,7 @@ def truth() -> StreetTruth:
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        ({"sede": "3"}, "unknown option 'sede'; known are seed: .*; frames: "),
+        ({"sede": "3"}, "unknown option 'sede'; .* seed: .*; frames: "),
         ({"seed": "three"}, "seed: Input should be a valid integer.*got three"),
         ({"seed": "-1"}, "seed: Input should be greater than or equal to 0"),
         ({"frames": "301"}, "frames: Input should be less than or equal to 300 .got 301"),
@@ -174,7 +174,9 @@ def test_labels_survive_pickling_and_name_a_missing_frame(scene):
         scene.lidar(20)
 
 
-@pytest.mark.parametrize(("frame", "name"), [(0, "front"), (10, "left")])
+@pytest.mark.parametrize(
+    ("frame", "name"), [(0, "front"), pytest.param(10, "left", marks=pytest.mark.long)]
+)
 def test_splats_agree_with_the_truth(scene, truth, frame, name):
     camera = scene.frames[frame].cameras[name]
     view = truth.render(camera)

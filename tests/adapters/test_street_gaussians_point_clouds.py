@@ -10,8 +10,6 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from street_gaussians_files import write_members, write_point_clouds
 
 from adapters.safe_pickle import stream_arrays
@@ -33,11 +31,10 @@ def streamed(value, protocol: int = 4) -> dict[int, np.ndarray]:
     return dict(stream_arrays(io.BytesIO(pickle.dumps(value, protocol=protocol))))
 
 
-@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], [4, 0, 4, 2, 1], [9, 3, 9, 0], [2, 2, 1]])
-def test_frames_come_back_in_whatever_order_they_are_asked_for(tmp_path, order):
+def test_frames_come_back_in_whatever_order_they_are_asked_for(tmp_path):
     points, projections = clouds()
     write_point_clouds(tmp_path, points, projections)
-    for frame in order:
+    for frame in (1, 2, 9, 4, 0, 4, 2, 2, 9, 1):
         cloud = read_point_cloud(tmp_path, frame)
         if frame == 9:
             assert cloud is None
@@ -45,6 +42,9 @@ def test_frames_come_back_in_whatever_order_they_are_asked_for(tmp_path, order):
         np.testing.assert_array_equal(cloud.points, points[frame])
         np.testing.assert_array_equal(cloud.projections, projections[frame])
         assert cloud.points.dtype == np.float64 and cloud.projections.dtype == np.int16
+    found = dict(iterate_point_clouds(tmp_path))
+    assert list(found) == list(points)
+    assert all((found[n].points == points[n]).all() for n in points)
 
 
 def test_frames_that_are_no_longer_kept_are_read_again(tmp_path, monkeypatch):
@@ -62,14 +62,6 @@ def test_a_file_that_changed_is_opened_anew(tmp_path):
     points, projections = clouds(points=55)
     write_point_clouds(tmp_path, points, projections)
     np.testing.assert_array_equal(read_point_cloud(tmp_path, 2).points, points[2])
-
-
-def test_all_frames_in_one_pass(tmp_path):
-    points, projections = clouds()
-    write_point_clouds(tmp_path, points, projections)
-    found = dict(iterate_point_clouds(tmp_path))
-    assert list(found) == list(points)
-    assert all((found[n].points == points[n]).all() for n in points)
 
 
 def test_a_file_without_projections_or_no_file(tmp_path):
@@ -120,8 +112,9 @@ def test_a_forked_process_opens_the_file_itself(tmp_path):
     assert found == {n: float(points[n].sum()) for n in (2, 4)}
 
 
-@pytest.mark.parametrize("protocol", [3, 4])
-@pytest.mark.parametrize("dtype", ["<f8", ">f4", "i2", "u1", "bool"])
+@pytest.mark.parametrize(
+    ("protocol", "dtype"), [(3, "<f8"), (4, ">f4"), (3, "i2"), (4, "u1"), (4, "bool")]
+)
 def test_arrays_of_any_protocol_and_type(protocol, dtype):
     value = {n: RNG.integers(0, 2, (n + 1, 3)).astype(dtype) for n in range(4)}
     found = streamed(value, protocol)
@@ -139,9 +132,9 @@ def test_numbers_of_numpy_columns_in_fortrans_order_and_the_old_name_of_numpy():
 
 
 def test_more_frames_than_a_pickle_puts_into_one_batch():
-    value = {n: np.full((2, 3), n, np.float32) for n in range(2500)}
+    value = {n: np.full((2, 3), n, np.float32) for n in range(1001)}
     found = streamed(value)
-    assert len(found) == 2500 and found[2499][0, 0] == 2499
+    assert len(found) == 1001 and found[1000][0, 0] == 1000
 
 
 def test_one_array_at_a_time_is_held(tmp_path):
@@ -151,16 +144,6 @@ def test_one_array_at_a_time_is_held(tmp_path):
     places = [file.tell() for _ in stream_arrays(file)]
     steps = np.diff(places)
     assert (steps > 20_000).all() and (steps < 30_000).all()
-
-
-class Calls:
-    """Unpickles by calling a function: what a hostile file does."""
-
-    def __init__(self, function, *arguments):
-        self.call = (function, arguments)
-
-    def __reduce__(self):
-        return self.call
 
 
 @pytest.mark.parametrize(
@@ -174,33 +157,15 @@ class Calls:
         (pickle.dumps({0: np.zeros(2, [("x", "f4")])}), "else than numbers"),
         (b"\x80\x04" + b")" * 5 + b"R.", "calls something"),
         (b"\x80\x04}(K\x00", "cut short"),
-        (b"\x80\x04}K\x00K\x01b.", "takes no state"),
         (b"\x80\x04t.", "no mark|damaged"),
-        (b"\x80\x04h\x07.", "damaged"),
         (b"\x80\x04B\xff\xff\xff\x7f", "states 2147483647 bytes"),
         (b"\x80\x04cnumpy" + b"x" * 5000, "name without end"),
-        (b"\x80\x04)" + b"\x85" * 300_000 + b".", "more than 262144 steps"),
         (b"\x80\x04cnumpy\nd\\type\n.", "with escapes"),
-        (b"\x80\x04\x97.", "NEXT_BUFFER"),
-        (b"\x80\x04P1\n.", "PERSID"),
     ],
 )
 def test_damaged_and_strange_pickles_are_refused(data, message):
     with pytest.raises(PickleError, match=message):
         list(stream_arrays(io.BytesIO(data)))
-
-
-@settings(max_examples=150, deadline=None)
-@given(st.lists(st.tuples(st.integers(2, 400), st.integers(0, 255)), min_size=1, max_size=4))
-def test_changed_bytes_give_arrays_or_an_error_of_ours(changes):
-    data = bytearray(pickle.dumps({0: np.ones((2, 3)), np.int64(1): np.zeros((1, 3))}))
-    for at, value in changes:
-        data[at % len(data)] = value
-    try:
-        found = dict(stream_arrays(io.BytesIO(bytes(data))))
-    except PickleError:
-        return
-    assert all(type(array) is np.ndarray and array.dtype.kind in "fiub" for array in found.values())
 
 
 def test_a_value_that_grows_when_it_is_shown_is_not_shown():
@@ -219,7 +184,10 @@ def test_a_value_that_grows_when_it_is_shown_is_not_shown():
     assert time.process_time() - start < 1
 
 
-def test_bytes_that_no_array_takes_are_not_piled_up(monkeypatch):
+def test_bytes_and_steps_that_no_array_takes_are_not_piled_up(monkeypatch):
+    monkeypatch.setattr("augment.files.pickles.MAX_STREAMED_STEPS", 5000)
+    with pytest.raises(PickleError, match="more than 5000 steps"):
+        list(stream_arrays(io.BytesIO(b"\x80\x04)" + b"\x85" * 6000 + b".")))
     monkeypatch.setattr("augment.files.pickles.MAX_STREAMED_BYTES", 10_000)
     piece = b"B" + (6000).to_bytes(4, "little") + bytes(6000)
     with pytest.raises(PickleError, match="12000 bytes that are in no array"):
@@ -231,23 +199,12 @@ def test_bytes_that_no_array_takes_are_not_piled_up(monkeypatch):
     assert len(streamed(value)) == 50
 
 
-def test_lengths_must_fit_shapes():
-    data = pickle.dumps({0: np.ones((2, 3))}, protocol=4)
-    bad = data.replace(b"K\x02K\x03\x86", b"K\x09K\x03\x86")
-    assert bad != data
-    with pytest.raises(PickleError, match=r"48 bytes for an array \[9, 3\]"):
-        list(stream_arrays(io.BytesIO(bad)))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda p, q: (p | {2: np.ones((4, 2))}, q), r"pointcloud\[2\] must be floats \[N, 3\]"),
         (lambda p, q: (p | {2: np.ones((4, 3), int)}, q), r"pointcloud\[2\] must be floats"),
-        (
-            lambda p, q: (p, q | {2: q[1].copy()}),
-            r"camera_projection\[2\] must be .* a row for each",
-        ),
+        (lambda p, q: (p, q | {2: q[1].copy()}), r"projection\[2\] must be .* a row for each"),
         (lambda p, q: (p, {n: q[n] for n in (0, 1, 3, 4)}), "same frames in the same order"),
         (lambda p, q: (p, {0: q[0]}), "same frames in the same order; got 1 and None"),
         (lambda p, q: (np.ones((3, 3)), q), r"one dictionary of arrays; it holds float64"),

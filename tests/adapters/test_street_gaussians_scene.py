@@ -391,9 +391,9 @@ def test_where_the_data_are(tmp_path: Path, drive: Facts) -> None:
         opened(model, data=str(drive.root))
 
 
-@pytest.mark.parametrize(
-    ("query", "words"),
-    [
+def test_wrong_options(tmp_path: Path, drive: Facts) -> None:
+    model = saved(tmp_path, drive, raw_model(drive))
+    for query, message in (
         ({"scale": "2"}, "unknown option 'scale'.*data: .*rotation_bug"),
         ({"iteration": "last"}, "iteration must be a whole number"),
         ({"width": "-5"}, "width must be a whole number"),
@@ -401,12 +401,9 @@ def test_where_the_data_are(tmp_path: Path, drive: Facts) -> None:
         ({"rotation_bug": "yes"}, "rotation_bug must be 0 or 1"),
         ({"frames": "5"}, "frames must be first:stop"),
         ({"frames": "50:60"}, "selects none of the 4 frames"),
-    ],
-)
-def test_wrong_options(tmp_path: Path, drive: Facts, query: dict, words: str) -> None:
-    model = saved(tmp_path, drive, raw_model(drive))
-    with pytest.raises(AdapterError, match=words):
-        opened(model, **query)
+    ):
+        with pytest.raises(AdapterError, match=message):
+            opened(model, **query)
 
 
 def test_paths_that_are_no_model(tmp_path: Path, drive: Facts) -> None:
