@@ -52,6 +52,7 @@ def rows(trade):
     return {(row["knob"], row["value"]): row for row in table_of(trade.figures)}
 
 
+@pytest.mark.long
 def test_every_value_has_a_row(trade, rows):
     assert json.loads(json.dumps(trade.figures, allow_nan=False)) is not None
     expected = [("render.scale", value) for value in (0.25, 0.5, 0.75)]
@@ -62,6 +63,7 @@ def test_every_value_has_a_row(trade, rows):
     assert sum(len(table["rows"]) for table in printable(trade.figures)["tables"]) == len(rows)
 
 
+@pytest.mark.long
 def test_errors_are_none_at_reference_and_grow_away_from_it(rows):
     best = rows[WHOLE, REFERENCE]
     assert (best["flip"], best["psnr"], best["ssim"], best["flicker"]) == (0, None, 1, 0)
@@ -77,6 +79,7 @@ def test_errors_are_none_at_reference_and_grow_away_from_it(rows):
     assert rows[DEPTH, "none"]["off_5cm"] is None
 
 
+@pytest.mark.long
 def test_estimators_are_compared_with_the_streets_surfaces(rows):
     assert rows[DEPTH, "median"]["depth_against"] == TRUTH
     assert 0.01 < rows[DEPTH, "median"]["abs_rel"] < 0.3  # a pixel of this picture is 15 of its own
@@ -87,6 +90,7 @@ def test_estimators_are_compared_with_the_streets_surfaces(rows):
     assert true_depths("pandaset:folder", [camera]) is None
 
 
+@pytest.mark.long
 def test_files_shrink_with_quality(rows):
     sizes = [rows[JPEG, quality]["kilobytes"] for quality in (60, 75, 92, 100)]
     errors = [rows[JPEG, quality]["flip"] for quality in (60, 75, 92, 100)]
