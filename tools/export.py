@@ -57,8 +57,8 @@ from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.output import fill, print_note
 
-# ------------------------------------------------------------------------------------------------
-# `--layout source` and `climategs mirror`: a variant as a copy of the dataset it was made from
+_SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
+_BAKED = ("ply", "splat")
 
 
 def recipes_for_source(
@@ -166,10 +166,21 @@ def _mirror_rows(
     quality = _jpeg_quality(out, scene.name, name)
     images, notes = weathered_images(out, rows, scene.frames, tree, quality)
     sweeps, unplaced = weathered_sweeps(out, rows, scene.labels, tree)
-    others, more = _of_other_scenes(scene, out, name, record.replaced)
-    other_sweeps = _sweeps_of_other_scenes(scene, out, name, record.sweeps)
+    kept = _rows_of_other_scenes(scene, out, name, record.replaced, "image")
+    kept_sweeps = _rows_of_other_scenes(scene, out, name, record.sweeps, "sweep")
+    known = {row["scene"] for row in (*kept.values(), *kept_sweeps.values()) if row}
+    qualities = {other: _jpeg_quality(out, other, name) for other in known}
+    if gone := sorted(place for place, row in kept.items() if row is None):
+        unplaced = [
+            *unplaced,
+            f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the "
+            f"manifest: the source's own stand there again",
+        ]
+    others = {
+        p: Weathered.of_row(out, row, qualities[row["scene"]]) for p, row in kept.items() if row
+    }
+    other_sweeps = {p: WeatheredSweep.of_row(out, row) for p, row in kept_sweeps.items() if row}
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
-    known = {each.scene for each in (*others.values(), *other_sweeps.values())}
     scenes = {key: record.scenes[key] for key in sorted(known & record.scenes.keys())}
     done = mirror_dataset(
         tree,
@@ -181,51 +192,27 @@ def _mirror_rows(
         links=links,
         progress=progress,
     )
-    sweeps = sum(tree.is_sweep(place) for place in done.weathered)
-    page = fill("mirror.txt", done=done, sweeps=sweeps, root=tree.root, links=links)
-    return [*page.split("\n"), *(f"  {note}" for note in [*notes, *unplaced, *more])]
+    num_sweeps = sum(tree.is_sweep(place) for place in done.weathered)
+    page = fill("mirror.txt", done=done, sweeps=num_sweeps, root=tree.root, links=links)
+    return [*page.split("\n"), *(f"  {note}" for note in [*notes, *unplaced])]
 
 
-def _of_other_scenes(
-    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, Any]]
-) -> tuple[dict[str, Weathered], list[str]]:
-    """The images that the copy has from other scenes of the dataset, as far as they are there."""
-    images = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
-    if not images:
-        return {}, []
-    table = read_manifest(out)
-    pairs = {(entry["scene"], variant) for entry in images.values()}
-    rows = {row["image_path"]: row for row in rows_of(table, pairs) if row["status"] == OK}
-    names = {row["scene"] for row in rows.values()}
-    quality = {name: _jpeg_quality(out, name, variant) for name in names}
-    found = {}
-    for place, entry in images.items():
-        if (row := rows.get(entry["image"])) is not None:
-            found[place] = Weathered.of_row(out, row, quality[row["scene"]])
-    gone = sorted(images.keys() - found.keys())
-    if not gone:
-        return found, []
-    return found, [
-        f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the manifest: "
-        f"the source's own stand there again"
-    ]
-
-
-def _sweeps_of_other_scenes(
-    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, str]]
-) -> dict[str, WeatheredSweep]:
-    """The weathered sweeps that the copy has from other scenes, as far as they are there."""
+def _rows_of_other_scenes(
+    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, Any]], kind: str
+) -> dict[str, dict[str, Any] | None]:
+    """Of each image, or weathered sweep, that the copy has from other scenes of the dataset the
+    manifest's row, by its place; None where it is no longer there.
+    """
     entries = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
     if not entries:
         return {}
     pairs = {(entry["scene"], variant) for entry in entries.values()}
     rows = [row for row in rows_of(read_manifest(out), pairs) if row["status"] == OK]
-    known = {row["lidar_path"]: row for row in rows if is_weathered(row)}
-    return {
-        place: WeatheredSweep.of_row(out, known[entry["sweep"]])
-        for place, entry in entries.items()
-        if entry["sweep"] in known
-    }
+    if kind == "image":
+        by_path = {row["image_path"]: row for row in rows}
+    else:
+        by_path = {row["lidar_path"]: row for row in rows if is_weathered(row)}
+    return {place: by_path.get(entry[kind]) for place, entry in entries.items()}
 
 
 def _jpeg_quality(out: Path, scene: str, variant: str) -> int:
@@ -298,12 +285,6 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
             f"{written_as} for the dataset's copy: `climategs mirror {out} --scene URI` makes it "
             f"from the images there; or choose another output folder, or add --overwrite"
         )
-
-
-# ---- export --------------------------------------------------------------------------------------
-
-_SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
-_BAKED = ("ply", "splat")
 
 
 def export_scene(

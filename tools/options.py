@@ -15,10 +15,10 @@ from tyro.conf import Positional, arg
 
 from tools.output import JsonFile, write_json
 
-# ---- fit options ---------------------------------------------------------------------------------
-
 if TYPE_CHECKING:
     from adapters.training_views.depth_priors import DepthPriors
+    from augment.effects.style.pairs import PairWeights
+    from augment.effects.style.train import StyleTrainConfig
     from augment.reconstruct.config import FitConfig
 
 DEFAULT_MINUTES = 10.0
@@ -83,7 +83,6 @@ class FitOptions:
     def __post_init__(self) -> None:
         from adapters.training_views.views import holdout_step
         from augment.errors import ClimateGSError
-        from tools.fit_report import open_street
 
         check_length(self)
         holdout_step(self.holdout)
@@ -100,6 +99,8 @@ class FitOptions:
             raise ClimateGSError("--cameras is names separated by commas, or all")
         parse_depth(self.depth)
         if self.truth is not None:
+            from tools.fit_report import open_street
+
             open_street(self.truth)
         if self.ego_masks is not None and not self.ego_masks.is_dir():
             raise ClimateGSError(f"--ego-masks: there is no folder {self.ego_masks}")
@@ -281,14 +282,6 @@ def _depth_text(priors: DepthPriors) -> str:
     return ",".join((["lidar"] if priors.lidar else []) + named) or "none"
 
 
-# ------------------------------------------------------------------------------------------------
-# What `climategs style train` can be asked for. Imports stay inside functions, so that `--help`
-# answers at once.
-
-if TYPE_CHECKING:
-    from augment.effects.style.pairs import PairWeights
-    from augment.effects.style.train import StyleTrainConfig
-
 SIZES_PX = {"small": 128, "b0": 256}  # the small encoder looks at 64 px, whatever it is given
 _Files = Annotated[tuple[Path, ...], arg(metavar="PATH [PATH ...]")]
 _Scenes = Annotated[tuple[str, ...], arg(name="scene", metavar="URI [URI ...]")]
@@ -403,7 +396,6 @@ class StyleTrainOptions:
 
     def config(self, steps: int) -> StyleTrainConfig:
         """The trainer's configuration for this many steps."""
-
         from augment.effects.style.train import LEARNING_RATES, StyleTrainConfig
 
         known = {field.name for field in dataclasses.fields(StyleTrainConfig)}

@@ -423,8 +423,6 @@ def _damaged(path: Path, what: str) -> OutputError:
     return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
 
 
-# ---- Curves over the steps, drawn by matplotlib (an extra) ----
-
 _BLUE, _ORANGE, _GREEN = "#0072b2", "#d55e00", "#009e73"
 Row = Mapping[str, Any]
 

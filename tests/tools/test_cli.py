@@ -12,8 +12,8 @@ import torch
 from augment.dataset import WeatherDataset
 from augment.files.ply import write_ply
 from augment.scene import Gaussians
-from recipes.schema import parse_frames
-from tools.cli import main, open_with_path
+from recipes.weather import style_preset_names
+from tools.cli import main
 from tools.render import resolve_variants
 
 FOG = """
@@ -71,6 +71,9 @@ def test_render_writes_images_manifest_and_pictures(scene_uri, recipe, tmp_path,
     # The second run finds everything done, and says so.
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 0
     assert "0 images written, 4 already there" in capsys.readouterr().out
+    camera = images[0].parent.name
+    assert main(["sheet", str(out), "--video-camera", camera]) == 0
+    assert cv2.VideoCapture(str(out / f"video_{camera}.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
 
 
 def test_render_a_flood_and_read_it_back(scene_uri, tmp_path, capsys):
@@ -139,18 +142,6 @@ def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypa
     assert "no light" in streams.err
 
 
-def test_video_of_one_camera(scene_uri, recipe, tmp_path):
-    out = tmp_path / "out"
-    main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"])
-    (camera,) = {path.parent.name for path in out.glob("*/*/images/*/*.png")}
-    assert main(["sheet", str(out), "--video-camera", camera]) == 0
-    video = cv2.VideoCapture(str(out / f"video_{camera}.mp4"))
-    frames = 0
-    while video.read()[0]:
-        frames += 1
-    assert frames == 2
-
-
 def test_inspect_says_what_is_there_and_writes_json(scene_uri, tmp_path, capsys):
     target = tmp_path / "facts.json"
     assert main(["inspect", scene_uri, "--json", str(target)]) == 0
@@ -193,6 +184,14 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         ([*here, "--variants", "0"], "--variants"),
         (["sheet", out[1]], "manifest.parquet does not exist"),
         (["inspect", scene_uri, "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts"),
+        (["style", "presets", "dawn-mits"], "dawn-mist"),
+        (["style", "train", *out], "there is nothing to learn from"),
+        (["style", "apply", "procedural:street", "dsuk", *out], "dusk"),
+        (["generate", "job.yaml"], "--out is missing"),
+        (["generate", *out], "no job file is named"),
+        (["generate", "job.yaml", *out], "no such file; a job is a YAML file"),
+        (["generate", *out, "--status"], "no job has been started there"),
+        (["generate", "--out", "ftp://x/y", "--status"], "ftp"),
     ):
         assert main(arguments) == 2
         error = capsys.readouterr().err
@@ -206,6 +205,16 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         assert "is not on this machine" in capsys.readouterr().err
 
 
+def test_style_presets_are_listed_and_printed(capsys):
+    assert main(["style", "presets"]) == 0
+    assert tuple(capsys.readouterr().out.split()) == style_preset_names()
+    assert main(["style", "presets", "dusk"]) == 0
+    assert "covariance:" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["style"])
+    assert "{apply, train, presets}" in capsys.readouterr().err
+
+
 def test_a_defect_keeps_its_traceback(monkeypatch):
     from tools import cli
 
@@ -217,26 +226,11 @@ def test_a_defect_keeps_its_traceback(monkeypatch):
         main(["recipes"])
 
 
-def test_frames_are_parsed():
-    for text, frames in {
-        "all": None, "4": (4,), "0,5,9": (0, 5, 9), "0:6:2": (0, 2, 4), "3:6": (3, 4, 5),
-        "0:3,2,7": (0, 1, 2, 7),
-    }.items():  # fmt: skip
-        assert parse_frames(text).select(range(10)) == frames
-
-
 def test_scale_is_recorded_in_the_recipe(recipe):
     (half, _) = resolve_variants(recipe, scale=0.5)
     (whole, _) = resolve_variants(recipe)
     assert half.render.scale == 0.5 and half.hash != whole.hash
     assert half.weather == whole.weather
-
-
-def test_another_camera_path(scene_uri, tmp_path):
-    path = tmp_path / "path.json"
-    plain = open_with_path(scene_uri.split("&cameras")[0], None)
-    scene = open_with_path(scene_uri.split("&cameras")[0], path)
-    assert len(scene.frames) == 2 and len(plain.frames) != 2
 
 
 def test_help_loads_neither_torch_nor_the_kernels():

@@ -97,10 +97,10 @@ def test_readers_refuse_changed_manifests_and_never_fail_otherwise(
     assert outcomes(out) == {"read": len(READERS)}
     whole = pq.read_table(out / "manifest.parquet")
     rng, found = random.Random(0), Counter[str]()
-    for changed in rng.sample(list(changed_tables(whole, rng)), k=50):
+    for changed in rng.sample(list(changed_tables(whole, rng)), k=20):
         pq.write_table(changed, out / "manifest.parquet")
         found += outcomes(out)
-    assert found["refused"] > 100 and found["read"] > 20
+    assert found["refused"] > 30 and found["read"] > 8
 
 
 def changed_notes(note: Any, rng: random.Random) -> Iterator[bytes]:

@@ -33,7 +33,7 @@ from tools.fit import (
     state_folder,
 )
 from tools.options import FitOptions, parse_depth
-from tools.training import RESERVE, Checkpoint, evaluation_steps, load_checkpoint, save_checkpoint
+from tools.training import RESERVE, Checkpoint, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def interrupter(at, number):
     return interrupt
 
 
-@pytest.mark.parametrize(("at", "checkpoint_s"), [(0, 0), (50, 0), (77, 0), (60, 3600)])
+@pytest.mark.parametrize(("at", "checkpoint_s"), [(77, 0), (60, 3600)])
 def test_a_killed_run_goes_on_to_the_same_bits(options, tmp_path, at, checkpoint_s):
     with pytest.raises(Killed):
         run(options, Fakes(before_step=killer(at)), checkpoint_s=checkpoint_s)
@@ -322,12 +322,6 @@ def test_estimate():
     assert step_s == pytest.approx(0.1)
     assert steps == pytest.approx((600 * (1 - RESERVE) - 90) / 0.1, abs=51)
     assert estimated(600, grows=False, views=10**6)[0] > 1000  # some time is left for steps
-
-
-def test_evaluations_are_about_ten_and_end_the_run():
-    for steps in (1, 3, 10, 11, 5000):
-        marks = evaluation_steps(steps)
-        assert max(marks) == steps and min(marks) >= 1 and len(marks) == min(steps, 10)
 
 
 def test_sampled_views_take_turns_between_cameras():
@@ -556,7 +550,7 @@ def recording(tmp_path, monkeypatch) -> str:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "adapters"))
     write_recording = importlib.import_module("recording_folder").write_recording
     folder = write_recording(tmp_path / "drive")
-    return f"recording:{folder}?voxel_m=0.1&image_scale=1&sky_size=32"
+    return f"recording:{folder}?voxel_m=0.5&image_scale=1&sky_size=8"
 
 
 def real_fit(recording, out, before_step=lambda step: None):
@@ -566,7 +560,7 @@ def real_fit(recording, out, before_step=lambda step: None):
         before_step(trainer.step)
         return run_step(trainer)
 
-    options = FitOptions(scene=recording, out=out, steps=12, scale=1.0, max_splats=20_000)
+    options = FitOptions(scene=recording, out=out, steps=6, scale=1.0, max_splats=20_000)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit.Trainer, "run_step", noting)
         return fit_scene(options, progress=False)
@@ -575,7 +569,7 @@ def real_fit(recording, out, before_step=lambda step: None):
 def test_a_recording_is_fitted_and_interruptions_change_no_bit(recording, tmp_path):
     whole = real_fit(recording, tmp_path / "whole")
     assert whole.code == 0
-    stopped = real_fit(recording, tmp_path / "parts", interrupter(4, signal.SIGINT))
+    stopped = real_fit(recording, tmp_path / "parts", interrupter(2, signal.SIGINT))
     assert stopped.code == 130
     so_far = open_scene(f"scene:{tmp_path / 'parts'}")
     assert so_far.actors and so_far.frames

@@ -24,22 +24,6 @@ def test_what_is_no_shard() -> None:
             parse_shard(text)
 
 
-def test_arguments_that_cannot_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for arguments, message in (
-        (["job.yaml"], "--out is missing"),
-        (["--out", "o"], "no job file is named"),
-        (["job.yaml", "--out", "o"], "no such file; a job is a YAML file"),
-        (["--out", "o", "--status"], "no job has been started there"),
-        (["--out", "ftp://x/y", "--status"], "ftp"),
-    ):
-        assert main(["generate", *arguments]) == 2
-        assert message in capsys.readouterr().err
-        assert not list(tmp_path.iterdir())
-
-
 def test_sigterm_is_as_ctrl_c() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt), ended_by_sigterm():

@@ -81,12 +81,6 @@ def root(tmp_path) -> Path:
     return write_sequence(tmp_path / "002")
 
 
-def test_recipes_get_the_datasets_format(root, tmp_path):
-    (recipe,) = recipes_for_source(scene_of(root), tmp_path / "out", [recipe_of()])
-    assert recipe.output.image == "jpg" and recipe.hash != recipe_of().hash
-    assert recipe.hash == recipe_of(image="jpg").hash
-
-
 def test_images_of_another_size_are_compressed_once(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     half = recipe_of(image="jpg")
@@ -228,18 +222,6 @@ def test_sweeps_that_the_dataset_has_no_files_for_are_told(root, tmp_path):
         f"  2 weathered LiDAR sweeps, the first of frame 1, have no file of their own in the "
         f"dataset: its copy keeps the recorded ones, and {tmp_path / 'out'} has these"
     )
-
-
-def test_variants_have_copies_of_their_own(root, tmp_path):
-    scene, out = scene_of(root), tmp_path / "out"
-    for name in ("fog", "clear"):
-        render(scene, out, *recipes_for_source(scene, out, [recipe_of(name)]), frames=[0])
-    mirror_outputs(scene, out, variants=["clear-000"], progress=False)
-    assert [path.name for path in (out / "source").iterdir()] == ["clear-000"]
-    mirror_outputs(scene, out, progress=False)
-    fog, clear = (contents(out / f"source/{n}-000/002") for n in ("fog", "clear"))
-    assert fog["camera/left/00.jpg"] != clear["camera/left/00.jpg"]
-    assert fog["camera/left/01.jpg"] == clear["camera/left/01.jpg"]
 
 
 def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):

@@ -54,11 +54,6 @@ def test_numbers_are_written_for_people() -> None:
     ]  # fmt: skip
 
 
-def test_text_is_cut_and_its_invisible_characters_are_shown() -> None:
-    assert report.visible_text("a\0\u202eb\udc80") == "a\ufffd\ufffdb\ufffd"
-    assert len(str(report.visible_text("x" * 10_000))) == report.MAX_TEXT
-
-
 def test_a_histogram_counts_every_image_once() -> None:
     rng = np.random.default_rng(0)
     values, images = rng.lognormal(0, 2, 200), rng.integers(1, 9, 200)

@@ -79,12 +79,6 @@ def test_no_strength_keeps_every_bit(scene_uri, photo, tmp_path):
     assert facts["clamped"]["pixels off a render under the style"] == 0
 
 
-def test_maps_by_region_are_listed_once_each(scene_uri, photo, tmp_path):
-    facts = apply_style(scene_uri, str(photo), tmp_path / "regions", per_region=True)
-    listed = [str(one["map"]) for name, one in facts["maps"].items() if name != "sky"]
-    assert "unknown" in facts["maps"] and len(set(listed)) == len(listed)
-
-
 def test_where_folding_differs_is_counted(scene_uri, tmp_path):
     """Half of what is seen shines to one side alone: below 0 to the other, where it shows black."""
     scene = open_scene(scene_uri)

@@ -14,7 +14,7 @@ import torch
 from adapters.base import open_scene
 from augment.cameras import Camera, Frame
 from augment.effects.style.network import load_network, network_facts
-from augment.effects.style.train import StyleTrainer
+from augment.effects.style.train import StyleTrainConfig, StyleTrainer
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.geometry import rigid
 from augment.scene import Gaussians, Scene
@@ -207,3 +207,10 @@ def test_no_images_leave_no_training_behind(tmp_path):
 def test_pair_weights_keep_what_is_not_named():
     weights = parse_pair_weights("same=2,look=0")
     assert (weights.same, weights.look, weights.half) == (2.0, 0.0, parse_pair_weights("").half)
+
+
+def test_the_training_s_defaults_are_the_library_s():
+    known = {field.name: field.default for field in dataclasses.fields(StyleTrainConfig)}
+    named = {f.name: f.default for f in dataclasses.fields(StyleTrainOptions) if f.name in known}
+    del named["steps"], named["learning_rate"], named["pair_weights"]  # None, "": the library's
+    assert named == {name: known[name] for name in named}
