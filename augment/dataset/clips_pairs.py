@@ -16,8 +16,6 @@ from torch.utils.data import Dataset, Sampler
 from augment.dataset.samples import IMAGES
 from augment.dataset.weather_dataset import Rows, WeatherDataset
 
-# ---- Training, validation and test sets that share no scene --------------------------------------
-
 # ---- Who trains on which sample: dealt to all processes, the same again after an interruption ----
 
 Uneven = Literal["exact", "pad", "drop"]
@@ -192,8 +190,6 @@ def _place(scene: str, seed: int) -> float:
     digest = hashlib.sha256(f"climategs split 1 {seed} {scene}".encode()).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
 
-
-# ---- clips pairs ---------------------------------------------------------------------------------
 
 # ---- Clean and weathered images of the same moment: side by side, or mixed into one dataset ------
 

@@ -43,8 +43,6 @@ from augment.jobs.files import TABLES, BoxWeather, CameraRecord, depth_in_metres
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import class_of_label
 
-# ---- samples -------------------------------------------------------------------------------------
-
 # ---- Boxes for training: in the frame of the world, the car or the camera, and as 2D boxes -------
 # Quaternions are wxyz. A box's own axes: x along its length, y its width, z its height.
 

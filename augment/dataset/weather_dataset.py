@@ -212,8 +212,6 @@ class SceneDataset(Dataset):
         return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))
 
 
-# ---- weather dataset -----------------------------------------------------------------------------
-
 # ---- A manifest's rows in a fifth of its memory, with random access to single ones ---------------
 # Most of a row in an Arrow table (440 bytes with short names, 84 here) are paths and names that
 # repeat. Here a column is its distinct values and one small number a row; paths are split into

@@ -50,9 +50,6 @@ from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
-# ---- What a scene.json may hold, and reading one that may come from anywhere ---------------------
-# The models are closed: an unknown key is an error, since it would be lost without a word.
-
 # ---- The arrays of a saved scene: their names, their shapes, and that every number can be drawn --
 #
 #     background.means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, K, 3]: float32
@@ -458,8 +455,6 @@ def checked_document(raw: dict[str, Any], where: str) -> SceneDocument:
 def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
 
-
-# ---- scene file ----------------------------------------------------------------------------------
 
 # ---- scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
 

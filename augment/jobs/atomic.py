@@ -56,10 +56,9 @@ def replaced_file(
     path: Path, *, clear: bool = True, flush: bool = True, ending: str = ""
 ) -> Iterator[BinaryIO]:
     """A file that takes its name only once it is whole and on the disk; makes missing folders.
-    clear: delete what killed writers of this file left. A job that writes many files into one
-    folder does that once, at its start. flush: make the name durable too. ending: of the temporary
-    name, for libraries that write to a name and go by it. Raises OutputError: the system refused
-    (disk full, no permission ...); `path` is then as it was.
+    clear: delete what killed writers of this file left. flush: make the name durable too. ending:
+    of the temporary name, for libraries that go by it. Raises OutputError: the system refused (disk
+    full, no permission ...); `path` is then as it was.
     """
     with refusals_of(path):
         make_folder(path.parent)
@@ -215,9 +214,8 @@ _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, 
 @contextmanager
 def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
     """A new, empty folder that takes the place of `target` when the block ends without an error.
-    own: names of the files and folders that make up such a folder. Those of the old folder are
-    deleted; anything else in the old folder is kept. Raises OutputError: the system refused (disk
-    full, no permission ...); `target` is then as it was.
+    own: names of the files and folders that make up such a folder; anything else in the old folder
+    is kept. Raises OutputError: the system refused; `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
     with refusals_of(target):

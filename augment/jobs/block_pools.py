@@ -58,9 +58,9 @@ Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker 
 
 @runtime_checkable
 class WorkerPool(Protocol):
-    """Workers are numbered 0 to slots - 1; every one has at most one task. A pool tells of finished
-    images through the `tick` that it was made with, called in the thread that waits, or, where the
-    work is done in this process, in several threads.
+    """Workers are numbered 0 to slots - 1; each has at most one task. A pool reports finished
+    images to the `tick` that it was made with, in the thread that waits; a SerialPool in several
+    threads.
     """
 
     slots: int
@@ -70,6 +70,7 @@ class WorkerPool(Protocol):
 
     def wait(self, timeout_s: float) -> list[Event]:
         """What has happened, at least one thing unless the time ran out first."""
+        ...
 
     def close(self) -> None:
         """End all workers: each finishes the images it has at hand, and what they hold is free."""
@@ -273,13 +274,13 @@ def last_line(error: Exception) -> str:
 
 
 class RayPool:
-    """`slots` actors of one CPU each, as many as the cluster has CPUs if None. Where the backend is
-    `cuda` they have a GPU each and its share of the CPUs, and None is as many as there are GPUs.
-    They run on the cluster that this process is connected to, else on the one that RAY_ADDRESS
-    names, else on one that is started here and ends with the pool. One that dies is replaced. Where
-    the cluster has no room for all of them, those that run do the work of the others. Raises
-    ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
-    start, or no machine of the cluster has a GPU.
+    """`slots` actors of one CPU each, as many as the cluster has CPUs if None; where the backend is
+    `cuda`, of a GPU and its share of the CPUs, as many as there are GPUs. They run on the cluster
+    that this process is connected to, else on the one that RAY_ADDRESS names, else on one that is
+    started here and ends with the pool. One that dies is replaced; where the cluster has no room
+    for all, those that run do the work of the others. Raises ClimateGSError: Ray is missing, or the
+    cluster cannot be reached; from wait: actors cannot start, or no machine of the cluster has a
+    GPU.
     """
 
     def __init__(self, setup: WorkSetup, tick: Tick, slots: int | None) -> None:

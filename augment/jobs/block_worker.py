@@ -10,7 +10,6 @@ import json
 import logging
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -22,10 +21,19 @@ from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, Sty
 from augment.jobs.atomic import remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
-from augment.jobs.layout import PATH_KINDS, STATE_FOLDER, folder_name, item_paths, variant_folder
+from augment.jobs.layout import (
+    PATH_KINDS,
+    STATE_FOLDER,
+    folder_name,
+    item_paths,
+    reading_back,
+    variant_folder,
+)
 from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
+from augment.jobs.prepare import snow_to_lay, store_beds
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
+from augment.jobs.quality import resolve_quality_for
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
 from augment.jobs.worker import Outcome, Renderer, WorkTimes, describe
@@ -131,12 +139,8 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
             if not store.exists(path):
                 store.write(path, json.dumps(vars(identity), sort_keys=True).encode())
             found = store.read(path)
-    try:
+    with reading_back(f"{store.uri}/{path}", "Delete it and start the job again"):
         other = Identity(**json.loads(found))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise OutputError(
-            f"{store.uri}/{path} is damaged: {error}. Delete it and start the job again"
-        ) from error
     identity.check(other, f"{store.uri}/{folder}")
 
 
@@ -317,8 +321,6 @@ class BlockWorker:
         return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
-        from augment.jobs.quality import resolve_quality_for
-
         scene, setup = self._scene_of(task.uri, task.name), self._setup
         try:
             return resolve_quality_for(
@@ -406,11 +408,9 @@ class BlockWorker:
                 publisher.finish()
             if not result.failed:
                 clear_block(self._store, self._setup.scratch, block)
-        seconds = Counter(result.timings)
-        seconds.update(times.so_far())
-        return BlockDone(
-            result.written, result.skipped, result.failed, result.failures, seconds=dict(seconds)
-        )
+        times.update(result.timings)
+        counts = result.written, result.skipped, result.failed, result.failures
+        return BlockDone(*counts, seconds=times.so_far())
 
     def _enter(self, block: Block) -> None:
         variant = (block.scene, block.variant)
@@ -426,8 +426,6 @@ class BlockWorker:
 
     def _lay_bed(self, block: Block, scene: Scene) -> None:
         """Let one process look where the snow can lie, and the others on this disk wait for it."""
-        from augment.jobs.prepare import snow_to_lay, store_beds
-
         if snow_to_lay(block.recipe) is not None:
             folder = self._beds_dir()
             with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):

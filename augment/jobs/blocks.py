@@ -23,7 +23,7 @@ from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
+from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, reading_back, variant_name
 from augment.jobs.manifest import OK, Identity, Part, Pictured, list_parts, read_manifest
 from augment.jobs.store import Store
 from augment.scene import Scene
@@ -47,8 +47,8 @@ class FrameRecord:
 @dataclass(frozen=True)
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
-    has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how
-    long opening it took. gaussians_bytes: of its splats.
+    has_labels, has_lidar: whether there are any. open_s: how long opening it took. gaussian_bytes:
+    of its splats.
     """
 
     uri: str
@@ -92,7 +92,7 @@ class SceneRecord:
     @staticmethod
     def from_json(data: bytes, where: str) -> SceneRecord:
         """What `to_json` made bytes of."""
-        try:
+        with reading_back(where, "Delete it; the scene is opened again"):
             facts: dict[str, Any] = json.loads(data)
             if facts.pop("format") != _FORMAT:
                 raise ValueError("it is of another version")
@@ -101,19 +101,14 @@ class SceneRecord:
                 for number, time, cameras in facts.pop("frames")
             )
             return SceneRecord(**facts, frames=frames)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise OutputError(
-                f"{where} is damaged: {error}. Delete it; the scene is opened again"
-            ) from error
 
 
 @dataclass(frozen=True)
 class Block:
     """Images that one worker renders in a row and that appear in the output at once. key:
-    `<scene>/<variant>-<first frame>-<digest>`; the digest is of all that decides the block's
-    images, so it stays the same whatever else is in the job. uri: what opens the scene. source: the
-    scene's own word for that. scene: its name in the output. frames, cameras: in order. images: how
-    many it has.
+    `<scene>/<variant>-<first frame>-<digest>`, the digest of all that decides the block's images,
+    whatever else is in the job. uri: what opens the scene. source: the scene's own word for that.
+    scene: its name in the output. images: how many it has.
     """
 
     key: str
@@ -171,8 +166,7 @@ def cut_into_blocks(
 ) -> list[Block]:
     """The scene's blocks, variant by variant, in the order of the frames. frames: as
     `recipes.schema` reads them; ranges end with the scene. block_images: about how many images one
-    has. Blocks begin at fixed frames of the scene, whatever the selection, so that most stay the
-    same when it grows.
+    has. Blocks begin at fixed frames, so that most stay the same when the selection grows.
     """
     known = {name for frame in record.frames for name in frame.cameras}
     if cameras is not None and (unknown := sorted(set(cameras) - known)):
@@ -180,7 +174,7 @@ def cut_into_blocks(
             f"scene {record.name!r} has no camera {', '.join(unknown)}; it has "
             f"{', '.join(sorted(known))}"
         )
-    wanted_cameras = known if cameras is None else set(cameras)
+    selected_cameras = known if cameras is None else set(cameras)
     numbers = [frame.number for frame in record.frames]
     chosen = parse_frames(frames).select(numbers, clip=True)
     requested = set(numbers if chosen is None else chosen)
@@ -189,48 +183,27 @@ def cut_into_blocks(
             f"scene {record.name!r} has no frame {', '.join(map(str, unknown_frames))}; its frames "
             f"are {numbers[0]} to {numbers[-1]}"
         )
-    span = max(1, block_images // max(len(wanted_cameras), 1))
+    span = max(1, block_images // max(len(selected_cameras), 1))
+    origin = record.uri, record.source, record.name
     blocks: list[Block] = []
     for recipe in recipes:
+        stem = f"{folder_name(record.name)}/{folder_name(variant_name(recipe))}"
         for start in range(0, len(record.frames), span):
             run = [f for f in record.frames[start : start + span] if f.number in requested]
-            counts = [len(wanted_cameras & f.cameras.keys()) for f in run]
+            counts = [len(selected_cameras & f.cameras.keys()) for f in run]
             held = tuple(f.number for f, count in zip(run, counts, strict=True) if count)
             if held:
-                names = tuple(sorted(wanted_cameras & {n for f in run for n in f.cameras}))
-                key = _key(record, recipe, run[0].number, held, names, backend)
-                blocks.append(
-                    Block(
-                        key,
-                        record.uri,
-                        record.source,
-                        record.name,
-                        recipe,
-                        held,
-                        names,
-                        sum(counts),
-                    )
-                )
+                names = tuple(sorted(selected_cameras & {n for f in run for n in f.cameras}))
+                decides = [record.source, recipe.hash, held, names, augment.__version__, backend]
+                digest = hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
+                key = f"{stem}-{run[0].number:06d}-{digest}"
+                blocks.append(Block(key, *origin, recipe, held, names, sum(counts)))
     if not blocks:
         raise SceneError(
             f"scene {record.name!r} ({record.uri}): frames {frames!r} and cameras "
             f"{'all' if cameras is None else ', '.join(cameras)} hold no image"
         )
     return blocks
-
-
-def _key(
-    record: SceneRecord,
-    recipe: Recipe,
-    first: int,
-    frames: tuple[int, ...],
-    cameras: tuple[str, ...],
-    backend: str,
-) -> str:
-    decides = [record.source, recipe.hash, frames, cameras, augment.__version__, backend]
-    digest = hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
-    variant = folder_name(variant_name(recipe))
-    return f"{folder_name(record.name)}/{variant}-{first:06d}-{digest}"
 
 
 # ---- The plan ------------------------------------------------------------------------------------
@@ -264,10 +237,9 @@ def make_plan(
     resolved: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
 ) -> Plan:
     """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
-    it cannot be opened. resolved: by scene and variant, those recipes whose quality had to choose
-    its settings in the scene, or why it could not: no recipe of that scene is rendered then. Raises
-    ClimateGSError: two scenes would share a folder, or none of them can be used. RecipeError: a
-    draw breaks a rule.
+    it cannot be opened. resolved: by scene and variant, recipes whose quality had to choose, or why
+    it could not: then no recipe of that scene is rendered. Raises ClimateGSError: two scenes would
+    share a folder, or none can be used. RecipeError: a draw breaks a rule.
     """
     blocks: list[Block] = []
     records: dict[str, SceneRecord] = {}
@@ -350,7 +322,16 @@ _BLOCK_FIELDS = tuple(PlannedBlock.__dataclass_fields__)
 
 def store_plan(store: Store, plan: Plan) -> None:
     """Write the plan's file; the same for every shard and every time."""
-    data = _to_json(plan)
+    facts = {
+        "format": _FORMAT,
+        "job": plan.job,
+        "version": augment.__version__,
+        "images": plan.images,
+        "scenes": len(plan.records),
+        "unusable": dict(plan.unusable),
+        "blocks": [[b.key, b.scene, b.variant, b.recipe.name, b.images] for b in plan.blocks],
+    }
+    data = json.dumps(facts, separators=(",", ":")).encode()
     path = f"{JOBS}/{plan.job}.json"
     if not (store.exists(path) and store.read(path) == data):
         store.write(path, data)
@@ -372,32 +353,13 @@ def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> No
             )
 
 
-def _to_json(plan: Plan) -> bytes:
-    blocks = [[b.key, b.scene, b.variant, b.recipe.name, b.images] for b in plan.blocks]
-    facts = {
-        "format": _FORMAT,
-        "job": plan.job,
-        "version": augment.__version__,
-        "images": plan.images,
-        "scenes": len(plan.records),
-        "unusable": dict(plan.unusable),
-        "blocks": blocks,
-    }
-    return json.dumps(facts, separators=(",", ":")).encode()
-
-
 def _from_json(data: bytes, where: str) -> StoredPlan:
-    try:
+    with reading_back(where, "Delete it and start the job again"):
         facts = json.loads(data)
         if facts["format"] != _FORMAT:
             raise ValueError("it is of another version")
         blocks = [dict(zip(_BLOCK_FIELDS, block, strict=True)) for block in facts["blocks"]]
         return _STORED_PLAN.validate_json(json.dumps({**facts, "blocks": blocks}), strict=True)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        problem = str(error).replace("\n", " ")
-        raise OutputError(
-            f"{where} is damaged: {problem}. Delete it and start the job again"
-        ) from error
 
 
 # ---- How far a job has come, read from its output alone ------------------------------------------

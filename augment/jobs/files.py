@@ -64,7 +64,7 @@ Item = tuple[int, str]  # frame number and camera name
 
 @runtime_checkable
 class View(Protocol):
-    """What a renderer returns, a dataclass; `augment.views.WeatheredView` is one."""
+    """What a renderer returns, a dataclass: `augment.views.WeatheredView` or a stand-in."""
 
     rgb: np.ndarray  # uint8 [H, W, 3]
     depth_m: np.ndarray | None  # float32 [H, W], 0 = none
@@ -302,11 +302,10 @@ def _measure_2d(
 
 
 def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
-    """What the weather leaves of each box: transmittance of the smog, times the part of its pixels
-    that no water hides, times the part that no snow covers; [count], 0 to 1. An effect that there
-    is not, or that says nothing of a box (NaN: no pixel shows it, or its own numbers are not
-    finite), takes nothing from it. So this is no answer to whether a box is in view, or behind
-    another: `pixels` of the tables is.
+    """What the weather leaves of each box, [count], 0 to 1: transmittance of the smog, times the
+    part of its pixels that no water hides, times the part that no snow covers. An effect that is
+    absent, or that says nothing of a box (NaN), takes nothing from it: whether a box is in view, or
+    behind another, is told by `pixels` of the tables.
     """
     factors = [np.ones(count)]
     if "box_smog" in weather:

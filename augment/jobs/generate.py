@@ -27,7 +27,7 @@ from tqdm import tqdm
 import augment
 from augment.errors import OutputError
 from augment.jobs.atomic import refusals_of
-from augment.jobs.block_pools import Event, Lost, SerialPool, Tick, WorkerPool
+from augment.jobs.block_pools import Event, Lost, ProcessPool, RayPool, SerialPool, Tick, WorkerPool
 from augment.jobs.block_worker import (
     BlockDone,
     BlockTask,
@@ -55,7 +55,8 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
-from augment.jobs.processes import renders_on_gpu
+from augment.jobs.processes import available_cores, renders_on_gpu
+from augment.jobs.quality import Question, recorded
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome
@@ -169,8 +170,8 @@ class Scheduler:
         one_by_one: bool = False,
     ) -> None:
         """What comes before the blocks; `each` gets a task's result, or a text that says why there
-        is none. A task whose worker dies is tried once more, while no other worker is busy.
-        one_by_one: no two at a time, so that none is in the way of another's frame times.
+        is none. A task whose worker dies is tried once more while no other worker is busy.
+        one_by_one: so that none disturbs another's frame times.
         """
         slots = 1 if one_by_one else self.slots
         waiting, alone = deque(tasks), deque[_First]()
@@ -203,9 +204,9 @@ class Scheduler:
     def render(
         self, blocks: Sequence[Block], names: Mapping[str, str | None], fail: FailBlock
     ) -> None:
-        """Render and publish the blocks. names: by scene, what it is called if not by itself. fail:
-        records all images of a block as failed. A block whose worker dies is tried once more while
-        no other worker is busy, each of its images in a process of its own.
+        """Render and publish the blocks. names: by scene, what the job calls it. fail: records all
+        images of a block as failed. A block whose worker dies is tried once more while no other
+        worker is busy, each of its images in a process of its own.
         """
         self._queue, self._names, self._fail = BlockQueue(blocks), names, fail
         while self._dispatch():
@@ -327,13 +328,25 @@ def resolve_recipes(
     """By scene and variant: the recipes that had to choose, resolved, or why they could not. found:
     the scene of every URI and name. keep: whether new choices are kept in the output.
     """
-    open_recipes = _open_recipes(job, found)
-    if not open_recipes:
-        return {}
-    choices, left = _recorded(store, open_recipes, job.setup.backend)
+    asked = [
+        (Question(recipe, record.name, record.source, RECORDED, job.setup.backend), entry)
+        for entry in job.scenes
+        if isinstance(record := found[entry.uri, entry.name], SceneRecord)
+        for recipe in job.recipes.of_scene(entry, record.name)
+        if recipe.quality.is_open
+    ]
+    with ThreadPoolExecutor(_READS, thread_name_prefix="choices") as pool:
+        answers = list(pool.map(lambda pair: recorded(store, pair[0]), asked))
+    choices: Choices = {}
+    left: defaultdict[tuple[str, str | None, str], list[Recipe]] = defaultdict(list)
+    for (question, entry), answer in zip(asked, answers, strict=True):
+        if answer is None:
+            left[entry.uri, entry.name, question.scene].append(question.recipe)
+        else:
+            choices[question.scene, variant_name(question.recipe)] = answer
     tasks = {
-        ResolveTask(record.uri, name, tuple(recipes), keep): record
-        for record, name, recipes in left
+        ResolveTask(uri, name, tuple(dict.fromkeys(recipes)), keep): scene
+        for (uri, name, scene), recipes in left.items()
     }
     bar = tqdm(
         total=len(tasks), unit="scene", desc="choosing settings", disable=not progress or not tasks
@@ -342,7 +355,7 @@ def resolve_recipes(
     def each(task: ResolveTask, resolved: ResolvedRecipes | str) -> None:
         for number, recipe in enumerate(task.recipes):
             outcome = resolved if isinstance(resolved, str) else resolved.recipes[number]
-            choices[tasks[task].name, variant_name(recipe)] = outcome
+            choices[tasks[task], variant_name(recipe)] = outcome
         bar.update()
 
     with bar:
@@ -353,47 +366,6 @@ def resolve_recipes(
         turned = [*tasks][start:] + [*tasks][:start]
         scheduler.do_first(turned, each, one_by_one=timed)
     return choices
-
-
-_OpenRecipes = list[tuple[SceneRecord, str | None, list[Recipe]]]
-
-
-def _open_recipes(job: GenerateJob, found: Found) -> _OpenRecipes:
-    """Scenes with their names in the job and the recipes that have to choose there."""
-    open_recipes: _OpenRecipes = []
-    for entry in job.scenes:
-        record = found[entry.uri, entry.name]
-        if isinstance(record, SceneRecord):
-            drawn = job.recipes.of_scene(entry, record.name)
-            if unresolved := [recipe for recipe in drawn if recipe.quality.is_open]:
-                open_recipes.append((record, entry.name, unresolved))
-    return open_recipes
-
-
-def _recorded(
-    store: Store, open_recipes: _OpenRecipes, backend: str
-) -> tuple[Choices, _OpenRecipes]:
-    """What the output knows already, and what is left to choose."""
-    from augment.jobs.quality import Question, recorded
-
-    questions = [
-        Question(recipe, record.name, record.source, RECORDED, backend)
-        for record, _, recipes in open_recipes
-        for recipe in recipes
-    ]
-    with ThreadPoolExecutor(_READS, thread_name_prefix="choices") as pool:
-        answers = list(pool.map(lambda question: recorded(store, question), questions))
-    choices: Choices = {
-        (question.scene, variant_name(question.recipe)): answer
-        for question, answer in zip(questions, answers, strict=True)
-        if answer is not None
-    }
-    left: _OpenRecipes = []
-    for record, name, recipes in open_recipes:
-        rest = [r for r in recipes if (record.name, variant_name(r)) not in choices]
-        if rest:
-            left.append((record, name, rest))
-    return choices, left
 
 
 # ---- How long a job will take and how large its output gets, from a few pictures -----------------
@@ -424,11 +396,10 @@ class Estimate:
 def estimate(
     plan: Plan, open_scene: SceneLoader, *, each: Callable[[str], None] = lambda name: None
 ) -> Estimate:
-    """Render a frame under each recipe, and scale what it takes by the pixels of the job. The
-    pictures are the middle frame of the recipe's first scene in one camera, twice: what the first
-    takes beyond the second (where snow can lie, what a style maps, compiling) counts once a scene.
-    Scenes and weather differ, so this is right to within a factor of two or so. each: told of every
-    recipe before it is tried.
+    """Render a frame under each recipe, and scale what it takes by the pixels of the job; right to
+    within a factor of two or so. The pictures are the middle frame of the recipe's first scene in
+    one camera, twice: what the first takes beyond the second (snow placement, style maps,
+    compiling) counts once a scene. each: called before every recipe.
     """
     firsts: dict[str, Block] = {}
     for block in plan.blocks:
@@ -463,21 +434,18 @@ def _megapixels(plan: Plan) -> tuple[dict[str, float], dict[str, int]]:
 
 
 def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
-    record = plan.records[block.scene]
-    camera = block.cameras[0]
+    record, camera = plan.records[block.scene], block.cameras[0]
     having = [f.number for f in record.frames if camera in f.cameras]
-    middle = having[len(having) // 2 :][:1] * 2
-    pictures = next(p for p in block.pictured(record) if p.camera == camera)
-    mpx = pictures.width * pictures.height / 1e6
+    pictured = next(p for p in block.pictured(record) if p.camera == camera)
+    mpx = pictured.width * pictured.height / 1e6
     took, size = [], 0
     with tempfile.TemporaryDirectory(prefix="climategs-estimate-") as folder:
-        for run, frame in enumerate(middle):
-            out = Path(folder) / str(run)
+        for out in (Path(folder) / "0", Path(folder) / "1"):
             job = RenderJob(
                 block.uri,
                 [block.recipe],
                 out,
-                frames=[frame],
+                frames=[having[len(having) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
                 beds_dir=Path(folder) / "beds",
@@ -500,11 +468,11 @@ _CLAIM_S = 30.0
 
 @dataclass(frozen=True)
 class GenerateJob:
-    """recipes: of the job, loaded. scenes: the job's, without patterns. executor: who renders:
-    `serial` this process, `processes` several of this machine, `ray` actors on a cluster. workers:
-    how many, None for the executor's own choice: where a GPU renders one process, or an actor for
-    each GPU of the cluster; else one for every core. shard: which part of the job is done here,
-    from 1, and how many there are. rescan: open all scenes anew, in case they have changed.
+    """recipes: of the job, loaded. scenes: the job's, without patterns. executor: `serial` renders
+    in this process, `processes` in several of this machine, `ray` in actors on a cluster. workers:
+    how many; None for one a core, where a GPU renders one process, or an actor for each GPU of the
+    cluster. shard: which part of the job is done here, from 1, and how many there are. rescan: open
+    all scenes anew, in case they have changed.
     """
 
     recipes: JobRecipes
@@ -528,9 +496,8 @@ class GenerateJob:
 @dataclass(frozen=True)
 class GenerateResult:
     """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
-    timings: seconds by kind of work, summed over threads and workers, of which `worker.shares_of`
-    says what the job was bound by; and by the clock: `plan`, with the scenes' opening, `scan` of
-    what is finished, and `render_wall`, all else.
+    timings: seconds by kind of work, summed over threads and workers (see `worker.shares_of`); and
+    by the clock: `plan`, `scan` of what is finished, and `render_wall`, all else.
     """
 
     written: int
@@ -550,13 +517,12 @@ def run_generate(
     on_image: Callable[[int, int], None] = lambda done, failed: None,
 ) -> GenerateResult:
     """Render and publish what of the job is not finished yet. progress: bars on stderr. prepare:
-    called before the first image is rendered, if any has to be, with one recipe of each name; to
-    compile kernels once and not in every worker, say. on_image: is told how many images are done
-    and how many of them failed, from several threads. A KeyboardInterrupt lets workers finish the
-    images they have at hand, merges what is published into the manifest, and is raised again.
-    Raises OutputError: the output cannot be written, or holds images of another kind under the same
-    names; none of its images was written then. ClimateGSError: no scene can be used. RecipeError: a
-    recipe cannot be used.
+    called before the first image is rendered, with one recipe of each name, to compile kernels once
+    and not in every worker, say. on_image: told how many images are done and how many of them
+    failed, from several threads. A KeyboardInterrupt lets workers finish the images at hand, merges
+    what is published into the manifest, and is raised again. Raises OutputError: the output cannot
+    be written, or holds images of another kind under the same names, and none was written.
+    ClimateGSError: no scene can be used. RecipeError: a recipe cannot be used.
     """
     return _Generation(_with_backend(job), progress, prepare, on_image).go()
 
@@ -575,12 +541,7 @@ def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
     if job.executor == "serial":
         return SerialPool(job.setup, tick)
     if job.executor == "ray":
-        from augment.jobs.block_pools import RayPool
-
         return RayPool(job.setup, tick, job.workers)
-    from augment.jobs.block_pools import ProcessPool
-    from augment.jobs.processes import available_cores
-
     # Several processes would share one GPU, and each have a copy of its scene there.
     default = 1 if renders_on_gpu(job.setup.backend) else available_cores()
     return ProcessPool(job.setup, tick, job.workers or default)

@@ -5,8 +5,10 @@ Paths in the manifest are relative to the output folder, with forward slashes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
@@ -112,6 +114,25 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths
         box_smog=f"{base}/{tables['box_smog']}" if "box_smog" in tables else None,
         calibration=f"{base}/calibration.json",
     )
+
+
+@contextlib.contextmanager
+def reading_back(where: str, advice: str) -> Iterator[None]:
+    """While JSON of the output is taken apart as it was put together, what goes wrong is an
+    OutputError. advice: what to do, a sentence without its full stop.
+    """
+    try:
+        yield
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as e:
+        problem = f"{e} is missing" if isinstance(e, KeyError) else " ".join(str(e).split())
+        raise OutputError(f"{where} is damaged: {problem}. {advice}") from e
 
 
 def relative_parts(path: str) -> tuple[str, ...] | None:

@@ -28,8 +28,6 @@ from augment.jobs.tables import read_table
 from recipes.schema import Recipe, knobs_of
 from recipes.weather import found
 
-# ---- manifest ------------------------------------------------------------------------------------
-
 OK, FAILED = "ok", "failed"
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import

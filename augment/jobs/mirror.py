@@ -281,8 +281,6 @@ def _facts(path: str) -> os.stat_result | None:
         return None
 
 
-# ---- mirror --------------------------------------------------------------------------------------
-
 # ---- Where the copy of a dataset lies, and the file beside it that says what stands in it --------
 
 MIRROR_FOLDER = "source"

@@ -1,4 +1,4 @@
-"""What worker processes need from the one that starts them."""
+"""What jobs run on: a backend, worker processes, the lock of the output, a shared scene."""
 
 from __future__ import annotations
 
@@ -84,8 +84,6 @@ def renders_on_gpu(backend: str) -> bool:
         return has_gpu()
     return backend == CUDA
 
-
-# ---- processes -----------------------------------------------------------------------------------
 
 Result = TypeVar("Result")
 _TURN_S = 0.0005

@@ -20,11 +20,14 @@ from tqdm import tqdm
 
 import augment
 from augment.cameras import Camera, Frame
-from augment.errors import OutputError, SceneError
+from augment.effects.snow.snow import placement_settings
+from augment.effects.snow.support import support_of
+from augment.effects.style.style import remember_maps, style_maps
+from augment.errors import SceneError
 from augment.jobs.claims import try_claim
 from augment.jobs.files import trajectory_id
-from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.prepare import snow_to_lay, style_to_apply
+from augment.jobs.layout import STATE_FOLDER, reading_back
+from augment.jobs.prepare import find_bed, remember, snow_to_lay, style_to_apply
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
 from augment.metrics.image import flip
@@ -192,8 +195,6 @@ class Bench:
         """Let the scene know where snow of these settings can lie, if that was found here."""
         snow = snow_to_lay(with_settings(self._recipe, settings))
         if snow is not None and self._cameras is None:
-            from augment.jobs.prepare import find_bed, remember
-
             remember(scene, snow, find_bed(self._scene, snow, backend=self._backend))
 
     def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
@@ -220,14 +221,9 @@ class Bench:
             return
         snow, style = snow_to_lay(recipe), style_to_apply(recipe)
         if snow is not None:
-            from augment.effects.snow.snow import placement_settings
-            from augment.effects.snow.support import support_of
-
             settings = placement_settings(snow)
             support_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
         if style is not None:
-            from augment.effects.style.style import remember_maps, style_maps
-
             remember_maps(self._scene, style, style_maps(self._scene, style, cameras=self._cameras))
 
 
@@ -662,7 +658,11 @@ def recorded(store: Store, question: Question) -> Recipe | None:
         data = store.read(question.path)
     except StoredFileMissing:
         return None
-    try:
+    what = f"the settings chosen for recipe {question.recipe.name} in scene {question.scene}"
+    with reading_back(
+        f"{store.uri}/{question.path}, {what},",
+        "Delete it, and they are chosen anew; images of other settings then have to be overwritten",
+    ):
         document = json.loads(data)
         if document["format"] != _FORMAT:
             raise ValueError(f"its format is {document['format']!r}, not {_FORMAT}")
@@ -673,13 +673,6 @@ def recorded(store: Store, question: Question) -> Recipe | None:
             raise TypeError(f"its settings are {settings!r}")
         _check_values(settings)
         return resolved_recipe(question.recipe, settings)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        message = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise OutputError(
-            f"{store.uri}/{question.path}, the settings chosen for recipe {question.recipe.name} "
-            f"in scene {question.scene}, is damaged: {message}. Delete it, and they are chosen "
-            f"anew; images of other settings then have to be overwritten"
-        ) from error
 
 
 def resolve_quality_once(

@@ -15,7 +15,7 @@ import re
 import shutil
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
@@ -25,7 +25,6 @@ import pyarrow as pa
 from tqdm import tqdm
 
 import augment
-from augment.boxes import Instances
 from augment.cameras import Frame
 from augment.errors import OutputError
 from augment.jobs.atomic import (
@@ -56,6 +55,7 @@ from augment.jobs.layout import (
     box_weather_files,
     folder_name,
     item_paths,
+    reading_back,
     variant_folder,
     variant_name,
 )
@@ -81,6 +81,7 @@ from augment.jobs.prepare import (
     style_to_apply,
 )
 from augment.jobs.processes import OutputLock, choose_backend, share_scene
+from augment.jobs.quality import resolve_quality_for
 from augment.jobs.store import open_store
 from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
 from augment.jobs.worker import (
@@ -89,6 +90,7 @@ from augment.jobs.worker import (
     Outcome,
     Renderer,
     Setup,
+    WorkTimes,
     describe,
     run_in_processes,
     run_serially,
@@ -98,8 +100,6 @@ from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
 from recipes.schema import Recipe
 from recipes.weather import Style
-
-# ---- What of a job is done already, what is left, and what the manifest will say of it -----------
 
 # ---- What a variant has finished so far, on the disk, until the manifest has it ------------------
 # `.climategs/journal/<scene>/<variant>.jsonl` starts with the variant's identity and gains a line
@@ -123,13 +123,9 @@ class ProgressLog:
             lines = self.path.read_bytes().split(b"\n")[:-1]  # the last part has no line break
         except FileNotFoundError:
             return None, []
-        try:
+        with reading_back(str(self.path), "Delete it; what it lists is rendered again"):
             identity, *rows = [json.loads(line) for line in lines]
             return Identity(**identity), rows
-        except (ValueError, TypeError, RecursionError) as error:
-            raise OutputError(
-                f"{self.path} is damaged: {error}. Delete it; what it lists is rendered again"
-            ) from error
 
     def begin(self, identity: Identity) -> None:
         """Open for appending; starts with the identity, or goes on after the last whole line."""
@@ -203,23 +199,6 @@ class VariantState:
     )
     is_logged: bool = False
 
-    def is_finished(self, out_dir: Path, item: Item, instances: Instances) -> bool:
-        """Whether the image's row says ok, and all its files and its boxes' numbers are there; and
-        its objects are numbered as today, when a frame may be read that could not be read then.
-        """
-        row = self.rows.get(item)
-        if row is None or row["status"] != OK:
-            return False
-        measured = [kind for kind in TABLES if row[f"{kind}_path"] is not None]
-        if any(item not in self.box_weather[kind] for kind in measured):
-            return False
-        if "box_2d" in measured:
-            numbers = self.box_weather["box_2d"][item]
-            if not instances.agree(numbers.track_ids, numbers["instance"]):
-                return False
-        paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
-        return all((out_dir / path).is_file() for path in paths if path is not None)
-
 
 class JobState:
     """The state of a job in its output folder. Needs the folder's lock."""
@@ -241,10 +220,6 @@ class JobState:
             folder = variant_folder(index.name, name)
             self.variants.append(VariantState(recipe, name, folder, identity, progress_log))
 
-    @property
-    def keys(self) -> set[tuple[str, str]]:
-        return {(self.index.name, variant.name) for variant in self.variants}
-
     def open(self, *, overwrite: bool) -> None:
         """Clear away what a killed run left, and read what it finished."""
         if (self.out_dir / MANIFEST).is_file():
@@ -258,15 +233,9 @@ class JobState:
         """What has to be rendered, in order: variant by variant, frame by frame."""
         for number, variant in enumerate(self.variants):
             for frame, names in selection:
-                left = [
-                    name
-                    for name in names
-                    if not variant.is_finished(
-                        self.out_dir, (frame.index, name), self.index.instances
-                    )
-                ]
+                left = tuple(n for n in names if not self._is_finished(variant, (frame.index, n)))
                 if left:
-                    yield Chunk(number, frame.index, tuple(left))
+                    yield Chunk(number, frame.index, left)
 
     def record(self, outcome: Outcome, frame: Frame) -> None:
         """Enter what became of an image, durably. May be called from several threads."""
@@ -278,6 +247,23 @@ class JobState:
             variant.rows[frame.index, outcome.camera] = row
             for kind, numbers in outcome.box_weather.items():
                 variant.box_weather[kind][frame.index, outcome.camera] = numbers
+
+    def _is_finished(self, variant: VariantState, item: Item) -> bool:
+        """Whether the image's row says ok, and all its files and its boxes' numbers are there; and
+        its objects are numbered as today, when a frame may be read that could not be read then.
+        """
+        row = variant.rows.get(item)
+        if row is None or row["status"] != OK:
+            return False
+        measured = [kind for kind in TABLES if row[f"{kind}_path"] is not None]
+        if any(item not in variant.box_weather[kind] for kind in measured):
+            return False
+        if "box_2d" in measured:
+            numbers = variant.box_weather["box_2d"][item]
+            if not self.index.instances.agree(numbers.track_ids, numbers["instance"]):
+                return False
+        paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
+        return all((self.out_dir / path).is_file() for path in paths if path is not None)
 
     def write_manifest(self, variants: Sequence[VariantState]) -> Path:
         """Put the rows of these variants into the manifest."""
@@ -316,9 +302,9 @@ class JobState:
         return False
 
     def _give_up(self, variants: Sequence[VariantState]) -> None:
-        """Drop the variants' files and rows, in an order that a kill cannot confuse. The folder
-        goes first, in one step: until the rows have gone too, the next run finds the old images
-        missing, which the old job can render again and another is refused.
+        """Drop the variants' files and rows, in an order that a kill cannot confuse: the folder
+        goes first, in one step. Until the rows have gone too, the next run finds the old images
+        missing; the old job can render them again, and another is refused.
         """
         trash = self.out_dir / STATE_FOLDER / "trash"
         for number, variant in enumerate(variants):
@@ -513,8 +499,6 @@ def _write_calibration(job_state: JobState, variant: VariantState, trajectory: s
     write_atomic(path, calibration_bytes(index, variant.name, trajectory, entries))
 
 
-# ---- render job ----------------------------------------------------------------------------------
-
 # ---- The files of a style beside the images that it made: `<variant>/style/` ---------------------
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
@@ -558,8 +542,7 @@ def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
 
 def copy_style_files(recipe: Recipe, folder: Path) -> None:
     """Put the style's files where `portable_recipe` names them. folder: the variant's. Raises
-    RecipeError: they cannot be read or are not those of the recipe's digest. OutputError: they
-    cannot be written.
+    RecipeError: they are unreadable or not those of the recipe's digest.
     """
     if recipe.style is None or not recipe.style.files:
         return
@@ -585,15 +568,14 @@ SceneLoader = Callable[[str], Scene]
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """What to render, and where to. recipes: resolved recipes, one a variant; their `name` and
-    `variant` number make the folder. Where a style names files without a digest, the job fills it
-    in; where a quality has still to choose its settings, they are chosen once and kept in the
-    output, for every later run. frames: the dataset's frame numbers, or None for all. cameras:
-    names, or None for all. camera_path: frames to render in place of the scene's own, poses in the
-    scene's world; labels and LiDAR pass through where a frame of the scene has the same number and
-    timestamp. workers: 1 renders in this process. overwrite: replace the variants' folders,
-    finished or not, and choose their settings anew. beds_dir: where it is kept where snow can lie,
-    for later jobs; in the output folder if None.
+    """What to render, and where to. recipes: resolved, one a variant; their `name` and `variant`
+    number make the folder. Missing digests of style files are filled in; settings that a quality
+    leaves open are chosen once and kept in the output. frames: the dataset's frame numbers, or None
+    for all. cameras: names, or None for all. camera_path: frames to render in place of the scene's
+    own, poses in the scene's world; labels and LiDAR pass through where a frame of the scene has
+    the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
+    variants' folders, finished or not, and choose their settings anew. beds_dir: keeps the snow
+    supports for later jobs; the output folder's state if None.
     """
 
     scene_uri: str
@@ -622,10 +604,10 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class JobResult:
-    """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
-    manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over threads
-    and workers (the kinds of `times`), or of the job itself (open, settle, place, style, labels,
-    share, finish). `times.shares_of` says what the job was bound by.
+    """Counts of images of this job. skipped: finished by earlier runs. failures: a line each.
+    seconds: wall clock. timings: seconds by kind of work, summed over threads and workers, or of
+    the job itself (open, settle, place, style, labels, share, finish); `worker.shares_of` says what
+    bound it.
     """
 
     written: int
@@ -645,28 +627,24 @@ def run_job(
     progress: bool = True,
     on_outcome: Callable[[Outcome], None] | None = None,
 ) -> JobResult:
-    """Render what is missing, then write labels, calibration and manifest.
-
-    scene_loader: called once with `job.scene_uri`. renderer: `augment.views.render_view` if None;
-    with several workers it must be an importable function, and the scene's labels and sky of
-    importable classes, since both are sent to other processes. progress: a bar on stderr. tell: is
-    called after each image with what became of it, from several threads, one at a time.
-
-    An image that fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt
-    finishes the images at hand, writes the manifest of what there is, and is raised again.
-
-    Raises:
-        SceneError: the scene cannot be opened, lacks a wanted frame or camera, or cannot have the
-            snow of a recipe. StyleError, RecipeError: a style or one of its files cannot be used.
-            No file of a variant has been written or replaced then.
-        OutputError: the folder cannot be written, is in use, or holds something else.
+    """Render what is missing, then write labels, calibration and manifest. scene_loader: called
+    once with `job.scene_uri`. renderer: `augment.views.render_view` if None; with several workers
+    an importable function, and the scene's labels and sky of importable classes. progress: a bar on
+    stderr. on_outcome: called after each image, from several threads, one at a time. An image that
+    fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt finishes the images
+    at hand, writes the manifest of what there is, and is raised again. Raises SceneError: the scene
+    cannot be opened, lacks a requested frame or camera, or cannot have the snow of a recipe;
+    StyleError, RecipeError: a style or one of its files cannot be used; no file of a variant has
+    been written or replaced then. OutputError: the folder cannot be written, is in use, or holds
+    something else.
     """
     started = time.perf_counter()
     run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
-    run.timings["open"] = time.perf_counter() - started - run.timings.get("settle", 0.0)
-    run.go(progress)
+    opening = time.perf_counter() - started
+    run.times.add("open", opening - run.times.so_far().get("settle", 0.0))
+    run.go()
     seconds = time.perf_counter() - started
-    run.timings[WORKERS] = job.workers * seconds
+    run.times.add(WORKERS, job.workers * seconds)
     return JobResult(
         written=run.counts[OK],
         skipped=run.skipped,
@@ -674,7 +652,7 @@ def run_job(
         manifest=run.out_dir / MANIFEST,
         seconds=seconds,
         failures=tuple(sorted(run.failures)),
-        timings=dict(run.timings),
+        timings=run.times.so_far(),
     )
 
 
@@ -690,16 +668,17 @@ class _Run:
         progress: bool,
     ) -> None:
         self.job, self.renderer, self.on_outcome = job, renderer, on_outcome
+        self.progress, self.times = progress, WorkTimes()
         self.scene: Scene | None = scene  # None once workers have it
-        self.timings: defaultdict[str, float] = defaultdict(float)
         # A stand-in has its own idea of backends.
         self.backend = job.backend if renderer else choose_backend(job.backend, scene)
         self.index = SceneIndex.of(scene, job.camera_path)
         self.selection = select_frames(self.index, job.frames, job.cameras)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
-        self.recipes = tuple(self._resolved(with_digest(r), progress) for r in job.recipes)
-        self.job_state = JobState(self.out_dir, self.index, self.recipes, self._identities())
+        self.recipes = tuple(self._resolved(with_digest(r)) for r in job.recipes)
+        identities = [self._identity(recipe) for recipe in self.recipes]
+        self.job_state = JobState(self.out_dir, self.index, self.recipes, identities)
         self.boxes = BoxCache(self.index)
         self.beds: tuple[StoredBed, ...] = ()
         self.maps: tuple[StoredMaps, ...] = ()
@@ -707,21 +686,23 @@ class _Run:
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
 
-    def go(self, progress: bool) -> None:
+    def go(self) -> None:
         self.total = len(self.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
             if self.job.overwrite:  # this may fail, so it comes before anything is given up
-                self._check_kept()
-                self._prepare(self.recipes, progress)
+                folders = [self.out_dir / variant.folder for variant in self.job_state.variants]
+                for recipe in self.recipes:
+                    check_kept(recipe, folders)
+                self._prepare(self.recipes)
             self.job_state.open(overwrite=self.job.overwrite)
             chunks = list(self.job_state.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
                 if not self.job.overwrite:
                     pending = sorted({chunk.variant for chunk in chunks})
-                    self._prepare([self.recipes[number] for number in pending], progress)
+                    self._prepare([self.recipes[number] for number in pending])
                 self.bar = tqdm(
-                    total=self.total, initial=self.skipped, unit="image", disable=not progress
+                    total=self.total, initial=self.skipped, unit="image", disable=not self.progress
                 )
                 with self.bar:
                     self._render(chunks, lock)
@@ -756,12 +737,11 @@ class _Run:
             spent = run_serially(
                 self.scene, self.index.frames, setup, chunks, self.renderer, self._deliver
             )
-            self.timings.update(spent)
+            self.times.update(spent)
             return
-        started = time.perf_counter()
-        shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
+        with self.times.spent("share"):
+            shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
         self.scene = None  # this process needs no more of it than the index
-        self.timings["share"] += time.perf_counter() - started
         try:
             spent = run_in_processes(
                 setup,
@@ -774,47 +754,30 @@ class _Run:
             )
         finally:
             shared.remove()
-        self.timings.update(spent)
+        self.times.update(spent)
 
-    def _resolved(self, recipe: Recipe, progress: bool) -> Recipe:
+    def _resolved(self, recipe: Recipe) -> Recipe:
         """The recipe with the settings that its quality chooses here, or has chosen before."""
         if not recipe.quality.is_open:
             return recipe
-        from augment.jobs.quality import resolve_quality_for
-
-        started = time.perf_counter()
         assert self.scene is not None
-        settled = resolve_quality_for(
-            open_store(self.out_dir),
-            recipe,
-            self.scene,
-            backend=self.backend,
-            camera_path=self.job.camera_path,
-            renderer=self.renderer,
-            anew=self.job.overwrite,
-            progress=progress,
-        )
-        self.timings["settle"] += time.perf_counter() - started
-        return settled
-
-    def _identities(self) -> list[Identity]:
-        return [
-            Identity(
-                source=self.index.source,
-                recipe_hash=recipe.hash,
-                trajectory=self.trajectory,
-                version=augment.__version__,
+        with self.times.spent("settle"):
+            return resolve_quality_for(
+                open_store(self.out_dir),
+                recipe,
+                self.scene,
                 backend=self.backend,
+                camera_path=self.job.camera_path,
+                renderer=self.renderer,
+                anew=self.job.overwrite,
+                progress=self.progress,
             )
-            for recipe in self.recipes
-        ]
 
-    def _check_kept(self) -> None:
-        folders = [self.out_dir / variant.folder for variant in self.job_state.variants]
-        for recipe in self.recipes:
-            check_kept(recipe, folders)
+    def _identity(self, recipe: Recipe) -> Identity:
+        version = augment.__version__
+        return Identity(self.index.source, recipe.hash, self.trajectory, version, self.backend)
 
-    def _prepare(self, recipes: Collection[Recipe], progress: bool) -> None:
+    def _prepare(self, recipes: Collection[Recipe]) -> None:
         """Find what images of these recipes share, for all cameras of the scene or the path. Where
         their snow can lie, and the colour maps of their styles.
         """
@@ -827,16 +790,18 @@ class _Run:
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
         if styled:
-            started = time.perf_counter()
-            self.maps = store_maps(self.scene, styled, cameras=cameras)
-            self.timings["style"] += time.perf_counter() - started
+            with self.times.spent("style"):
+                self.maps = store_maps(self.scene, styled, cameras=cameras)
         if snowy:
-            started = time.perf_counter()
-            folder = self.job.beds_dir or self.out_dir / STATE_FOLDER
-            self.beds = store_beds(
-                self.scene, snowy, folder, cameras=cameras, backend=self.backend, progress=progress
-            )
-            self.timings["place"] += time.perf_counter() - started
+            with self.times.spent("place"):
+                self.beds = store_beds(
+                    self.scene,
+                    snowy,
+                    self.job.beds_dir or self.out_dir / STATE_FOLDER,
+                    cameras=cameras,
+                    backend=self.backend,
+                    progress=self.progress,
+                )
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""
@@ -850,12 +815,11 @@ class _Run:
 
     def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""
-        started = time.perf_counter()
-        labelled = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
-        self.boxes.get(sorted(labelled))
-        if labelled:
-            _ = self.index.instances.by_track  # read once, and not by every worker
-        self.timings["labels"] += time.perf_counter() - started
+        with self.times.spent("labels"):
+            labelled = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
+            self.boxes.get(sorted(labelled))
+            if labelled:
+                _ = self.index.instances.by_track  # read once, and not by every worker
         rest = []
         for chunk in chunks:
             message = self.boxes.errors.get(chunk.frame)
@@ -880,6 +844,5 @@ class _Run:
                 self.on_outcome(outcome)
 
     def _finish(self) -> None:
-        started = time.perf_counter()
-        finish(self.job_state, self.trajectory, self.boxes)
-        self.timings["finish"] += time.perf_counter() - started
+        with self.times.spent("finish"):
+            finish(self.job_state, self.trajectory, self.boxes)

@@ -33,6 +33,9 @@ from augment.jobs.atomic import (
 from augment.jobs.layout import path_below, relative_parts
 from augment.jobs.processes import uninterrupted
 
+if TYPE_CHECKING:
+    from pyarrow.fs import FileSystem
+
 _UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
 
 
@@ -51,9 +54,8 @@ class StoredFile:
 @runtime_checkable
 class Store(Protocol):
     """Files below one folder. All methods raise OutputError, and may be called by any thread. A
-    store can be pickled and used after a fork: each process opens its own connections. (A child
-    that os.fork made and that used S3 must end by os._exit, as those of multiprocessing do: at a
-    normal exit, pyarrow waits for threads that did not follow it.)
+    store can be pickled and used after a fork: each process opens its own connections. A child of
+    os.fork that used S3 must end by os._exit: at a normal exit, pyarrow waits for threads it lacks.
     """
 
     @property
@@ -92,11 +94,10 @@ class Store(Protocol):
 
 
 def open_store(uri: str | Path) -> Store:
-    """The store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like. Nothing
-    is read or made yet: a folder appears with its first file, a bucket must exist. S3 takes
-    `endpoint_override`, `scheme`, `region`, `force_virtual_addressing` and `tls_ca_file_path` in
-    the URI, and credentials from the environment. Raises OutputError: no such kind of store, or
-    options that it does not know.
+    """The store at a path, `file://`, `s3://bucket/path?region=...`, `gs://` or the like. A folder
+    appears with its first file, a bucket must exist. S3 takes the options _S3_OPTIONS in the URI,
+    and credentials from the environment. Raises OutputError: no such kind of store, or options that
+    it does not know.
     """
 
     if isinstance(uri, Path) or "://" not in uri:
@@ -264,21 +265,11 @@ def _reading(path: Path) -> Iterator[None]:
 # complete before a stream is opened, the stream lives in one uninterruptible step, and the size of
 # what arrived is checked.
 
-# ---- Where a remote store is, what is secret about it, and the file system that opens it ---------
-
-if TYPE_CHECKING:
-    from pyarrow.fs import FileSystem
-
 # An object of these appears once its upload is complete; elsewhere a file grows under its name.
 _OBJECT_STORES = ("s3", "gs", "gcs")
 _KINDS = (*_OBJECT_STORES, "abfs", "abfss", "hdfs", "viewfs")
-_S3_OPTIONS = (
-    "endpoint_override",
-    "scheme",
-    "region",
-    "force_virtual_addressing",
-    "tls_ca_file_path",
-)
+_S3_OPTIONS = ("endpoint_override", "scheme", "region",
+               "force_virtual_addressing", "tls_ca_file_path")  # fmt: skip
 _SECRET_OPTION = re.compile(r"key|secret|token|password|credential|signature|^sig$", re.IGNORECASE)
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _CONNECT_TIMEOUT_S = 10
@@ -451,11 +442,6 @@ def advice(failure: Exception, scheme: str) -> str:
     )
 
 
-# ---- remote store --------------------------------------------------------------------------------
-
-if TYPE_CHECKING:
-    from pyarrow.fs import FileSystem
-
 _DELETES_AT_ONCE = 8
 _of_parents: list[FileSystem | None] = []
 _random = SystemRandom()  # the jitter of processes with one seed must differ
@@ -509,11 +495,9 @@ class RemoteStore:
 
     def put_file(self, path: str, source: Path) -> None:
         """The file is read into memory first: one that fails to be read must not be uploaded."""
-        path = stored_path(path, self.uri)
-        try:
+        stored_path(path, self.uri)
+        with _reading(source):
             data = source.read_bytes()
-        except OSError as error:
-            raise OutputError(f"cannot read {source}: {error.strerror}") from error
         self.write(path, data)
 
     def list(self, folder: str) -> dict[str, StoredFile]:
@@ -540,7 +524,7 @@ class RemoteStore:
     def delete(self, paths: Iterable[str]) -> None:
         """Object stores know no folders; but pyarrow leaves an empty marker of the folder."""
         names = [stored_path(path, self.uri) for path in paths]
-        if len(names) < 2:
+        if len(names) < 2:  # at the end of a process no thread can be started
             for name in names:
                 self._delete(name)
             return

@@ -24,8 +24,6 @@ import pyarrow.parquet as pq
 from augment.errors import OutputError
 from augment.labels import Boxes, LidarSweep
 
-# ---- columns -------------------------------------------------------------------------------------
-
 METADATA_KEY = b"climategs"
 
 _UNLIKE_METADATA = (
@@ -200,11 +198,10 @@ def _opened(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
 
 
 def _has_extension_types(file: pa.NativeFile) -> bool:
-    """Whether the Arrow schema in a Parquet file's footer names an extension type. As a file is
-    opened, Arrow hands what it says of such a type to whatever this process has registered under
-    the type's name; some unpickle it, as pyarrow's own did up to 14.0.0. So the footer is searched
-    beforehand, unparsed, for the schema: it is base64, and bytes before it may look as if they
-    belonged to it.
+    """Whether the Arrow schema in a Parquet file's footer names an extension type, to whose
+    registered class Arrow would hand what the file says (pyarrow's own unpickled it up to 14.0.0).
+    The footer is searched beforehand, unparsed: the schema is base64, and bytes before it may look
+    as if they belonged to it.
     """
     size = file.size()
     file.seek(max(0, size - 8))

@@ -105,6 +105,10 @@ class WorkTimes:
             for kind in kinds:
                 self.add(kind, time.perf_counter() - started)
 
+    def update(self, seconds: Mapping[str, float]) -> None:
+        for kind, spent in seconds.items():
+            self.add(kind, spent)
+
     def so_far(self) -> dict[str, float]:
         with self._lock:
             return dict(self._seconds)
@@ -112,8 +116,8 @@ class WorkTimes:
 
 @dataclass(frozen=True)
 class Shares:
-    """Parts of a job's time, 0 to 1. Of the workers' time: rendering; awaiting, of that, views in
-    flight; held, waiting for files; beside, all else, and the greatest part of it. Of the writing
+    """Parts of a job's time, 0 to 1. Of the workers' time: rendering, of that awaiting views in
+    flight; held, waiting for files; beside, all else, and its greatest part. Of the writing
     threads' time: writing, by kind.
     """
 
@@ -272,11 +276,10 @@ class _Drawn:
 
 
 class FrameRunner:
-    """Renders chunks in this thread, writes on others, and tells `deliver` of each image. Where the
-    renderer returns pending views, the next is begun before the last is waited for, so that a GPU
-    has work while its pictures come back. deliver: called from the writing threads, once the
-    image's files are on the disk. An error of the scene or the renderer concerns one image; an
-    OutputError or GpuLost ends the run, since the next image would fail too.
+    """Renders chunks in this thread, writes on others, and gives `deliver` each image from the
+    writing threads, once its files are on the disk. Where the renderer returns pending views, the
+    next is begun before the last is waited for, so that a GPU has work while pictures come back. An
+    error of the scene or the renderer concerns one image; an OutputError or GpuLost ends the run.
     """
 
     def __init__(
@@ -575,7 +578,7 @@ def run_in_processes(
     work, without those of workers that died. What a dead worker had in hand is tried once more,
     each image alone; if its process dies again the image is recorded as failed. Raises ValueError:
     the renderer cannot be sent to another process. OutputError: a worker could not write.
-    ClimateGSError: a worker could not start.
+    ClimateGSError: one could not start.
     """
     try:
         reduction.ForkingPickler.dumps(renderer)

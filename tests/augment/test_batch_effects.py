@@ -215,6 +215,9 @@ def test_without_labels_there_are_only_the_masks(tmp_path: Path, uri: str, outpu
 def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked) -> None:
     small, ones = np.zeros((8, 12), np.uint8), np.ones((16, 24), np.uint8)
     for number, (change, message) in enumerate([
+        ({"rgb": np.zeros((16, 24, 3), np.float32)}, "rgb must be uint8"),
+        ({"rgb": np.zeros((8, 12, 3), np.uint8)}, r"rgb of \[8, 12, 3\].*16 rows of 24 pixels"),
+        ({"depth_m": None}, "returned no depth_m buffer"),
         ({"water": None}, "returned no water buffer"),
         ({"water": small}, r"water of \[8, 12\].*16 rows of 24 pixels"),
         ({"water": ones}, r"mask must hold 0 and 255 only; got \[1\]"),
@@ -235,15 +238,20 @@ def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked
             assert not TABLES[f"box_{kind}"].read(out / "s/fog-000/labels" / f"{kind}.parquet")
 
 
-def test_effects_under_a_recipe_without_are_recorded(tmp_path: Path) -> None:
-    for name, weather in (("a water level", {"flood": FLOOD}), ("a snow depth", {"snow": SNOW})):
+def test_what_a_recipe_does_not_ask_for_is_recorded(tmp_path: Path) -> None:
+    for more, message in (
+        ({"flood": FLOOD}, "a water level for a recipe without a flood"),
+        ({"snow": SNOW}, "a snow depth for a recipe without snow"),
+        ({"instance": True}, "a instance buffer, which the recipe does not ask for"),
+    ):
 
-        def render(scene, camera, recipe, *, backend, weather=weather):
-            return fake_render(scene, camera, make_recipe(**weather), backend=backend)
+        def render(scene, camera, recipe, *, backend, more=more):
+            given = make_recipe(**{"instance": False, **more})
+            return fake_render(scene, camera, given, backend=backend)
 
-        job = RenderJob("fake:s", [make_recipe()], tmp_path / name, frames=[1])
+        job = RenderJob("fake:s", [make_recipe(instance=False)], tmp_path / message, frames=[1])
         result = run(job, render)
-        assert result.failed == 2 and f"{name} for a recipe without" in result.failures[0]
+        assert result.failed == 2 and message in result.failures[0]
 
 
 @pytest.mark.parametrize(

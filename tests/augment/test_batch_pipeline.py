@@ -208,6 +208,7 @@ def test_what_fails_after_a_task_stops_the_pump() -> None:
         pump.close()
 
 
+@pytest.mark.long
 def test_a_job_on_a_gpu_gives_the_pictures_of_the_cpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

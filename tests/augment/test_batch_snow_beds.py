@@ -176,6 +176,7 @@ def test_live_samples_share_one_search(placements) -> None:
     assert all(torch.equal(again[k]["image"], images[k]) for k in range(2))
 
 
+@pytest.mark.long
 def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
     """Real beds and real pictures: whole, by two workers, and in parts that search anew."""
     recipe, uri = snowy(0.15, cell_m=0.2), "fake:street?frames=2"

@@ -368,6 +368,7 @@ def test_targets_of_what_is_seen(whole: Path) -> None:
         unchecked(sample, bounds="tight")
 
 
+@pytest.mark.long
 def test_parked_cars_of_a_recorded_drive_have_an_instance(shared_dir) -> None:
     from adapters.base import open_scene
 

@@ -99,6 +99,7 @@ def test_shards_in_any_order_give_the_files_of_one_run(tmp_path: Path, whole: di
     assert run(make_job(tmp_path, shard=(2, 2), renderer=must_not_render)).written == 0
 
 
+@pytest.mark.long
 def test_only_what_is_new_is_rendered(tmp_path: Path) -> None:
     """More frames, scenes, recipes and variants, one after the other."""
     dry, both = make_recipes(["dry"]), make_recipes(["dry", "wet"])

@@ -388,7 +388,7 @@ VALUES = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_any_document_is_a_scene_or_a_scene_error(tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "fuzzed"

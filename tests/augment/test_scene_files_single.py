@@ -83,7 +83,7 @@ def test_a_folder_and_a_file_turn_into_each_other(file, tmp_path):
     assert file.read_bytes() == (tmp_path / "again.climategs").read_bytes()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_any_numbers_come_back(tmp_path_factory, data):
     """Of times, names, gaps and facts: what is valid is kept to the bit."""
@@ -233,7 +233,7 @@ def test_undrawable_numbers_of_a_halved_file_are_left_out(tmp_path):
     ]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     flips=st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 255)), min_size=1, max_size=8),
     in_header=st.booleans(),

@@ -292,7 +292,7 @@ WORDS = ["ply", "format", "ascii", "binary_little_endian", "binary_big_endian", 
 LINES = st.lists(st.lists(st.sampled_from(WORDS), max_size=5).map(" ".join), max_size=14)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(lines=LINES, tail=st.binary(max_size=80), cut=st.integers(0, 400))
 def test_any_header_reads_or_raises_a_scene_error(lines: list[str], tail: bytes, cut: int) -> None:
     content = ("ply\n" + "\n".join([*lines, "end_header\n"])).encode() + tail
@@ -300,7 +300,7 @@ def test_any_header_reads_or_raises_a_scene_error(lines: list[str], tail: bytes,
     _read_or_scene_error(content[:cut])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     flips=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=12),
     cut=st.integers(0, 2000),
