@@ -64,13 +64,6 @@ def test_the_gpu_sees_what_the_cpu_sees(views, shift_m, monkeypatch):
     assert (seen != expected).sum() <= 1  # a threshold may lie within float32's rounding
 
 
-def test_nothing_is_seen_by_none(monkeypatch):
-    points, normals, is_sure = some_points(5, 1)
-    with pretended_gpu(monkeypatch):
-        none = draw_views([], [], backend="cuda")
-        assert not none.see(points, normals, is_sure).any()
-
-
 def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
     ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)

@@ -62,22 +62,14 @@ def test_a_file_gives_back_the_bed_to_the_bit(bed: SnowSupport, tmp_path: Path) 
 
 
 def test_the_same_bed_is_the_same_bytes(bed: SnowSupport, tmp_path: Path) -> None:
-    slower = dataclasses.replace(bed, seconds={"views": 1e3})
-    for name, one in (("a", bed), ("b", bed), ("c", slower)):
-        save_support(tmp_path / name, one, "k")
-    contents = {path.read_bytes() for path in tmp_path.iterdir()}
-    assert len(contents) == 1
-
-
-def test_tensors_that_share_memory_are_kept(bed: SnowSupport, tmp_path: Path) -> None:
+    for name in "ab":
+        save_support(tmp_path / name, bed, "k")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     ground = dataclasses.replace(bed.ground, light=bed.ground.tracks)
     shared = SnowSupport(ground, {"a": bed.actors["car"], "b": bed.actors["car"]})
     save_support(tmp_path / "bed", shared, "k")
     assert_equal(load_support(tmp_path / "bed", "k"), shared)
-
-
-def test_an_empty_bed_is_kept_too(scene: Scene, tmp_path: Path) -> None:
-    empty = place_snow_support(scene, [], SETTINGS)
+    empty = place_snow_support(drive(sheet((-2, 14), (-6, 6))), [], SETTINGS)
     save_support(tmp_path / "b", empty, "k")
     assert_equal(load_support(tmp_path / "b", "k"), empty)
 

@@ -10,14 +10,12 @@ from scenes import camera_ahead, random_gaussians
 from augment.effects.style.color_maps import (
     CLASSES,
     StyleMaps,
-    identity_map,
     map_sh,
     style_actor,
     style_gaussians,
     style_sky,
     styled_scene,
 )
-from augment.effects.style.style import identity_maps
 from augment.render.composite import composite_sky, map_colors
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
@@ -26,6 +24,8 @@ from augment.render.threads import limit_threads
 from augment.scene import Actor, ColorWaves, PosedGaussians, Track
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from tests.augment.pretend_gpu import pretended_gpu
+
+IDENTITY_MAPS = StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
 
 
 def some_map(seed: int = 0, size: float = 0.2) -> torch.Tensor:
@@ -38,7 +38,7 @@ def maps_of(splats: torch.Tensor) -> StyleMaps:
 
 def maps_by_class() -> StyleMaps:
     splats = torch.stack([some_map(seed) for seed in range(CLASSES)])
-    splats[3] = identity_map()
+    splats[3] = torch.eye(3, 4)
     return maps_of(splats)
 
 
@@ -54,11 +54,8 @@ def directions(count: int) -> torch.Tensor:
     return torch.nn.functional.normalize(drawn, dim=1)
 
 
-@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-@pytest.mark.parametrize(
-    "backend, count",
-    [*(("cpu", count) for count in (1, 7, 128, 4500)), *(("cuda", count) for count in (1, 7, 80))],
-)
+@pytest.mark.parametrize("sh_degree", [0, 1, 3])
+@pytest.mark.parametrize("backend, count", [("cpu", 7), ("cpu", 4500), ("cuda", 7)])
 def test_the_kernel_equals_the_definition(backend, sh_degree, count):
     """Sizes that no run, no register and no program divides; sums of three products round alike."""
     gaussians = with_classes(count, sh_degree)
@@ -100,14 +97,14 @@ def test_identities_leave_every_bit(backend):
     odd = torch.tensor([-0.0, float("nan"), float("inf"), 1e-42])
     gaussians.sh.view(-1)[: len(odd)] = odd
     bits = gaussians.sh.clone().view(torch.int32)
-    every = maps_of(identity_map().repeat(CLASSES, 1, 1))
-    for maps in (identity_maps(), every):
+    every = maps_of(torch.eye(3, 4).repeat(CLASSES, 1, 1))
+    for maps in (IDENTITY_MAPS, every):
         assert style_gaussians(gaussians, maps, backend=backend) is gaussians
         out = torch.zeros_like(gaussians.sh)
         out = out.to(gpu.gpu_device()) if backend == "cuda" else out
         assert style_gaussians(gaussians, maps, out=out, backend=backend).sh is out
         assert torch.equal(out.cpu().view(torch.int32), bits)
-    slow = map_sh(gaussians.sh, identity_map()[None])
+    slow = map_sh(gaussians.sh, torch.eye(3, 4)[None])
     assert torch.equal(slow.view(torch.int32), bits)
 
 
@@ -252,7 +249,7 @@ def test_skies(sky):
     torch.testing.assert_close(
         style_sky(sky, color_map).sample(towards), expected, rtol=0, atol=1e-6
     )
-    assert style_sky(sky, identity_map()) is sky
+    assert style_sky(sky, torch.eye(3, 4)) is sky
     extreme = style_sky(sky, 9 * some_map()).sample(towards)
     assert extreme.min() >= 0 and extreme.max() <= 1
 
@@ -269,7 +266,7 @@ def test_a_styled_scene_keeps_everything_else():
         assert after.gaussians.means is before.gaussians.means
         for name in ("track_id", "label", "track", "size_m"):
             assert getattr(after, name) is getattr(before, name)
-    same_bits = styled_scene(scene, identity_maps())
+    same_bits = styled_scene(scene, IDENTITY_MAPS)
     assert same_bits.background is scene.background and same_bits.sky is scene.sky
 
 

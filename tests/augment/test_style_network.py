@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from augment.effects.style.network import (
     FLOOR_STD,
@@ -44,7 +45,10 @@ def test_folded_is_factor_by_factor(offset):
     colors = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2))
     folded = apply_map(compose(net.style_map(f_s), net.content_map(f_c)), colors)
     # 1e-5: the sums of float32 products of values near 1, in two orders.
-    torch.testing.assert_close(folded, net.apply_factors(f_c, f_s, colors), atol=1e-5, rtol=1e-5)
+    pad = (0, 1) if offset else (0, 0)
+    content = F.pad(colors, pad, value=1.0) @ net.content_p @ f_c @ net.content_q
+    factors = F.pad(content, pad, value=1.0) @ net.style_p @ f_s @ net.style_q
+    torch.testing.assert_close(folded, factors, atol=1e-5, rtol=1e-5)
     assert bool((net.content_map(f_c)[..., 3] != 0).any()) == offset
     untrained = gscm_map(Gscm(offset=offset), pictures(1), pictures(1))
     torch.testing.assert_close(untrained, torch.eye(3, 4), atol=1e-4, rtol=0)

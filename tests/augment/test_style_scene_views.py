@@ -13,7 +13,6 @@ from augment.effects.style.scene_views import (
     map_sh,
     open_view,
     rendered_pictures,
-    spread_cameras,
     views_of,
 )
 from augment.errors import SceneError
@@ -146,11 +145,11 @@ def test_views_are_squares_of_cameras_spread_over_the_drive():
         for number in range(10)
     )
     scene = dataclasses.replace(scene_of(one_gaussian()), frames=frames)
-    chosen = spread_cameras(scene, 6)
+    chosen = [view.camera for view in views_of(scene, 6, 4)]
     assert [camera.name for camera in chosen] == list("ababab")
     times = [camera.timestamp_ns for camera in chosen]
     assert times == sorted(times) and times[0] <= 1 and times[-1] >= 8
-    assert len(spread_cameras(scene, 99)) == 20
+    assert len(views_of(scene, 99, 4)) == 20
     views = views_of(scene, 3, 12)
     assert [tuple(view.picture.shape) for view in views] == [(3, 12, 12)] * 3
     wide = camera_ahead()
@@ -161,7 +160,7 @@ def test_views_are_squares_of_cameras_spread_over_the_drive():
 
 def test_a_scene_that_no_camera_sees_is_refused():
     with pytest.raises(SceneError, match=r"has no cameras .* camera_path=FILE"):
-        spread_cameras(scene_of(one_gaussian(), cameras={}), 4)
+        views_of(scene_of(one_gaussian(), cameras={}), 4, 4)
 
 
 def test_colours_are_of_background_and_actors_alike():

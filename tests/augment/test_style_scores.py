@@ -26,7 +26,8 @@ def photos() -> torch.Tensor:
 
 def test_order_of_methods(photos):
     none, half, full = (
-        score_pairs(closed_method("mkl", strength), photos, repeats=1) for strength in (0.0, 0.5, 1.0)
+        score_pairs(closed_method("mkl", strength), photos, repeats=1)
+        for strength in (0.0, 0.5, 1.0)
     )
     assert none.same < half.same < full.same
     assert none.same == pytest.approx(none.look)  # the style does not matter to it

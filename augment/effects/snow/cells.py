@@ -6,7 +6,7 @@ A support knows nothing of a recipe's depth: snow of any depth is laid on the sa
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from jaxtyping import Float32, Int16, Int32
 from torch import Tensor
@@ -20,10 +20,8 @@ EDGE_CAP_M = 2.0  # distances to the edge are not told apart beyond this
 
 @dataclass(frozen=True, eq=False)
 class SnowCells:
-    """C cells on the surfaces of one part of a scene: its background, or one actor.
-
-    Cells are squares seen from above, in the part's own frame (an actor's: origin at its box's
-    centre, z up).
+    """C cells on the surfaces of one part of a scene: squares seen from above, in the part's frame
+    (an actor's: origin at its box's centre, z up).
 
     centers_m [C, 3]: x and y of the middle, and z of the surface there. normals [C, 3]: unit, of
     the surface, z > 0. sizes_m [C]: sides. edge_m [C]: level distance from the middle to the
@@ -59,9 +57,8 @@ class SnowCells:
 @dataclass(frozen=True, eq=False)
 class SnowSupport:
     """The cells of a whole scene. ground: of the background. actors: by track_id, of those that
-    carry snow. seconds: how long each stage of finding them took, for reports.
+    carry snow.
     """
 
     ground: SnowCells
     actors: Mapping[str, SnowCells]
-    seconds: Mapping[str, float] = field(default_factory=dict)

@@ -216,11 +216,6 @@ class Footprints:
         return float(z_m.max(initial=-np.inf))
 
 
-def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """int64: numbers of the Gaussians that may be seen, from above, between two corners (x, y)."""
-    return Footprints(gaussians).in_box(low, high)
-
-
 def top_of(parts: Sequence[PosedGaussians]) -> float:
     """z that no centre of the parts exceeds, world; -inf where there is none."""
     return max((_top_m(part) for part in parts if len(part.gaussians)), default=-math.inf)

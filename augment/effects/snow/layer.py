@@ -66,17 +66,10 @@ def build_snow_layer(
         return _lay(cells, own, snow, light, profile, rng, moves=track_id is not None)
 
     actors = {actor.track_id: actor.gaussians for actor in scene.actors}
-    return SnowLayers(
-        ground=layer_of(support.ground, scene.background, None),
-        actors={
-            track_id: layer_of(cells, actors[track_id], track_id)
-            for track_id, cells in support.actors.items()
-        },
-        sun=light.sun,
-        wrap=light.wrap,
-        thickness_m=snow.depth_m,
-        grain=_grain(snow, scene, light, seed),
-    )
+    ground = layer_of(support.ground, scene.background, None)
+    own = {name: layer_of(cells, actors[name], name) for name, cells in support.actors.items()}
+    grain = _grain(snow, scene, light, seed)
+    return SnowLayers(ground, own, light.sun, light.wrap, thickness_m=snow.depth_m, grain=grain)
 
 
 def profile_on(
@@ -117,11 +110,7 @@ def _lay(
     seed = rng.integers(0, 2**64, dtype=np.uint64)
     depths = find_depths(cells, profile, seed)
     gaussians, normals, slopes = _splats(
-        cells,
-        depths,
-        profile.numbers.depth_m,
-        lights,
-        colors,
+        *(cells, depths, profile.numbers.depth_m, lights, colors),
         keep_normals=snow.sparkle > 0 or (moves and not per_pixel),
         keep_slopes=per_pixel or moves,
     )
@@ -196,14 +185,9 @@ def _splats(
             *(heights, depths.mottle, depths.draws, tops, lasts - counts, lights, colors),
             *(t.numpy() for t in (means, quats, scales, sh, normals, slopes)),
         )
-    gaussians = Gaussians(
-        means=means,
-        quats=quats,
-        scales=scales,
-        opacities=torch.full((total,), OPACITY),
-        sh=sh,
-        semantic=torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16),
-    )
+    opacities = torch.full((total,), OPACITY)
+    classes = torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16)
+    gaussians = Gaussians(means, quats, scales, opacities, sh, semantic=classes)
     return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
 
 

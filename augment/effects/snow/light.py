@@ -108,12 +108,17 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     """
     found = light_of(scene)
     light = snow.light
-    azimuth_deg = found.azimuth_deg if light.sun_azimuth_deg is None else light.sun_azimuth_deg
-    elevation_deg = (
-        found.elevation_deg if light.sun_elevation_deg is None else light.sun_elevation_deg
+    azimuth_deg, elevation_deg, share = (
+        own if given is None else given
+        for own, given in (
+            (found.azimuth_deg, light.sun_azimuth_deg),
+            (found.elevation_deg, light.sun_elevation_deg),
+            (found.sun_share, light.sun),
+        )
     )
-    share = found.sun_share if light.sun is None else light.sun
-    sun = _direction(azimuth_deg, elevation_deg)
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    flat = math.cos(elevation)
+    sun = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
     wrap = _mix(_WRAP_OVERCAST, _WRAP_CLEAR, share)
     shade = _mix(_SHADE_OVERCAST, _SHADE_CLEAR, share)
     if light.brightness is None:
@@ -126,15 +131,11 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     cast = _tint(found.ground_rgb_linear, 0.25) if found.ground_is_grey else np.ones(3)
     lit_linear = lit * _even(cast * np.asarray(_SUN_TINT) ** share)
     sky_linear = lit * _even(cast * _tint(found.sky_rgb_linear, 0.2 + 0.4 * share))
-    shadow_linear = _shadow(lit_linear, sky_linear, shade)
-    return Illumination(sun, _display(lit_linear), _display(shadow_linear), wrap)
-
-
-def light_of(scene: Scene) -> SceneLight:
-    """What the scene shows of its light; worked out once per scene object."""
-    if scene not in _LIGHTS:
-        _LIGHTS[scene] = _find_light(scene)
-    return _LIGHTS[scene]
+    lit_rgb, shadow_rgb = (
+        _triple(display_from_linear(np.clip(linear, 0, 1)))
+        for linear in (lit_linear, _shadow(lit_linear, sky_linear, shade))
+    )
+    return Illumination(sun, lit_rgb, shadow_rgb, wrap)
 
 
 _LIGHTS: WeakKeyDictionary[Scene, SceneLight] = WeakKeyDictionary()
@@ -168,8 +169,11 @@ def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
     return np.minimum(shade * (lit + strength * (tinted - lit)), lit)
 
 
-def _find_light(scene: Scene) -> SceneLight:
-    sun_deg, contrast, sky_rgb = _look_at_sky(scene.sky)
+def light_of(scene: Scene) -> SceneLight:
+    """What the scene shows of its light; worked out once per scene object."""
+    if scene in _LIGHTS:
+        return _LIGHTS[scene]
+    (azimuth_deg, elevation_deg), contrast, sky_rgb = _look_at_sky(scene.sky)
     red, _, blue = _triple(sky_rgb)
     is_blue = _ramp(blue / red, _GREY_BLUENESS, _CLEAR_BLUENESS) if red > 1e-6 else 0.0
     overcast_at, clear_at = (
@@ -177,10 +181,9 @@ def _find_light(scene: Scene) -> SceneLight:
         for grey, blue in zip(_GREY_CONTRASTS, _BLUE_CONTRASTS, strict=True)
     )
     clear = _ramp(contrast, overcast_at, clear_at)
-    rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
-    azimuth_deg, elevation_deg = sun_deg
     clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
-    return SceneLight(
+    rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
+    found = _LIGHTS[scene] = SceneLight(
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
         sun_share=_mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear),
@@ -190,6 +193,7 @@ def _find_light(scene: Scene) -> SceneLight:
         ground_rgb_linear=_triple(rgb),
         ground_is_grey=is_grey,
     )
+    return found
 
 
 def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
@@ -276,12 +280,6 @@ def _median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.array(medians)
 
 
-def _direction(azimuth_deg: float, elevation_deg: float) -> tuple[float, float, float]:
-    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    flat = math.cos(elevation)
-    return (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
-
-
 def _shoulder(luminance: float) -> float:
     """The same up to the knee, then ever slower towards the ceiling, without a kink."""
     if luminance <= _KNEE:
@@ -306,10 +304,6 @@ def _even(rgb: np.ndarray) -> np.ndarray:
 
 def _luminance(rgb_linear: np.ndarray) -> float:
     return float((rgb_linear * np.asarray(_LUMINANCE)).sum())
-
-
-def _display(linear: np.ndarray) -> tuple[float, float, float]:
-    return _triple(display_from_linear(np.clip(linear, 0, 1)))
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:

@@ -140,15 +140,10 @@ def shift_m(seed: int) -> np.ndarray:
 
 def _count_splits(gaussians: Gaussians, camera: Camera, finest: float) -> np.ndarray:
     splits = np.empty(len(gaussians), np.uint8)
+    pose = np.ascontiguousarray(camera.camera_from_world.numpy()[:3])
+    means, scales = gaussians.means.numpy(), gaussians.scales.numpy()
     with kernel_threads(ROWS):
-        close_kernels.count_splits(
-            gaussians.means.numpy(),
-            gaussians.scales.numpy(),
-            np.ascontiguousarray(camera.camera_from_world.numpy()[:3]),
-            view_limits(camera),
-            finest,
-            splits,
-        )
+        close_kernels.count_splits(means, scales, pose, view_limits(camera), finest, splits)
     return splits
 
 
@@ -327,10 +322,9 @@ class SnowLayers:
             assert slopes is not None
             gaussians = _lit(gaussians, slopes, layer.normals, sun, self.wrap)
             slopes = None
-        drawn = [(gaussians, slopes)]
-        near = (
-            split_near(gaussians, slopes, camera, sun, self.grain) if layer is self.ground else None
-        )
+        drawn, near = [(gaussians, slopes)], None
+        if layer is self.ground:
+            near = split_near(gaussians, slopes, camera, sun, self.grain)
         if near is not None:
             drawn = [(near.whole, slopes), (near.fine, near.fine_slopes)]
         glints = None if layer.crystals is None else layer.crystals.glints(sun, eye_m)
@@ -345,15 +339,11 @@ class SnowLayers:
         sun: tuple[float, float, float],
     ) -> list[PosedGaussians]:
         """Splats with their slopes where a part stands. sun: unit, in the part's frame."""
+        lights = (None if s is None else SplatShading(s, sun, self.wrap) for _, s in drawn)
+        pose = (part.world_from_part, part.instance_id)
         return [
-            PosedGaussians(
-                splats,
-                part.world_from_part,
-                part.instance_id,
-                is_snow=True,
-                shading=None if slopes is None else SplatShading(slopes, sun, self.wrap),
-            )
-            for splats, slopes in drawn
+            PosedGaussians(splats, *pose, is_snow=True, shading=light)
+            for (splats, _), light in zip(drawn, lights, strict=True)
         ]
 
 

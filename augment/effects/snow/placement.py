@@ -1,23 +1,21 @@
 """Where snow can lie in a scene: cells of the surfaces that are open to the sky and seen.
 
-plan      square tiles about the cameras' path, finer near it             (tiles)
-views     what each of some cameras along the drive sees                  (height_map)
-then for squares of tiles, each with a margin of its surroundings:
-  above   heights, colours and classes from straight above                (height_map)
-  surface where snow stays, and where its edges are                       (surface)
-  ground  holes, light, wheel tracks, banks
-actors    the same in each vehicle's own frame                            (surface)
-join      neighbours across squares, and what the cells bury              (surface)
+Square tiles are planned about the cameras' path, finer near it, and the depth that some cameras
+along the drive see is drawn. Squares of tiles, each with a margin, are then worked on one by one:
+drawn from above, holes closed, surfaces told apart, cells found that a camera sees, their light,
+wheel tracks and banks. Vehicles are in their own frames. In the end neighbours are joined across
+squares, and the Gaussians found that the cells bury.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,8 +23,7 @@ import torch
 from tqdm import tqdm
 
 from augment.cameras import Camera
-from augment.effects.snow import surface_kernels as hole_kernels
-from augment.effects.snow import surface_kernels as tile_kernels
+from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells, SnowSupport
 from augment.effects.snow.height_map import (
     Estimator,
@@ -61,8 +58,7 @@ from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
 
-# ------------------------------------------------------------------------------------------------
-# Which squares of the world a support covers, how fine each is, and where its cells are kept
+# ---- Which squares of the world a support covers, how fine each is, and where its cells are kept -
 
 # Cells double in size at each of these level distances from the cameras' path, metres; beyond the
 # last there are none.
@@ -76,8 +72,7 @@ _PATH_GAP_M = 25.0  # those farther apart are not joined
 _MAX_TILES = 30_000_000  # of the rectangle about the path
 
 
-@dataclass(frozen=True)
-class Window:
+class Window(NamedTuple):
     """A rectangle of one level's cells. left, bottom: numbers of its first column and row, counted
     from the plan's origin, + to +x and +y. width, height: cells.
     """
@@ -160,9 +155,7 @@ class TilePlan:
 
 
 class CellNumbers:
-    """Where each cell of a plan stands in a support: a number for every cell of every tile, -1
-    where the support has none.
-    """
+    """Where each cell of a plan stands in a support; -1 where that has none."""
 
     def __init__(self, plan: TilePlan) -> None:
         self._plan = plan
@@ -181,18 +174,11 @@ class CellNumbers:
 
     def at(self, xy: np.ndarray) -> np.ndarray:
         """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
-        tile_rows, tile_columns = self._plan.levels.shape
         out = np.empty(len(xy), np.int32)
-        tile_kernels.find_numbers(
-            np.ascontiguousarray(xy, np.float64),
-            self._plan.origin_m,
-            self._plan.side_m,
-            tile_rows,
-            tile_columns,
-            self._sides,
-            self._starts,
-            self._numbers,
-            out,
+        surface_kernels.find_numbers(
+            *(np.ascontiguousarray(xy, np.float64), self._plan.origin_m, self._plan.side_m),
+            *(self._plan.levels.shape[0], self._plan.levels.shape[1]),
+            *(self._sides, self._starts, self._numbers, out),
         )
         return out
 
@@ -236,15 +222,11 @@ def views_along(cameras: Sequence[Camera], step_m: float = 2.0) -> list[Camera]:
     """Cameras spread along the drive: of each name the first, the last, and those between that have
     moved by step_m or turned by 10 degrees since the one taken before.
     """
-    named: dict[str, list[Camera]] = {}
-    for camera in cameras:
-        named.setdefault(camera.name, []).append(camera)
     taken = []
-    for group in named.values():
-        group.sort(key=lambda camera: camera.timestamp_ns)
-        last: Camera | None = None
+    for group in _by_name(cameras):
+        last = group[0]
         for place, camera in enumerate(group):
-            if last is None or place == len(group) - 1 or _has_moved(last, camera, step_m):
+            if place in (0, len(group) - 1) or _has_moved(last, camera, step_m):
                 taken.append(camera)
                 last = camera
     return taken
@@ -252,12 +234,8 @@ def views_along(cameras: Sequence[Camera], step_m: float = 2.0) -> list[Camera]:
 
 def path_points(cameras: Sequence[Camera]) -> np.ndarray:
     """float64 [P, 3]: the centres of cameras of one name after another, joined in order of time."""
-    named: dict[str, list[Camera]] = {}
-    for camera in cameras:
-        named.setdefault(camera.name, []).append(camera)
     points = []
-    for group in named.values():
-        group.sort(key=lambda camera: camera.timestamp_ns)
+    for group in _by_name(cameras):
         centres = np.stack([camera.centre.numpy() for camera in group])
         points.append(centres)
         for a, b in itertools.pairwise(centres):
@@ -268,6 +246,14 @@ def path_points(cameras: Sequence[Camera]) -> np.ndarray:
     joined = np.concatenate(points)
     _, first = np.unique(np.round(joined / (0.5 * _PATH_STEP_M)), axis=0, return_index=True)
     return joined[np.sort(first)]
+
+
+def _by_name(cameras: Sequence[Camera]) -> Iterable[list[Camera]]:
+    """The cameras of each name in order of time."""
+    named: dict[str, list[Camera]] = {}
+    for camera in sorted(cameras, key=lambda camera: camera.timestamp_ns):
+        named.setdefault(camera.name, []).append(camera)
+    return (named[name] for name in dict.fromkeys(camera.name for camera in cameras))
 
 
 def _has_moved(before: Camera, camera: Camera, step_m: float) -> bool:
@@ -327,19 +313,14 @@ def _mark_frustum(
 
 def _image_borders(camera: Camera) -> list[tuple[np.ndarray, float]]:
     """Planes n . p >= offset, camera coordinates, between which the image lies."""
-    borders = []
-    for axis, (focal, middle, size) in enumerate(
-        ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    ):
+    borders = [(np.array([0.0, 0.0, 1.0]), 0.0)]
+    lens = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    for axis, (focal, middle, size) in enumerate(lens):
         for sign, edge in ((1.0, -middle / focal), (-1.0, (size - middle) / focal)):
             normal = np.zeros(3)
             normal[axis] = sign
-            if camera.is_orthographic:
-                borders.append((normal, sign * edge))
-            else:
-                normal[2] = -sign * edge
-                borders.append((normal, 0.0))
-    borders.append((np.array([0.0, 0.0, 1.0]), 0.0))
+            normal[2] = 0.0 if camera.is_orthographic else -sign * edge
+            borders.append((normal, sign * edge if camera.is_orthographic else 0.0))
     return borders
 
 
@@ -348,8 +329,6 @@ def _round_up(value: float) -> float:
     digit = 10 ** (math.floor(math.log10(value)) - 1)
     return round(math.ceil(value / digit) * digit, 12)
 
-
-# ---- placement -----------------------------------------------------------------------------------
 
 # ---- How bright the bare ground is for what it is made of: shadows that the recording holds ------
 
@@ -533,7 +512,9 @@ def _plane_around(
         return None, alike
     z = height[rows, columns].astype(np.float64)
     used, fits = np.empty(len(z), bool), np.empty(len(z), bool)
-    slopes = hole_kernels.find_plane(rows, columns, z, _FIRST_M, _ALIKE_M, _MIN_CELLS, used, fits)
+    slopes = surface_kernels.find_plane(
+        rows, columns, z, _FIRST_M, _ALIKE_M, _MIN_CELLS, used, fits
+    )
     fits &= lies[rows, columns]
     if not (fits.mean() >= _MIN_ALIKE and math.hypot(*slopes) <= _STEEPEST * cell):
         return None, alike
@@ -730,12 +711,11 @@ def place_snow_support(
     backend: str = AUTO,
     progress: bool = False,
 ) -> SnowSupport:
-    """The cells of a scene that snow can lie on and that some of the cameras can see.
+    """The cells of a scene that snow can lie on and that some of the cameras can see; the same bits
+    from any number of threads. Empty without cameras, or where nothing open is seen.
 
-    Any number of threads gives the same bits.
-    Without cameras, or where nothing open is seen, the support is empty. backend: "cuda" draws and
-    looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
-    shows a bar.
+    backend: "cuda" draws and looks on the GPU; any other on the CPU, since the torch definition
+    would take hours. progress: shows a bar.
 
     Raises:
         SceneError: metres or gravity are not known, or the cells would take too much memory.
@@ -743,12 +723,10 @@ def place_snow_support(
     check_metric_and_level(scene)
     if backend != CUDA:
         backend = AUTO
-    clock = _StageTimer()
     views = views_along(cameras)
     background = plain_gaussians(scene.background)
     plan = plan_tiles(views, settings.cell_m, _heights(scene))
     plan.check_size()
-    clock.timed("plan")
     vehicles = [actor for actor in scene.actors if is_vehicle(actor)]
     squares = [
         (level, window)
@@ -756,70 +734,19 @@ def place_snow_support(
         for window in plan.squares(level, _SQUARE_CELLS)
     ]
     if not squares:
-        return SnowSupport(_no_cells(), {}, clock.seconds)
+        return SnowSupport(_no_cells(), {})
     parked = tuple(_parked(scene))
-    with tqdm(
-        total=len(views) + len(squares) + len(vehicles),
-        desc="placing snow",
-        disable=not progress,
-        unit="step",
-    ) as bar:
-        seen_from = draw_views(
-            views,
-            [PosedGaussians(background), *parked],
-            backend=backend,
-            after_each=lambda: bar.update(),
-        )
-        clock.timed("views")
+    steps = len(views) + len(squares) + len(vehicles)
+    with tqdm(total=steps, desc="placing snow", disable=not progress, unit="step") as bar:
+        parts = [PosedGaussians(background), *parked]
+        seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
         paths = wheel_paths(scene)
         work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
-        clock.timed("plan")
         found = in_order(work.find, squares, after_each=bar.update)
-        clock.share_lap([square.seconds for square in found])
-        on_vehicles = in_order(
-            lambda actor: find_actor_cells(
-                actor,
-                cell_m=settings.cell_m,
-                max_slope_deg=settings.max_slope_deg,
-                estimator=settings.estimator,
-                backend=backend,
-            ),
-            vehicles,
-            after_each=bar.update,
-        )
-        actors = {
-            actor.track_id: cells
-            for actor, cells in zip(vehicles, on_vehicles, strict=True)
-            if cells is not None
-        }
-        clock.timed("actors")
-    ground = work.joined(found)
-    clock.timed("join")
-    return SnowSupport(ground, actors, clock.seconds)
-
-
-class _StageTimer:
-    """Adds up the seconds between laps by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def timed(self, name: str) -> None:
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
-
-    def share_lap(self, stages: Sequence[Mapping[str, float]]) -> None:
-        """End a lap of several threads: its seconds go to stages as those of the threads did."""
-        sums: dict[str, float] = {}
-        for each in stages:
-            for name, seconds in each.items():
-                sums[name] = sums.get(name, 0.0) + seconds
-        now = time.perf_counter()
-        share = (now - self._last) / max(sum(sums.values()), 1e-9)
-        self.seconds |= {name: share * seconds for name, seconds in sums.items()}
-        self._last = now
+        find = functools.partial(find_actor_cells, **vars(settings), backend=backend)
+        on_vehicles = zip(vehicles, in_order(find, vehicles, after_each=bar.update), strict=True)
+        actors = {actor.track_id: cells for actor, cells in on_vehicles if cells is not None}
+    return SnowSupport(work.joined(found), actors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -836,15 +763,14 @@ class _Square:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Cells of a level's window; None where it has none. columns, rows: int64 [C], counted from the
-    plan's origin. seconds: what finding them took, by stage.
+    """Cells of a level's window, at least one. columns, rows: int64 [C], counted from the plan's
+    origin.
     """
 
     level: int
     columns: np.ndarray
     rows: np.ndarray
-    cells: CellList | None
-    seconds: Mapping[str, float]
+    cells: CellList
 
 
 class _Ground:
@@ -868,51 +794,39 @@ class _Ground:
         self._footprints, self._parked_top_m = Footprints(background), top_of(parked)
         self._path = path_points(cameras)
 
-    def find(self, level_and_window: tuple[int, Window]) -> _Found:
-        """The cells of one window of a level."""
-        clock = _StageTimer()
+    def find(self, level_and_window: tuple[int, Window]) -> _Found | None:
+        """The cells of one window of a level; None where it has none."""
         square = _with_margin(self._plan, *level_and_window)
         view, classes, lies, filled = self._draw(square)
-        clock.timed("above")
         surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
-        clock.timed("surface")
         seen = self._seen(surface, square, filled)
-        clock.timed("seen")
         rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
-        cells = None
-        if len(rows):
-            cells = cells_at(
-                surface,
-                rows,
-                columns,
-                sides=_sides(surface, seen & square.own),
-                luminance=ground_luminance(view, classes, surface.can_carry),
-                tracks=draw_tracks(self._paths, surface, classes),
-                banks=banks_of(surface),
-                classes=classes,
-            )
-        clock.timed("ground")
-        return _Found(
-            square.level,
-            columns.astype(np.int64) + square.window.left,
-            rows.astype(np.int64) + square.window.bottom,
-            cells,
-            clock.seconds,
+        if not len(rows):
+            return None
+        cells = cells_at(
+            surface,
+            rows,
+            columns,
+            sides=_sides(surface, seen & square.own),
+            luminance=ground_luminance(view, classes, surface.can_carry),
+            tracks=draw_tracks(self._paths, surface, classes),
+            banks=banks_of(surface),
+            classes=classes,
         )
+        window = square.window
+        return _Found(square.level, columns + window.left, rows + window.bottom, cells)
 
-    def joined(self, found: Sequence[_Found]) -> SnowCells:
+    def joined(self, found: Sequence[_Found | None]) -> SnowCells:
         """All those cells, one square's after another's, linked across squares."""
-        numbers, lists, count = CellNumbers(self._plan), [], 0
-        for square in found:
-            if square.cells is None:
-                continue
-            to = count + np.arange(len(square.cells), dtype=np.int32)
-            numbers.put(square.level, square.columns, square.rows, to)
-            lists.append(square.cells)
-            count += len(square.cells)
-        if not lists:
+        squares = [square for square in found if square is not None]
+        if not squares:
             return _no_cells()
-        cells = CellList.joined(lists)
+        numbers, count = CellNumbers(self._plan), 0
+        for square in squares:
+            to = count + np.arange(len(square.rows), dtype=np.int32)
+            numbers.put(square.level, square.columns, square.rows, to)
+            count += len(square.rows)
+        cells = CellList.joined([square.cells for square in squares])
         light = relative_light(cells.luminance, cells.semantic)
         return make_cells(cells, light, numbers, self._background)
 
@@ -927,11 +841,9 @@ class _Ground:
         far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
         near, chosen = self._background, None
         if self._backend != CUDA:  # where all of them lie already
-            chosen = self._footprints.in_box(np.array(corner), np.array(far))
-            if 2 * len(chosen) < len(near):
-                near = near.select(torch.from_numpy(chosen))
-            else:  # a copy would take longer than what lies outside
-                chosen = None
+            inside = self._footprints.in_box(np.array(corner), np.array(far))
+            if 2 * len(inside) < len(near):  # else a copy would take longer than what lies outside
+                near, chosen = near.select(torch.from_numpy(inside)), inside
         margin = _margin(cell)
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
         pixel_mask = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
@@ -1000,15 +912,15 @@ def _parked(scene: Scene) -> list[PosedGaussians]:
     """Actors that stand still, where they stand halfway through their track; the background's
     snow lies beside them.
     """
-    parts = []
-    for number, actor in enumerate(scene.actors, start=1):
-        if actor.label == EGO_VEHICLE or moves(actor) or len(actor.gaussians) == 0:
-            continue
-        poses = actor.track.world_from_actor
-        parts.append(
-            PosedGaussians(plain_gaussians(actor.gaussians), poses[len(poses) // 2], number)
+    return [
+        PosedGaussians(
+            plain_gaussians(actor.gaussians),
+            actor.track.world_from_actor[len(actor.track.world_from_actor) // 2],
+            number,
         )
-    return parts
+        for number, actor in enumerate(scene.actors, start=1)
+        if actor.label != EGO_VEHICLE and not moves(actor) and len(actor.gaussians)
+    ]
 
 
 def _heights(scene: Scene) -> tuple[float, float]:

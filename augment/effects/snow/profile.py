@@ -226,7 +226,8 @@ def profile_of(
         for step, height in _RELIEF_M
     ]
     wind = octaves_of(rows, rng, along=along, stretch=1 + 0.8 * drift)
-    drifts = _joined(wind, octaves_of(relief, rng))
+    pairs = zip(vars(wind).values(), vars(octaves_of(relief, rng)).values(), strict=True)
+    drifts = Octaves(*map(np.concatenate, pairs))
     patches = octaves_of(_PATCHES, rng)
     threshold = threshold_of(patches, share_covered(snow))
     pressed = snow.tracks == "always" or (snow.tracks == "auto" and snow.depth_m <= AUTO_TRACKS_M)
@@ -245,12 +246,6 @@ def profile_of(
         floor_z_m=floor_z_m,
     )
     return Profile(numbers, drifts, patches, octaves_of(_MOTTLE, rng))
-
-
-def _joined(first: Octaves, second: Octaves) -> Octaves:
-    names = ("turns", "amplitudes", "lengths_m", "seeds")
-    pairs = ([getattr(first, name), getattr(second, name)] for name in names)
-    return Octaves(*(np.concatenate(pair) for pair in pairs))
 
 
 def heights_of(cells: SnowCells, profile: Profile) -> np.ndarray:

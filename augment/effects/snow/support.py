@@ -54,15 +54,13 @@ def support_key(
     for actor in scene.actors:
         digest.update(repr((actor.track_id, actor.label, actor.size_m)).encode())
         _add_gaussians(digest, actor.gaussians)
-        _add(digest, actor.track.timestamps_ns)
-        _add(digest, actor.track.world_from_actor)
+        _add(digest, actor.track.timestamps_ns, actor.track.world_from_actor)
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         about = (camera.name, *numbers, camera.timestamp_ns, camera.is_orthographic)
         digest.update(repr(about).encode())
         _add(digest, camera.camera_from_world)
-    for frame in scene.frames:
-        _add(digest, frame.world_from_ego)
+    _add(digest, *(frame.world_from_ego for frame in scene.frames))
     return digest.hexdigest()
 
 
@@ -140,8 +138,7 @@ def _cells(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
                 f"{part}.{name} must be {dtype} {list(shape)}; got {tensor.dtype} "
                 f"{list(tensor.shape)}"
             )
-    limits = {"neighbours": FLUSH, "buried_by": -1}
-    for name, least in limits.items():
+    for name, least in (("neighbours", FLUSH), ("buried_by", -1)):
         values = found[name]
         if values.numel() and not least <= int(values.min()) <= int(values.max()) < counts["cell"]:
             raise ValueError(f"{part}.{name} names cells that are not there")
@@ -151,17 +148,16 @@ def _cells(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
 
 
 def _add_gaussians(digest: hashlib.blake2b, gaussians: Gaussians) -> None:
-    for name in ("means", "quats", "scales", "opacities"):
-        _add(digest, getattr(gaussians, name))
-    _add(digest, gaussians.sh[:, 0])
-    if gaussians.semantic is not None:
-        _add(digest, gaussians.semantic)
+    g = gaussians
+    own = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
+    _add(digest, *own, *(() if g.semantic is None else (g.semantic,)))
 
 
-def _add(digest: hashlib.blake2b, tensor: Tensor) -> None:
-    array = np.ascontiguousarray(tensor.detach().numpy())
-    digest.update(repr((array.shape, array.dtype.str)).encode())
-    digest.update(array.view(np.uint8).data if array.size else b"")
+def _add(digest: hashlib.blake2b, *tensors: Tensor) -> None:
+    for tensor in tensors:
+        array = np.ascontiguousarray(tensor.detach().numpy())
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(array.view(np.uint8).data if array.size else b"")
 
 
 _remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowSupport]] = WeakKeyDictionary()
@@ -187,14 +183,22 @@ def support_of(
         SceneError: as place_snow_support.
         OutputError: the folder cannot be written.
     """
-    found = _remembered.get(scene, {}).get(settings)
-    if found is not None:
-        return found
+    known = _remembered.setdefault(scene, {})
+    if settings in known:
+        return known[settings]
     if cameras is None:
         cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    support = _kept(scene, cameras, settings, folder, backend, progress)
-    remember_support(scene, settings, support)
-    return support
+    key = "" if folder is None else support_key(scene, cameras, settings, backend=backend)
+    path = None if folder is None else support_path(folder, key)
+    if path is not None and path.exists():
+        try:
+            return known.setdefault(settings, load_support(path, key))
+        except SceneError as error:
+            logger.warning("the snow of %s is placed anew: %s", scene.name, error)
+    support = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
+    if path is not None:
+        save_support(path, support, key)
+    return known.setdefault(settings, support)
 
 
 def remember_support(scene: Scene, settings: PlacementSettings, support: SnowSupport) -> None:
@@ -205,25 +209,3 @@ def remember_support(scene: Scene, settings: PlacementSettings, support: SnowSup
 def support_path(folder: Path, key: str) -> Path:
     """Where the support of a key is kept in a folder."""
     return folder / f"snow-{key}.safetensors"
-
-
-def _kept(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    settings: PlacementSettings,
-    folder: Path | None,
-    backend: str,
-    progress: bool,
-) -> SnowSupport:
-    if folder is None:
-        return place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
-    key = support_key(scene, cameras, settings, backend=backend)
-    path = support_path(folder, key)
-    if path.exists():
-        try:
-            return load_support(path, key)
-        except SceneError as error:
-            logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-    support = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
-    save_support(path, support, key)
-    return support

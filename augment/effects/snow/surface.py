@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -16,10 +16,10 @@ from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells
 from augment.effects.snow.height_map import (
     Estimator,
+    Footprints,
     HeightMap,
     classes_of,
     draw_from_above,
-    in_box,
     in_order,
     plain_gaussians,
     slices_of,
@@ -290,7 +290,7 @@ def find_buried(
 ) -> tuple[np.ndarray, np.ndarray]:
     """buried int32 [B] and buried_by int32 [B, 5], see SnowCells; only such as can be hidden."""
     found = []
-    if len(cells):
+    if len(cells.sizes_m):
         parts = slices_of(len(gaussians))
         found = in_order(lambda part: _find_part(gaussians, numbers, part, cells), parts)
     return (
@@ -336,12 +336,11 @@ def _find_part(
 # ---- Cells taken from grids, one list after another, and made into a record ----------------------
 
 
-@dataclass(frozen=True, eq=False)
-class CellList:
+class CellList(NamedTuple):
     """Cells of some grid: arrays of C rows, as SnowCells has them but for
 
     sides: int8 [C, 4], LINK where a cell of the same size is expected, else OPEN_EDGE or FLUSH.
-    luminance: of the bare ground (see ground_light), NaN where not known.
+    luminance: of the bare ground (see ground_luminance), NaN where not known.
     """
 
     centers_m: np.ndarray
@@ -354,14 +353,10 @@ class CellList:
     banks: np.ndarray
     semantic: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.sizes_m)
-
     @staticmethod
     def joined(lists: Sequence[CellList]) -> CellList:
         """All of them, in order."""
-        names = [field.name for field in fields(CellList)]
-        return CellList(*(np.concatenate([getattr(one, n) for one in lists]) for n in names))
+        return CellList(*map(np.concatenate, zip(*lists, strict=True)))
 
     @staticmethod
     def empty() -> CellList:
@@ -415,7 +410,9 @@ def make_cells(
 ) -> SnowCells:
     """The record: neighbours found by their places, and the Gaussians that the cells bury."""
     neighbours = cells.sides.astype(np.int32)
-    in_order(lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells)))
+    in_order(
+        lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells.sizes_m))
+    )
     buried, buried_by = find_buried(gaussians, numbers, cells)
     kept = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
     return SnowCells(
@@ -475,7 +472,7 @@ def find_actor_cells(
     classes = classes_of(gaussians)
     own = ~np.isin(classes, _GROUND)
     own &= gaussians.means.numpy()[:, 2] > _BOTTOM_M - actor.size_m[2] / 2
-    chosen = np.intersect1d(in_box(gaussians, -half, half), np.flatnonzero(own))
+    chosen = np.intersect1d(Footprints(gaussians).in_box(-half, half), np.flatnonzero(own))
     if len(chosen) == 0:
         return None
     cells_half = np.ceil(half / cell).astype(int)

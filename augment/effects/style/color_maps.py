@@ -31,8 +31,6 @@ from augment.scene import Actor, Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, is_stand_in
 
-# ---- The linear maps that a style becomes in a scene: colour' = M[:, :3] @ colour + M[:, 3] ------
-
 CLASSES = max(SemanticClass) + 1
 
 
@@ -52,11 +50,9 @@ class StyleMaps:
     seen_sky: Float[Tensor, "3 4"] | None = None
 
     def __post_init__(self) -> None:
-        _check("splats", self.splats, (len(self.splats), 3, 4))
-        _check("sky", self.sky, (3, 4))
-        _check("picture", self.picture, (3, 4))
-        if self.seen_sky is not None:
-            _check("seen_sky", self.seen_sky, (3, 4))
+        for name, value in vars(self).items():
+            if value is not None:
+                _check(name, value, (len(value), 3, 4) if name == "splats" else (3, 4))
         if len(self.splats) not in (1, CLASSES):
             raise ValueError(
                 f"splats must hold one map, or one for each of {CLASSES} classes; "
@@ -73,23 +69,12 @@ def _check(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must be finite; got {value.tolist()}")
 
 
-def identity_map() -> Float[Tensor, "3 4"]:
-    """The map that changes nothing."""
-    return torch.eye(3, 4)
-
-
-def with_strength(color_map: Float[Tensor, "*B 3 4"], strength: float) -> Float[Tensor, "*B 3 4"]:
-    """The identity at strength 0, the map at 1, straight between and beyond."""
-    return torch.lerp(torch.eye(3, 4, dtype=color_map.dtype), color_map, strength)
-
-
-# --------------------------------------------------------------------------------------------------
-# Splats that paint sky: what of a fitted scene has to change with the sky and not with the land. A
-# fit fills gaps at the skyline, between wires, branches and roofs, with splats of the sky's colour.
-# Under the land's map they would stay behind as halos when the sky's map is another. What paints
-# sky stands above the horizon and has the colour of the sky behind it, where that is what the
-# cameras see as sky: a cube map behind a wall holds whatever the fit left there, and a wall that is
-# as pale as the clouds beside it may still differ from the sky behind it.
+# ---- Splats that paint sky -----------------------------------------------------------------------
+# A fit fills gaps at the skyline, between wires, branches and roofs, with splats of the sky's
+# colour; under the land's map they would stay behind as halos. What paints sky stands above the
+# horizon and has the colour of the sky behind it, where that is what the cameras see as sky: a cube
+# map behind a wall holds whatever the fit left there, and a wall as pale as the clouds beside it
+# may still differ from the sky behind it.
 
 LEVELS = 8  # steps from a splat of the land to one of the sky
 _NEAR, _FAR = 0.06, 0.16  # greatest difference of a channel: sky up to here, none from there
@@ -100,11 +85,9 @@ _MAX_PLACES = 64  # that the sky is looked at from
 
 
 def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
-    """How much of every background splat is sky, 0 to LEVELS; None where none is any, or where it
-    cannot be told: without cameras, without knowing where up is, or in front of a grey stand-in.
-
-    Each is looked at from the nearest of the scene's cameras. Remembered for as long as the scene
-    lives, since it is the same for every style.
+    """How much of every background splat is sky, 0 to LEVELS, seen from the nearest camera; None
+    where none is any, or where it cannot be told: without cameras, without knowing where up is, or
+    in front of a grey stand-in. Remembered while the scene lives: it is the same for every style.
     """
     seen = maps.seen_sky
     if seen is None or is_stand_in(scene.sky):
@@ -325,12 +308,9 @@ def style_sky(sky: Sky, color_map: Float[Tensor, "3 4"]) -> Sky:
     """
     if not bool(_changes(color_map[None])):
         return sky
-    if isinstance(sky, ConstantSky):
-        return ConstantSky(_mapped(sky.rgb, color_map))
-    if isinstance(sky, LatLongSky):
-        return LatLongSky(_mapped(sky.image, color_map))
-    if isinstance(sky, CubemapSky):
-        return CubemapSky(_mapped(sky.faces, color_map))
+    for kind, texels in ((ConstantSky, "rgb"), (LatLongSky, "image"), (CubemapSky, "faces")):
+        if isinstance(sky, kind):
+            return kind(_mapped(getattr(sky, texels), color_map))
     return MappedSky(sky, color_map)
 
 
@@ -346,9 +326,7 @@ class MappedSky:
 
 
 def styled_scene(scene: Scene, maps: StyleMaps) -> Scene:
-    """Background, actors and sky mapped; all else is the scene's own. What of the background paints
-    sky changes with it.
-    """
+    """Background, actors and sky mapped; what of the background paints sky changes with that."""
     return dataclasses.replace(
         scene,
         background=style_gaussians(scene.background, maps, levels=sky_levels(scene, maps)),
@@ -383,18 +361,14 @@ def _rows_of(gaussians: Gaussians, count: int) -> Tensor | None:
     classes = gaussians.semantic
     if count == 1 or classes is None or not len(classes):
         return None
-    low, high = _extent(classes)
+    values = classes.cpu().numpy()  # torch's own least and greatest take longer on the CPU
+    low, high = int(values.min()), int(values.max())
     if low < 0 or high >= count:
         raise ValueError(
             f"the style has maps for classes 0 to {count - 1}; the Gaussians' classes are "
             f"{low} to {high}"
         )
     return classes
-
-
-def _extent(classes: Tensor) -> tuple[int, int]:
-    values = classes.cpu().numpy()  # torch's own least and greatest take longer on the CPU
-    return int(values.min()), int(values.max())
 
 
 def _check_out(out: Tensor, sh: Tensor) -> None:

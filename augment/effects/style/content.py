@@ -89,7 +89,19 @@ def content_pictures(
 
 def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashable:
     """What of the cameras the scene's content depends on."""
-    return tuple(map(_camera_key, select_views(scene, cameras, VIEWS)))
+    return tuple(
+        (
+            c.width,
+            c.height,
+            c.fx,
+            c.fy,
+            c.cx,
+            c.cy,
+            c.timestamp_ns,
+            c.camera_from_world.numpy().tobytes(),
+        )
+        for c in select_views(scene, cameras, VIEWS)
+    )
 
 
 def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> tuple[Camera, ...]:
@@ -130,16 +142,12 @@ def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
 
     They stand for the whole picture: how much sky would be seen is not known.
     """
-    parts = scene.all_gaussians
-    rgb = np.concatenate([_constant_colors(part) for part in parts])
-    weights = np.concatenate([_extents(part) for part in parts])
-    if not weights.sum() > 0:
-        weights = np.ones_like(weights)
+    rgb, weights = _splat_colors(scene)
     whole = statistics_of(rgb, weights)
     assert whole is not None
     found = {WHOLE: whole, LAND: whole}
     if per_region:
-        channels = np.concatenate([_channels(part) for part in parts])
+        channels = np.concatenate([_channels(part) for part in scene.all_gaussians])
         for number, region in enumerate(_CHANNELS):
             own = np.where(channels == number, weights, 0)
             _add(found, region, rgb, own, float(weights.sum()))
@@ -239,11 +247,7 @@ def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
 
 def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
     """Colours of Gaussians, each as often as its weight says, in no order that means aught."""
-    parts = scene.all_gaussians
-    rgb = np.concatenate([_constant_colors(part) for part in parts])
-    weights = np.concatenate([_extents(part) for part in parts])
-    if not weights.sum() > 0:
-        weights = np.ones_like(weights)
+    rgb, weights = _splat_colors(scene)
     reached = np.cumsum(weights)
     pixels = PICTURE_SIZE**2
     at = np.searchsorted(reached, (np.arange(pixels) + 0.5) / pixels * reached[-1])
@@ -262,15 +266,14 @@ def _marked_scene(scene: Scene) -> Scene:
     """The scene with Gaussians of the colours (1, 0, 0) on roads, (0, 1, 0) on vegetation,
     (0, 0, 1) on the rest, so that a picture of it holds every pixel's weights of the three.
     """
-    return scene.with_gaussians(_marked)
 
+    def marked(gaussians: Gaussians) -> Gaussians:
+        table = torch.full((len(_CHANNELS) + 1, 1, 3), -0.5 / SH_C0, dtype=gaussians.sh.dtype)
+        for number in range(len(_CHANNELS)):
+            table[number, 0, number] = 0.5 / SH_C0
+        return dataclasses.replace(gaussians, sh=table[torch.from_numpy(_channels(gaussians))])
 
-def _marked(gaussians: Gaussians) -> Gaussians:
-    table = torch.full((len(_CHANNELS) + 1, 1, 3), -0.5 / SH_C0, dtype=gaussians.sh.dtype)
-    for number in range(len(_CHANNELS)):
-        table[number, 0, number] = 0.5 / SH_C0
-    channels = torch.from_numpy(_channels(gaussians))
-    return dataclasses.replace(gaussians, sh=table[channels])
+    return scene.with_gaussians(marked)
 
 
 def _channels(gaussians: Gaussians) -> np.ndarray:
@@ -283,24 +286,21 @@ def _channels(gaussians: Gaussians) -> np.ndarray:
     return table[gaussians.semantic.numpy()]
 
 
-def _constant_colors(gaussians: Gaussians) -> np.ndarray:
-    return np.clip(0.5 + SH_C0 * gaussians.sh[:, 0].detach().double().numpy(), 0, 1)
-
-
-def _extents(gaussians: Gaussians) -> np.ndarray:
-    """float64 [N]: opacity times the mean over three sides of what is seen of an ellipsoid, m^2."""
-    a, b, c = gaussians.scales.detach().double().numpy().T
-    sides = (a * b + b * c + c * a) / 3
-    return gaussians.opacities.detach().double().numpy() * sides
+def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The constant colours of all Gaussians, float64 [N, 3], and their weights [N]: opacity times
+    the mean over three sides of what is seen of an ellipsoid, m^2; 1 where all weigh nothing.
+    """
+    colors, weights = [], []
+    for part in scene.all_gaussians:
+        colors.append(np.clip(0.5 + SH_C0 * part.sh[:, 0].detach().double().numpy(), 0, 1))
+        a, b, c = part.scales.detach().double().numpy().T
+        weights.append(part.opacities.detach().double().numpy() * ((a * b + b * c + c * a) / 3))
+    weighted = np.concatenate(weights)
+    return np.concatenate(colors), weighted if weighted.sum() > 0 else np.ones_like(weighted)
 
 
 def _small(camera: Camera) -> Camera:
     return camera.scaled(min(1.0, math.sqrt(VIEW_PIXELS / (camera.width * camera.height))))
-
-
-def _camera_key(camera: Camera) -> tuple:
-    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return (*lens, camera.camera_from_world.numpy().tobytes(), camera.timestamp_ns)
 
 
 def _remember(scene: Scene, key: tuple, found: Callable[[], _T]) -> _T:

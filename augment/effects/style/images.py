@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float32
 
 from augment.effects.style.statistics import (
     LAND,
@@ -22,11 +23,9 @@ from augment.errors import StyleError
 from augment.files.image_size import FORMATS, ImageHeader, image_header
 from recipes.files import open_file
 
-# --------------------------------------------------------------------------------------------------
-# Where a picture shows sky, vegetation and road: by colour and place, and only where it is clear. A
-# region that is missed costs little: the map of the whole picture, or of all the land, stands in
-# for it. One that is wrong gives a sky the colours of a wall. So every rule here leans towards
-# none.
+# ---- Where a picture shows sky, vegetation and road ----------------------------------------------
+# By colour and place, and only where it is clear: for a region that is missed the map of the whole
+# picture, or of all the land, stands in; a wrong one gives a sky the colours of a wall.
 
 _SIDE_PX = 128  # the longer side of the picture in which regions are found
 _STEPS = np.geomspace(0.015, 0.2, 20)  # of colour, that may end a sky; the best of them is taken
@@ -214,23 +213,9 @@ class StyleImage:
     pixel counts (its alpha). sky: bool [H, W].
     """
 
-    rgb: np.ndarray
-    weights: np.ndarray
-    sky: np.ndarray
-
-    def __post_init__(self) -> None:
-        shape = self.rgb.shape[:2]
-        for name, dtype, expected in (
-            ("rgb", np.float32, (*shape, 3)),
-            ("weights", np.float32, shape),
-            ("sky", np.bool_, shape),
-        ):
-            value = getattr(self, name)
-            if value.shape != expected or value.dtype != dtype:
-                raise ValueError(
-                    f"{name} must be {np.dtype(dtype)} {list(expected)}; "
-                    f"got {value.dtype} {list(value.shape)}"
-                )
+    rgb: Float32[np.ndarray, "H W 3"]
+    weights: Float32[np.ndarray, "H W"]
+    sky: Bool[np.ndarray, "H W"]
 
 
 def read_style_image(path: Path, mask: Path | None = None) -> StyleImage:
@@ -370,7 +355,8 @@ def _upright_alpha(stored: np.ndarray, upright: np.ndarray) -> np.ndarray:
 def _shrunk(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Averaged to at most SIDE_PX: float32 colours [H, W, 3] and weights [H, W]."""
     most = np.float32(np.iinfo(rgb.dtype).max)
-    size = _small_size(rgb.shape)
+    scale = min(1.0, SIDE_PX / max(rgb.shape[:2]))
+    size = (max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale)))
     if alpha is None:
         small = cv2.resize(np.ascontiguousarray(rgb), size, interpolation=cv2.INTER_AREA)
         small = small.reshape(size[1], size[0], 3)
@@ -383,22 +369,13 @@ def _shrunk(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.n
     return np.clip(colors, 0, 1), np.clip(weights, 0, 1)
 
 
-def _small_size(shape: tuple[int, ...]) -> tuple[int, int]:
-    """(width, height) as OpenCV takes it."""
-    height, width = shape[:2]
-    scale = min(1.0, SIDE_PX / max(height, width))
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def _mask(mask: Path, full: tuple[int, ...], small: tuple[int, ...], image: Path) -> np.ndarray:
     bgr, alpha = _read(mask, "sky mask")
     if alpha is not None:
         bgr = bgr * (alpha[..., None] > np.iinfo(alpha.dtype).max // 2)  # transparent: no sky
     height, width = bgr.shape[:2]
-    fits = abs(width * full[0] - height * full[1]) <= _SHAPE_TOLERANCE * height * full[1] + max(
-        full[:2]
-    )
-    if not fits:
+    room = _SHAPE_TOLERANCE * height * full[1] + max(full[:2])
+    if abs(width * full[0] - height * full[1]) > room:
         raise StyleError(
             f"sky mask {mask}: is {width} x {height}, and style image {image} is of another "
             f"shape, {full[1]} x {full[0]}; a mask has the image's aspect ratio"

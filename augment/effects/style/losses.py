@@ -22,7 +22,6 @@ hold differences of colours, with its linear part alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -36,9 +35,8 @@ from augment.errors import StyleError
 from augment.files.checkpoints import read_state_dict
 
 # ---- Features of pictures whose means and deviations say what a picture's style is ---------------
-# The paper takes layers of VGG-19, trained on ImageNet (Simonyan & Zisserman 2015); a user who has
-# the weights names their file. Where there is none, a bank of fixed filters is the stand-in: it
-# knows colours and contrasts at several scales, and nothing of what things are.
+# The paper's layers of VGG-19, trained on ImageNet (Simonyan & Zisserman 2015), where the user has
+# the weights; else a bank of fixed filters, which knows colours and contrasts at several scales.
 
 Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
 
@@ -66,8 +64,6 @@ def open_features(weights: Path | None) -> FeatureExtractor:
     return FilterBank() if weights is None else load_vgg19(weights)
 
 
-# ---- VGG-19 --------------------------------------------------------------------------------------
-
 # Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus whose outputs
 # are taken, by the numbers that torchvision gives them.
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512,))
@@ -91,15 +87,15 @@ class Vgg19(nn.Module):
         for number, block in enumerate(_BLOCKS):
             if number:
                 layers.append(nn.MaxPool2d(2))
-            for wanted in block:
-                out = max(1, round(wanted * width))
+            for full_width in block:
+                out = max(1, round(full_width * width))
                 layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
                 channels = out
         self.features = nn.Sequential(*layers)
-        self.mean: Tensor
-        self.deviation: Tensor
-        self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
-        self.register_buffer("deviation", torch.tensor(_DEVIATION)[:, None, None], persistent=False)
+        self.mean, self.deviation = (
+            nn.Buffer(torch.tensor(values)[:, None, None], persistent=False)
+            for values in (_MEAN, _DEVIATION)
+        )
         self.requires_grad_(False)
 
     def forward(self, pictures: Tensor) -> Features:
@@ -129,15 +125,15 @@ def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
     """
     found = read_state_dict(path, StyleError)
     network = Vgg19(width=width)
-    wanted = network.state_dict()
-    lacking = [name for name in wanted if name not in found]
+    own = network.state_dict()
+    lacking = [name for name in own if name not in found]
     if lacking:
         raise StyleError(
             f"{path} lacks {', '.join(lacking[:4])}{' ...' if len(lacking) > 4 else ''}: expected "
             f"torchvision's names of VGG-19 (features.0.weight ...); it holds "
             f"{', '.join(list(found)[:4]) or 'nothing'}"
         )
-    for name, ours in wanted.items():
+    for name, ours in own.items():
         theirs = found[name]
         if theirs.shape != ours.shape or not theirs.dtype.is_floating_point:
             raise StyleError(
@@ -146,7 +142,7 @@ def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
             )
         if not bool(torch.isfinite(theirs).all()):
             raise StyleError(f"{path}: {name} holds NaN or infinite values")
-    network.load_state_dict({name: found[name].float() for name in wanted})
+    network.load_state_dict({name: found[name].float() for name in own})
     return network
 
 
@@ -290,9 +286,7 @@ def weighted_sum(terms: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
     Raises:
         ValueError: there are none.
     """
-    parts: Sequence[Tensor] = [
-        weights[name] * term for name, term in terms.items() if weights.get(name)
-    ]
+    parts = [weights[name] * term for name, term in terms.items() if weights.get(name)]
     if not parts:
         raise ValueError(f"none of the losses {', '.join(terms)} weighs anything: {weights}")
-    return torch.stack(list(parts)).sum()
+    return torch.stack(parts).sum()

@@ -351,19 +351,6 @@ class Gscm(nn.Module):
         """sGSCM, folded."""
         return self._fold(self.style_p, f_s, self.style_q)
 
-    def apply_factors(
-        self,
-        f_c: Float[Tensor, "B k k"],
-        f_s: Float[Tensor, "B k k"],
-        colors: Float[Tensor, "B N 3"],
-    ) -> Float[Tensor, "B N 3"]:
-        """Both stages factor by factor: what the folded maps must agree with."""
-        content = self._homogeneous(colors) @ self.content_p @ f_c @ self.content_q
-        return self._homogeneous(content) @ self.style_p @ f_s @ self.style_q
-
-    def _homogeneous(self, colors: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N rows"]:
-        return nn.functional.pad(colors, (0, 1), value=1.0) if self.offset else colors
-
     def _fold(
         self, p: Float[Tensor, "rows k"], t: Float[Tensor, "B k k"], q: Float[Tensor, "k 3"]
     ) -> Float[Tensor, "B 3 4"]:

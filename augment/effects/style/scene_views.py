@@ -70,10 +70,14 @@ def views_of(
     Raises:
         SceneError: the scene has no cameras.
     """
-    return [
-        open_view(scene, camera.resized(size_px, size_px), with_parts=with_parts)
-        for camera in spread_cameras(scene, count)
-    ]
+    cameras = select_views(scene, None, count)
+    if not cameras:
+        raise SceneError(
+            f"scene {scene.name!r} ({scene.source}) has no cameras to look through; name some with "
+            f"camera_path=FILE in its URI"
+        )
+    squeezed = (camera.resized(size_px, size_px) for camera in cameras)
+    return [open_view(scene, camera, with_parts=with_parts) for camera in squeezed]
 
 
 def open_view(scene: Scene, camera: Camera, *, with_parts: bool = True) -> SceneView:
@@ -85,21 +89,6 @@ def open_view(scene: Scene, camera: Camera, *, with_parts: bool = True) -> Scene
     alpha = output.alpha[None]
     picture = output.rgb.permute(2, 0, 1) + (1 - alpha) * sky
     return SceneView(camera, picture, alpha, sky, _seen(parts, camera) if with_parts else ())
-
-
-def spread_cameras(scene: Scene, count: int) -> tuple[Camera, ...]:
-    """At most `count` of the scene's cameras: names in turn, spread over the drive.
-
-    Raises:
-        SceneError: it has none.
-    """
-    chosen = select_views(scene, None, count)
-    if not chosen:
-        raise SceneError(
-            f"scene {scene.name!r} ({scene.source}) has no cameras to look through; name some with "
-            f"camera_path=FILE in its URI"
-        )
-    return chosen
 
 
 def folded_pictures(
@@ -163,29 +152,22 @@ def colors_of(scene: Scene, *, count: int = KEPT_COLORS, seed: int = 0) -> Gauss
 def _rendered(view: SceneView, color_map: Tensor) -> Tensor:
     if not view.parts:
         raise ValueError("a view without its Gaussians cannot be rendered: open it with_parts")
-    parts = [
-        dataclasses.replace(
-            part,
-            gaussians=dataclasses.replace(part.gaussians, sh=map_sh(part.gaussians.sh, color_map)),
-        )
-        for part in view.parts
-    ]
+    parts = [_with_sh(part, map_sh(part.gaussians.sh, color_map)) for part in view.parts]
     output = rasterize(parts, view.camera, buffers=(RGB, ALPHA))
     assert output.rgb is not None
     sky = folded_pictures(view.sky[None], color_map[None])[0]
     return output.rgb.permute(2, 0, 1) + (1 - view.alpha) * sky
 
 
+def _with_sh(part: PosedGaussians, sh: Tensor) -> PosedGaussians:
+    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
+
+
 def _moved(part: PosedGaussians, device: str | torch.device) -> PosedGaussians:
     own = part.gaussians
-    there = Gaussians(
-        means=own.means.to(device),
-        quats=own.quats.to(device),
-        scales=own.scales.to(device),
-        opacities=own.opacities.to(device),
-        sh=own.sh.to(device),
-        semantic=None if own.semantic is None else own.semantic.to(device),
-    )
+    columns = (own.means, own.quats, own.scales, own.opacities, own.sh)
+    semantic = None if own.semantic is None else own.semantic.to(device)
+    there = Gaussians(*(column.to(device) for column in columns), semantic=semantic)
     return dataclasses.replace(part, gaussians=there)
 
 
@@ -198,10 +180,7 @@ def _seen(parts: Sequence[PosedGaussians], camera: Camera) -> tuple[PosedGaussia
         torch.zeros(len(part.gaussians), 1, 3, dtype=part.gaussians.sh.dtype, requires_grad=True)
         for part in parts
     ]
-    probes = [
-        dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
-        for part, sh in zip(parts, grey, strict=True)
-    ]
+    probes = [_with_sh(part, sh) for part, sh in zip(parts, grey, strict=True)]
     output = rasterize(probes, camera, buffers=(RGB, ALPHA))
     assert output.rgb is not None
     output.rgb.sum().backward()

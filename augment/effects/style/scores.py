@@ -105,9 +105,11 @@ def closed_method(name: str, strength: float = 1.0) -> Method:
     """mkl or reinhard with the limits that recipes have, at a strength; 0 changes nothing."""
     closed = {"mkl": mkl_map, "reinhard": reinhard_map}[name]
 
-    def mapped(*pictures: Tensor) -> Tensor:
-        statistics = (statistics_of(picture.flatten(1).T.numpy()) for picture in pictures)
-        return torch.lerp(torch.eye(3, 4), closed(*statistics).float(), strength)
+    def mapped(content: Tensor, style: Tensor) -> Tensor:
+        pixels = (picture.flatten(1).T.numpy() for picture in (content, style))
+        from_content, to_style = map(statistics_of, pixels)
+        assert from_content is not None and to_style is not None  # every pixel weighs 1
+        return torch.lerp(torch.eye(3, 4), closed(from_content, to_style).float(), strength)
 
     return mapped
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from augment.semantics import SemanticClass
 
 WHOLE, SKY, LAND = "whole", "sky", "land"  # land: all but the sky
 VEGETATION, ROAD, REST = "vegetation", "road", "rest"  # of the land
-REGIONS = (WHOLE, SKY, LAND, VEGETATION, ROAD, REST)
 
 # What a Gaussian's class says of its region; every other class is of the rest.
 REGION_OF_CLASS: Mapping[SemanticClass, str] = {
@@ -43,15 +42,12 @@ class ColorStatistics:
     share: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.mean.shape != (3,) or self.covariance.shape != (3, 3):
+        shapes = (self.mean.shape, self.covariance.shape)
+        finite = np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()
+        if shapes != ((3,), (3, 3)) or not finite:
             raise ValueError(
-                f"colour statistics are a mean [3] and a covariance [3, 3]; got "
-                f"{list(self.mean.shape)} and {list(self.covariance.shape)}"
-            )
-        if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
-            raise ValueError(
-                f"colour statistics must be finite; got mean {self.mean.tolist()} and covariance "
-                f"{self.covariance.tolist()}"
+                f"colour statistics are a finite mean [3] and covariance [3, 3]; got "
+                f"{self.mean.tolist()} and {self.covariance.tolist()}"
             )
 
 
@@ -175,24 +171,21 @@ def closed_maps(
         return _mapped(content[region], style[region], limits, strength, form)
 
     picture = between(WHOLE)
-    own_sky = _both(content, style, SKY)
-    land = between(LAND) if own_sky and _both(content, style, LAND) else picture
+    both = content.keys() & style.keys()
+    own_sky = SKY in both
+    land = between(LAND) if own_sky and LAND in both else picture
     sky = between(SKY, SKY_LIMITS) if own_sky else picture
     splats = land[None]
     if per_region:
         regions = {
             region: torch.lerp(land, between(region), _trust(content[region], style[region]))
             for region in (ROAD, VEGETATION, REST)
-            if _both(content, style, region)
+            if region in both
         }
         splats = torch.stack([_of_class(value, regions, land, sky) for value in range(CLASSES)])
     seen = content[SKY] if own_sky else None
     about = seen and torch.from_numpy(np.column_stack([seen.covariance, seen.mean])).float()
     return StyleMaps(splats.float(), sky.float(), picture.float(), about)
-
-
-def _both(content: Statistics, style: Statistics, region: str) -> bool:
-    return region in content and region in style
 
 
 def _trust(content: ColorStatistics, style: ColorStatistics) -> float:
@@ -211,8 +204,7 @@ def _of_class(value: int, regions: dict[str, Tensor], land: Tensor, sky: Tensor)
     return regions.get(REGION_OF_CLASS.get(kind, REST), land)
 
 
-@dataclass(frozen=True)
-class _Form:
+class _Form(NamedTuple):
     """gain: the 3 x 3 between two floored covariances. limited: one like it within limits."""
 
     gain: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -248,10 +240,6 @@ def _mkl_gain(content: np.ndarray, style: np.ndarray) -> np.ndarray:
     return (matrix + matrix.T) / 2
 
 
-def _reinhard_gain(content: np.ndarray, style: np.ndarray) -> np.ndarray:
-    return np.diag(np.sqrt(np.diag(style) / np.diag(content)))
-
-
 def _limited_channels(matrix: np.ndarray, limits: Limits) -> np.ndarray:
     """The diagonal matrix within the limits; each channel carries contrast, and keeps some."""
     return np.diag(np.clip(np.diag(matrix), limits.least_contrast, limits.most_gain))
@@ -269,7 +257,9 @@ def _limited(matrix: np.ndarray, limits: Limits) -> np.ndarray:
 
 
 _MKL = _Form(_mkl_gain, _limited)
-_REINHARD = _Form(_reinhard_gain, _limited_channels)
+_REINHARD = _Form(
+    lambda content, style: np.diag(np.sqrt(np.diag(style) / np.diag(content))), _limited_channels
+)
 
 
 def _target_mean(

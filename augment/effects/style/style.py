@@ -21,13 +21,11 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.style.color_maps import (
     StyleMaps,
-    identity_map,
     level_maps,
     map_rows,
     sky_levels,
     style_gaussians,
     style_sky,
-    with_strength,
 )
 from augment.effects.style.content import (
     PICTURE_SIZE,
@@ -53,8 +51,6 @@ from recipes.errors import RecipeError
 from recipes.weather import Style, style_preset_text
 from recipes.yaml_tree import read_plain
 
-# ---- From a recipe's style to the maps of a scene: the one place that knows all the methods ------
-
 if TYPE_CHECKING:
     from augment.effects.style.network import Gscm
 
@@ -67,26 +63,22 @@ _given: WeakKeyDictionary[Scene, dict[Style, StyleMaps]] = WeakKeyDictionary()
 def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None = None) -> StyleMaps:
     """The maps that give the scene the style's colours, float32; identities at strength 0.
 
-    style: image, mask and checkpoint are paths that can be opened as they are. Its applied_to says
-    which of the maps are wanted, and changes none. cameras: those that the scene will be seen by;
-    None for all of its own. The last few are remembered for as long as the scene lives, with what
-    their files held when they were first read. `remember_maps` overrides all of this.
+    style: image, mask and checkpoint are paths that can be opened as they are. cameras: those that
+    the scene will be seen by; None for all of its own. The last few are remembered for as long as
+    the scene lives, with what their files held when first read. `remember_maps` overrides this.
 
     Raises:
         StyleError: an image, a preset or a checkpoint cannot be used.
     """
     if not style.changes:
-        return identity_maps()
+        return StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
     given = _given.get(scene, {}).get(style)
     if given is not None:
         return given
     key = (style, content_key(scene, cameras))
     known = _remembered.setdefault(scene, {})
     if key not in known:
-        maps = _find_maps(scene, style, cameras)
-        while len(known) >= MAX_REMEMBERED:
-            del known[next(iter(known))]
-        known[key] = maps
+        _put(known, key, _find_maps(scene, style, cameras))
     return known[key]
 
 
@@ -94,34 +86,28 @@ def remember_maps(scene: Scene, style: Style, maps: StyleMaps) -> None:
     """Make `style_maps` give these maps for the scene and the style from now on, whatever the
     cameras.
     """
-    given = _given.setdefault(scene, {})
-    while len(given) >= MAX_REMEMBERED:
-        del given[next(iter(given))]
-    given[style] = maps
+    _put(_given.setdefault(scene, {}), style, maps)
 
 
-def identity_maps() -> StyleMaps:
-    """One map for all, which changes nothing."""
-    return StyleMaps(identity_map()[None], identity_map(), identity_map())
+def _put(known: dict[Any, StyleMaps], key: object, maps: StyleMaps) -> None:
+    """Remember the maps, and forget the oldest where there are too many."""
+    while len(known) >= MAX_REMEMBERED:
+        del known[next(iter(known))]
+    known[key] = maps
 
 
 def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
     if style.method == "gscm":
         found = _network_map(scene, style, cameras)
         return StyleMaps(found[None], found, found)
+    preset = style.preset
     return closed_maps(
         content_statistics(scene, cameras, per_region=style.per_region),
-        _style_statistics(style),
+        image_statistics(_style_image(style)) if preset is None else preset_statistics(preset),
         method=style.method,
         strength=style.strength,
         per_region=style.per_region,
     )
-
-
-def _style_statistics(style: Style) -> Statistics:
-    if style.preset is not None:
-        return preset_statistics(style.preset)
-    return image_statistics(_style_image(style))
 
 
 def _style_image(style: Style) -> StyleImage:
@@ -146,7 +132,8 @@ def _network_map(
         )
     mean = content.double().mean((0, 2, 3))
     full = _limited(found, mean)
-    return _limited(with_strength(full, style.strength), mean).float()
+    # The identity at strength 0, the map at 1, straight between and beyond.
+    return _limited(torch.lerp(torch.eye(3, 4).double(), full, style.strength), mean).float()
 
 
 def _content_side(
@@ -215,10 +202,9 @@ def preset_statistics(name: str) -> Statistics:
         StyleError: there is no style of that name, or its file is not as it should be.
     """
     try:
-        text = style_preset_text(name)
+        return parse_statistics(style_preset_text(name), source=f"style {name}")
     except RecipeError as error:
         raise StyleError(str(error)) from None
-    return parse_statistics(text, source=f"style {name}")
 
 
 def parse_statistics(text: str, *, source: str) -> Statistics:
@@ -243,14 +229,12 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
 def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
     """The statistics of disjoint parts as one, each by its share."""
     share = sum(part.share for part in parts)
-    mean = sum((part.share / share * part.mean for part in parts), np.zeros(3))
-    second = sum(
-        (
-            part.share / share * (part.covariance + np.outer(part.mean - mean, part.mean - mean))
-            for part in parts
-        ),
-        np.zeros((3, 3)),
-    )
+    mean, second = np.zeros(3), np.zeros((3, 3))
+    for part in parts:
+        mean += part.share / share * part.mean
+    for part in parts:
+        off = part.mean - mean
+        second += part.share / share * (part.covariance + np.outer(off, off))
     return ColorStatistics(mean, second, share)
 
 
@@ -263,8 +247,9 @@ def _fields(value: Any, expected: tuple[str, ...], where: str) -> dict[str, Any]
 
 def _statistics(value: Any, share: float, where: str) -> ColorStatistics:
     fields = _fields(value, tuple(_FIELDS), where)
-    mean, covariance = (_numbers(fields[key], shape, f"{where}.{key}") for key, shape in
-                        _FIELDS.items())  # fmt: skip
+    mean, covariance = (
+        _numbers(fields[key], shape, f"{where}.{key}") for key, shape in _FIELDS.items()
+    )
     if not ((mean >= 0) & (mean <= 1)).all():
         raise StyleError(f"{where}.mean: must be in [0, 1]; got {mean.tolist()}")
     if not np.array_equal(covariance, covariance.T):
@@ -297,10 +282,10 @@ class SceneStyle:
     """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
     background splat is sky; None where none is any.
 
-    folds: the background's SH are mapped once and kept, as much memory as they take themselves (of
-    the GPU where that draws), in place of the colours that they evaluate to, which a map does not
-    commute with where the clamp to >= 0 acts (augment.effects.style.color_maps). Actors' colours
-    are mapped either way: their SH are turned and changed from frame to frame, and they are few.
+    folds: the background's SH are mapped once and kept (on the GPU where that draws), in place of
+    the colours that they evaluate to, which a map does not commute with where the clamp to >= 0
+    acts (augment.effects.style.color_maps). Actors' colours are mapped either way: their SH change
+    from frame to frame.
     """
 
     maps: StyleMaps
@@ -328,25 +313,27 @@ class SceneStyle:
             return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
         if self.levels is None or part.instance_id > 0:
             return dataclasses.replace(part, color_maps=self.maps.splats)
-        return dataclasses.replace(part, color_maps=self._level_maps, color_rows=self._rows)
+        maps, rows = self._level_maps
+        return dataclasses.replace(part, color_maps=maps, color_rows=rows)
+
+    def _fold(self, backend: str) -> Float[Tensor, "N K 3"]:
+        background = self.bare.background
+        return style_gaussians(background, self.maps, levels=self.levels, backend=backend).sh
 
     @cached_property
     def _folded(self) -> Float[Tensor, "N K 3"]:
-        return style_gaussians(self.bare.background, self.maps, levels=self.levels).sh
+        return self._fold(AUTO)
 
     @cached_property
     def _folded_on_gpu(self) -> Float[Tensor, "N K 3"]:
-        background = self.bare.background
-        return style_gaussians(background, self.maps, levels=self.levels, backend=CUDA).sh
+        return self._fold(CUDA)
 
     @cached_property
-    def _level_maps(self) -> Float[Tensor, "R 3 4"]:
-        return level_maps(self.maps)
-
-    @cached_property
-    def _rows(self) -> Int16[Tensor, "N"]:
+    def _level_maps(self) -> tuple[Tensor, Tensor]:
+        """The maps at every level, and each background splat's row of them."""
         assert self.levels is not None
-        return map_rows(self.levels, self.bare.background.semantic, len(self.maps.splats))
+        rows = map_rows(self.levels, self.bare.background.semantic, len(self.maps.splats))
+        return level_maps(self.maps), rows
 
 
 def look_of(scene: Scene, style: Style) -> SceneStyle:
