@@ -1,6 +1,4 @@
-"""Labelled boxes in an image: which pixels show which, their 2D boxes and what hides them, and the
-numbers that instance images give them.
-"""
+"""Labelled boxes in an image: their pixels, 2D boxes, occlusion, and numbers in instance images."""
 
 from __future__ import annotations
 
@@ -362,7 +360,9 @@ def _projected_edges(corners_m: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, 
     a, b = corners_m[:, EDGES[:, 0]], corners_m[:, EDGES[:, 1]]  # [B, 12, 3]
     seen = np.maximum(a[..., 2], b[..., 2]) > NEAR_M
     ends = np.concatenate([cut_edges(a, b), cut_edges(b, a)], axis=1)
-    return _project(ends, K), np.concatenate([seen, seen], axis=1)
+    z = np.maximum(ends[..., 2:], NEAR_M)  # nearer ones belong to edges that are not seen
+    pixels = ends[..., :2] / z * K[[0, 1], [0, 1]] + K[:2, 2]
+    return pixels, np.concatenate([seen, seen], axis=1)
 
 
 def _hull_area(points: np.ndarray) -> float:
@@ -371,11 +371,6 @@ def _hull_area(points: np.ndarray) -> float:
     reach = max(float(np.abs(points - middle).max()), 1e-9)  # OpenCV's are float32
     hull = cv2.convexHull(((points - middle) / reach).astype(np.float32))
     return cv2.contourArea(hull) * reach**2
-
-
-def _project(points_m: np.ndarray, K: np.ndarray) -> np.ndarray:
-    z = np.maximum(points_m[..., 2:], NEAR_M)  # nearer ones belong to edges that are not seen
-    return points_m[..., :2] / z * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
 def _hit(

@@ -324,34 +324,24 @@ def ground_of(scene: Scene) -> Ground:
 
 def check_metric_and_level(scene: Scene) -> None:
     """Raises SceneError, which asks for both, where metres or gravity are not known."""
-    unknown = [
-        what
-        for known, what in (
-            (scene.has_known_gravity, "which way is up"),
-            (scene.has_metric_scale, "how long a unit is"),
-        )
-        if not known
-    ]
-    if not unknown:
+    lacks = {}  # what is not known: the option of a URI that says it
+    if not scene.has_known_gravity:
+        lacks["which way is up"] = "up=-y"
+    if not scene.has_metric_scale:
+        lacks["how long a unit is"] = "scale=0.35"
+    if not lacks:
         return
+    example = "gaussians:PATH?up=-y&scale=0.35"
+    if scene.source.startswith("gaussians:"):
+        example = scene.source + ("&" if "?" in scene.source else "?") + "&".join(lacks.values())
     raise SceneError(
         f"scene {scene.name!r} ({scene.source}): its ground cannot be told without metres and "
-        f"gravity; not known: {' and '.join(unknown)}. Give both: for a splat file as in "
-        f"{_example(scene)}, where up is the file's axis that points up (or up=cameras, their "
+        f"gravity; not known: {' and '.join(lacks)}. Give both: for a splat file as in "
+        f"{example}, where up is the file's axis that points up (or up=cameras, their "
         f"mean) and scale is metres per unit (scale=1 if it is in metres); for a recording, poses "
         f'in metres with z up, and no "has_metric_scale": false in calibration.json; for a scene '
         f"folder, fit it again from such a source"
     )
-
-
-def _example(scene: Scene) -> str:
-    """The scene's own URI with what it lacks, or one like it."""
-    if not scene.source.startswith("gaussians:"):
-        return "gaussians:PATH?up=-y&scale=0.35"
-    lacks = ([] if scene.has_known_gravity else ["up=-y"]) + (
-        [] if scene.has_metric_scale else ["scale=0.35"]
-    )
-    return scene.source + ("&" if "?" in scene.source else "?") + "&".join(lacks)
 
 
 def ground_sentence(ground: Ground) -> str:
@@ -405,21 +395,18 @@ def _measure(scene: Scene) -> Ground:
 def _lidar(scene: Scene, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns [N, 3] of a handful of sweeps in the scene's world, and their classes int16 [N]."""
     points, classes = [np.zeros((0, 3))], [np.zeros(0, np.int16)]
+    labels = scene.labels
     for index in _spread_frames(scene, positions):
         sweep = scene.lidar(index)
         if sweep is None:
             continue
-        known = (
-            scene.labels.lidar_classes(sweep) if isinstance(scene.labels, ClassifiesLidar) else None
-        )
+        known = labels.lidar_classes(sweep) if isinstance(labels, ClassifiesLidar) else None
+        if known is None:
+            known = np.full(len(sweep), SemanticClass.UNKNOWN, np.int16)
         world = sweep.points_m - scene.world_origin_m
         finite = np.isfinite(world).all(axis=1)
         points.append(world[finite])
-        classes.append(
-            np.full(int(finite.sum()), SemanticClass.UNKNOWN, np.int16)
-            if known is None
-            else known[finite]
-        )
+        classes.append(known[finite])
     return np.concatenate(points), np.concatenate(classes)
 
 
@@ -472,14 +459,8 @@ def _from_path(scene: Scene, positions: np.ndarray) -> Ground:
     if scene.ground_z_m is not None:
         return Ground(scene.ground_z_m, scene.ground_z_m, "ego path")
     heights = positions[:, 2]
-    cameras = np.array(
-        [
-            np.mean([float(camera.centre[2]) for camera in frame.cameras.values()])
-            if frame.cameras
-            else math.nan
-            for frame in scene.frames
-        ]
-    )
+    centres = [[float(c.centre[2]) for c in frame.cameras.values()] for frame in scene.frames]
+    cameras = np.array([np.mean(own) if own else math.nan for own in centres])
     seen = np.isfinite(cameras)
     if seen.any() and np.median((cameras - heights)[seen]) < _EGO_ON_ROAD_M:
         heights = cameras[seen] - CAMERA_HEIGHT_M

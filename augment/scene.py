@@ -34,10 +34,9 @@ class Track:
     """Where an actor is over time. Linear in position, slerp in rotation, between samples.
 
     timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
-    hold_ns: how long before the first and after the last sample the actor stays at that pose
-    (cameras of a frame fire at slightly different moments); beyond it the actor is absent.
-    max_gap_ns: between samples further apart than this the actor is absent too, but for hold_ns
-    after the one and before the other, where it stays at that pose; None: always interpolated.
+    hold_ns: how long the actor stays at a pose before the first and after the last sample, and at
+    both ends of a gap longer than max_gap_ns (None: always interpolated); beyond it the actor is
+    absent. (Cameras of a frame fire at slightly different moments.)
     """
 
     timestamps_ns: Tensor
@@ -88,7 +87,7 @@ class Track:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is cached, which other processes make again in less time than it travels."""
+        """Without what is cached, which is made anew in less time than it travels."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 

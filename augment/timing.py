@@ -1,8 +1,6 @@
-"""Times of passes, for whoever wants them: `with stopwatch() as seconds:` around rendering.
-
-A pass says `with lap("flood: bed"):`. Where nobody listens that costs a look-up. A GPU works on
-while the program goes on: for whoever listens, laps begin and end when it has done what it was
-told, which makes the whole slower and each lap's time its own.
+"""Times of passes: `with stopwatch() as seconds:` around, `with timed("flood: bed"):` in a pass,
+which costs a look-up where no stopwatch runs. Where one does, the GPU is waited for at both
+ends of a pass, which makes the whole slower and each time its own.
 """
 
 from __future__ import annotations
@@ -11,13 +9,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from types import TracebackType
 
 import torch
 
 
 class StageTimer:
-    """seconds: by name, without what laps inside a lap took."""
+    """seconds: by name, without those of passes inside the pass."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -33,7 +30,7 @@ class StageTimer:
         self._open.pop()
 
     def _close(self) -> None:
-        """Give the time since the last change to the innermost open lap."""
+        """Give the time since the last change to the innermost open pass."""
         if torch.cuda.is_initialized():
             torch.cuda.synchronize()
         now = time.perf_counter()
@@ -43,11 +40,11 @@ class StageTimer:
         self._since = now
 
 
-_listening: ContextVar[StageTimer | None] = ContextVar("laps", default=None)
+_listening: ContextVar[StageTimer | None] = ContextVar("stopwatch", default=None)
 
 
 class timed:
-    """Counts what runs inside under a name, where somebody listens."""
+    """Counts what runs inside under a name, where a stopwatch runs."""
 
     __slots__ = ("_name", "_timer")
 
@@ -59,22 +56,17 @@ class timed:
         if self._timer is not None:
             self._timer.start(self._name)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._timer is not None:
             self._timer.stop()
 
 
 @contextmanager
 def stopwatch() -> Iterator[dict[str, float]]:
-    """Seconds of the laps that run inside, in this thread or task, by name."""
-    laps = StageTimer()
-    before = _listening.set(laps)
+    """Seconds of the passes that run inside, in this thread or task, by name."""
+    timer = StageTimer()
+    before = _listening.set(timer)
     try:
-        yield laps.seconds
+        yield timer.seconds
     finally:
         _listening.reset(before)
