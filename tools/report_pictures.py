@@ -26,6 +26,7 @@ from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.jobs.store import Store, StoredFile, StoredFileMissing
 from augment.jobs.tables import read_table
 from augment.semantics import SemanticClass
+from tools.drawing import color_mapped, resized
 from tools.report_numbers import Draws, weather_text
 
 Value = TypeVar("Value")
@@ -420,16 +421,14 @@ def color_depth(depth_m: np.ndarray) -> tuple[np.ndarray, str]:
     near = max(float(near), _NEAREST_M)
     far = max(float(far), 1.01 * near)
     place = np.log(np.maximum(depth_m, _NEAREST_M) / near) / np.log(far / near)
-    levels = np.rint(255 * (1 - np.clip(place, 0, 1))).astype(np.uint8)
-    turbo = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
-    rgb[there] = turbo[there]
+    rgb[there] = color_mapped(1 - place, cv2.COLORMAP_TURBO)[there]
     return rgb, f"{near:.1f} m to {far:.0f} m"
 
 
 def depth_gradient() -> str:
     """CSS stops of `color_depth`'s colours, near to far."""
     levels = np.linspace(255, 0, 9).astype(np.uint8)[:, None]
-    stops = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    stops = color_mapped(levels / 255, cv2.COLORMAP_TURBO)[:, 0]
     return ",".join("rgb({} {} {})".format(*stop) for stop in stops.tolist())
 
 
@@ -459,7 +458,4 @@ def embed(rgb: np.ndarray, width: int, most: int) -> Picture:
 
 def _shrunk(image: np.ndarray, width: int) -> np.ndarray:
     """Without new values: a mean of two classes is a third one."""
-    if image.shape[1] <= width:
-        return image
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return image if image.shape[1] <= width else resized(image, width, cv2.INTER_NEAREST_EXACT)
