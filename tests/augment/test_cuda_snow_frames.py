@@ -229,6 +229,7 @@ def test_a_street_full_of_snow_is_the_cpus(street, monkeypatch):
     assert len(glints) <= 2 * MAX_GLINTS
 
 
+@pytest.mark.long
 def test_a_picture_of_close_and_glinting_snow_is_the_cpus(monkeypatch):
     scene, recipe = small_scene(), RECIPES["snow, close and glinting"]
     view = scene.frames[0].cameras["ahead"].cropped(8, 3, 7, 5)
