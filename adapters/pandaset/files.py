@@ -491,7 +491,7 @@ class PandaSetLabels:
     """Labels of one sequence, read when asked.
 
     Boxes: one an object; where both sensors' cuboids of it are in the file, the one that
-    `siblings.Objects` ranks first. A track_id is the uuid of the object's best box, the same in all
+    `Objects` ranks first. A track_id is the uuid of the object's best box, the same in all
     frames; attributes hold every column of the file under its own name (None where a text is
     missing), the box's own uuid, yaw and sibling included. Sweeps: columns x y z (metres), i
     (intensity 0 to 255), t (seconds), d (0: the spinning sensor, 1: the forward one) exactly as in
