@@ -94,12 +94,11 @@ def place_flood(recipe: Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
     bases = {"lowest": ground.lowest_z_m, "median": ground.median_z_m, "absolute": 0.0}
     level_z_m = bases[flood.reference] + flood.level_m
     depth_m = max(level_z_m - ground.lowest_z_m, MIN_DEPTH_M)
-    seed = recipe.seed if flood.waves.seed is None else flood.waves.seed
     medium = FloodMedium(
         level_z_m=level_z_m,
         extinction_per_m=flood.extinction_per_m_rgb,
         rgb=flood.color,
-        waves=make_waves(flood.waves, seed=seed, depth_m=depth_m),
+        waves=make_waves(flood.waves, seed=recipe.seed, depth_m=depth_m),
         refraction_index=flood.refraction_index,
         fresnel=flood.fresnel,
         reflection=flood.reflection,
