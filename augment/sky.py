@@ -75,7 +75,7 @@ def is_stand_in(sky: Sky) -> bool:
 
 
 def sample_at(sky: Sky, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The sky's colours where the directions lie, though its own tensors lie on the CPU."""
+    """The sky's colours on the directions' device, though its own tensors lie on the CPU."""
     if directions.device.type == "cpu":
         return sky.sample(directions)
     if isinstance(sky, ConstantSky):
