@@ -274,10 +274,7 @@ def test_which_file_of_a_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        (
-            {"upp": "z"},
-            r"'upp'; did you mean 'up'. allowed are up: .*; scale: metres per unit",
-        ),
+        ({"upp": "z"}, r"'upp'; did you mean 'up'. allowed are up: .*; scale: metres per unit"),
         ({"up": "north"}, "up must be"),
         ({"scale": "big"}, "scale must be metres per unit.*got 'big'"),
         ({"scale": "-1"}, "scale must be"),
