@@ -200,7 +200,7 @@ _REACHES_M = (6.0, 16.0, math.inf)  # beside the path; beyond its ends, at least
 _BEYOND_M = 20.0
 _CELL_M, _CELLS_A_SIDE = 0.5, 200
 _LOW_QUANTILE = 0.1  # in a cell; LiDAR has stray returns below the ground, splats even more
-_FEWEST, _MIN_SHARE = 30, 0.25  # of the low points, on a plane that is believed
+_MIN_POINTS, _MIN_SHARE = 30, 0.25  # of the low points, on a plane that is believed
 _ITERATIONS, _TRIES = 500, 3  # a quarter of the points on a plane: missed once in 2600 times
 _SEED = 20260101
 
@@ -269,16 +269,16 @@ def _low_points(points: np.ndarray) -> np.ndarray:
 def _level_plane(o3d: Any, points: np.ndarray) -> np.ndarray | None:
     """Unit normal and offset [4] of the nearly level plane with the most points; None if no such
     plane has enough of them."""
-    fewest = max(_FEWEST, math.ceil(_MIN_SHARE * len(points)))
+    min_points = max(_MIN_POINTS, math.ceil(_MIN_SHARE * len(points)))
     for _ in range(_TRIES):
-        if len(points) < fewest:
+        if len(points) < min_points:
             return None
         middle = points.mean(axis=0)
         o3d.utility.random.seed(_SEED)
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points - middle))
         # A probability below 1 stops early, at a moment that depends on the threads' progress.
         model, inliers = cloud.segment_plane(_THRESHOLD_M, 3, _ITERATIONS, probability=1.0)
-        if len(inliers) < fewest:
+        if len(inliers) < min_points:
             return None
         normal = np.array(model[:3]) / np.linalg.norm(model[:3])
         if abs(normal[2]) >= math.cos(math.radians(STEEPEST_DEG)):

@@ -23,7 +23,7 @@ from augment.effects.flood.waves import make_waves
 from augment.effects.smog import SmogMedium
 from augment.effects.snow.near_camera import SIZE_M, Layer, SnowLayers
 from augment.effects.snow.snow import PlacedSnow, snow_layers_of
-from augment.effects.style.style import look_of
+from augment.effects.style.style import scene_style_of
 from augment.errors import SceneError
 from augment.geometry import rotmat_from_quat
 from augment.ground import check_metric_and_level, ground_of
@@ -191,9 +191,10 @@ class Plan:
     depth. steps: every pass considered, in order. recorded_exposure: cameras' colour maps apply to
     the finished picture. shows_water: depth, semantic and instance images show the water's surface,
     not the scene under it. finds_boxes: labels or instance images need the depth of the solid
-    surfaces, snow included. snowless_buffers: replace buffers in views without snow. bare_buffers:
-    what depth, semantic and instance images take from a render of the scene without its snow; empty
-    where they show it. styles_picture: the style maps the finished picture, not the scene in it.
+    surfaces, snow included. buffers_without_snow: replace buffers in views without snow.
+    bare_buffers: what depth, semantic and instance images take from a render of the scene without
+    its snow; empty where they show it. styles_picture: the style maps the finished picture, not the
+    scene in it.
     """
 
     settings: RasterSettings
@@ -210,7 +211,7 @@ class Plan:
     shows_water: bool = False
     snow: PlacedSnow | None = None
     finds_boxes: bool = False
-    snowless_buffers: frozenset[str] = frozenset()
+    buffers_without_snow: frozenset[str] = frozenset()
     bare_buffers: frozenset[str] = frozenset()
     style: Style | None = None
     styles_picture: bool = False
@@ -279,7 +280,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     return Plan(
         settings=settings,
         buffers=frozenset(buffers),
-        snowless_buffers=frozenset(without_snow),
+        buffers_without_snow=frozenset(without_snow),
         smog_in_splats=smog if per_gaussian else None,
         smog_on_buffers=None if per_gaussian else smog,
         depth_buffer=depth_buffer,
@@ -556,14 +557,14 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     cameras = _layer_cameras(plan, camera) if water else (camera,)
     poses = _poses(scene, camera)
     drawn = _owners_seen(_actor_boxes(scene), poses, cameras, plan.settings.near_m)
-    layers, snowy = cover_for(plan, scene, backend=backend), set[int]()
+    layers, snowy = snow_layers_for(plan, scene, backend=backend), set[int]()
     if layers is not None:
         with_ground = {0: np.eye(4), **poses}
         snowy = _owners_seen(_snow_boxes(scene, layers), with_ground, cameras, plan.settings.near_m)
         drawn |= snowy - {0}
     buffers, bare_buffers = plan.buffers, plan.bare_buffers
     if layers is not None and not snowy:
-        buffers = plan.snowless_buffers
+        buffers = plan.buffers_without_snow
         if not water:  # the scene is the bare one already
             buffers, bare_buffers = buffers | bare_buffers, frozenset[str]()
         why = "neither snow nor what it buries can be in view"
@@ -586,11 +587,13 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     )
 
 
-def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowLayers | None:
+def snow_layers_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowLayers | None:
     """The plan's snow as it lies in the scene; None without one. backend: see snow_layers_of."""
     if plan.snow is None:
         return None
-    style_parts = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
+    style_parts = (
+        None if plan.style is None or plan.styles_picture else scene_style_of(scene, plan.style)
+    )
     return snow_layers_of(scene, plan.snow, style_parts, backend=backend)
 
 

@@ -14,9 +14,9 @@ from augment.cameras import Camera
 from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.effects.flood.water_plane import plane_depth
 from augment.effects.smog import SmogMedium, fog_raster
-from augment.effects.style.style import look_of
+from augment.effects.style.style import scene_style_of
 from augment.jobs.processes import choose_backend
-from augment.plan import Plan, ViewPlan, cover_for, make_plan, plan_view
+from augment.plan import Plan, ViewPlan, make_plan, plan_view, snow_layers_for
 from augment.render.buffers import AUTO, CUDA, EXPECTED_DEPTH, RenderOutput, kernels_for
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.rasterize import rasterize
@@ -315,10 +315,10 @@ def render_buffers(
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
     with timed("parts"):
-        look = None if plan.style is None else look_of(scene, plan.style)
+        look = None if plan.style is None else scene_style_of(scene, plan.style)
         style_parts = None if plan.styles_picture else look
         parts = bare_parts = scene.parts_for(camera, view.actors)
-    layers = cover_for(plan, scene, backend=backend) if view.snow else None
+    layers = snow_layers_for(plan, scene, backend=backend) if view.snow else None
     if layers is not None:
         with timed("snow: placement and layer"):
             parts = layers.parts_for(scene, camera, parts, view.snowy, backend=backend)

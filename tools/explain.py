@@ -20,7 +20,7 @@ from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.ground import ground_of, ground_sentence
 from augment.jobs.quality import resolve_quality, resolved_recipe
-from augment.plan import Plan, cover_for, make_plan, plan_view
+from augment.plan import Plan, make_plan, plan_view, snow_layers_for
 from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
@@ -243,7 +243,7 @@ def measure_passes(recipe: Recipe, scene: Scene, views: int = VIEWS) -> PassTime
     once_s = {}
     if recipe.weather.snow is not None and (plan := make_plan(recipe, scene)).snow is not None:
         start = time.perf_counter()
-        cover_for(plan, scene)
+        snow_layers_for(plan, scene)
         once_s["snow: placement and layer"] = time.perf_counter() - start
     variants = {"": recipe} | without_folded(recipe, scene)
     runs = {name: _runs(scene, cameras, variant) for name, variant in variants.items()}

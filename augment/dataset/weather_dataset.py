@@ -54,7 +54,7 @@ from augment.jobs.files import (
 )
 from augment.jobs.layout import PATH_KINDS, resolve_inside, variant_name
 from augment.jobs.manifest import OK, concat_rows, read_finished, weather_columns
-from augment.jobs.prepare import find_bed, remember, snow_to_lay, store_maps
+from augment.jobs.prepare import find_snow_support, remember, snow_of_recipe, store_maps
 from augment.jobs.processes import choose_backend
 from augment.jobs.quality import resolve_quality
 from augment.jobs.store import Store, StoredFileMissing, open_store
@@ -131,15 +131,15 @@ class SceneDataset(Dataset):
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
 
-        snow = snow_to_lay(self.recipe)
-        self._bed = None if snow is None else find_bed(scene, snow, backend=self._backend)
+        snow = snow_of_recipe(self.recipe)
+        self._bed = None if snow is None else find_snow_support(scene, snow, backend=self._backend)
         self._maps = store_maps(scene, [self.recipe])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """In another process the scene is another object, which knows of no bed and no maps yet."""
         self.__dict__.update(state)
         self._process = os.getpid()
-        snow = snow_to_lay(self.recipe)
+        snow = snow_of_recipe(self.recipe)
         if snow is not None and self._bed is not None:
             remember(self.scene, snow, self._bed)
         for maps in self._maps:

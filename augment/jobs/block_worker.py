@@ -30,7 +30,7 @@ from augment.jobs.layout import (
     variant_folder,
 )
 from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
-from augment.jobs.prepare import snow_to_lay, store_beds
+from augment.jobs.prepare import snow_of_recipe, store_snow_supports
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
 from augment.jobs.quality import resolve_quality_for
@@ -389,7 +389,7 @@ class BlockWorker:
             cameras=block.cameras,
             backend=self._setup.backend,
             workers=2 if task.is_trial else 1,
-            beds_dir=self._beds_dir(),
+            snow_support_dir=self._snow_support_dir(),
         )
         with Publisher(self._store, folder, block) as publisher:
 
@@ -418,7 +418,7 @@ class BlockWorker:
             enter_variant(self._store, *variant, block.identity(self._setup.backend))
             self._entered.add(variant)
 
-    def _beds_dir(self) -> Path:
+    def _snow_support_dir(self) -> Path:
         if self._store.local_dir is not None:
             return self._store.local_dir / STATE_FOLDER
         assert self._setup.scratch is not None
@@ -426,10 +426,10 @@ class BlockWorker:
 
     def _lay_bed(self, block: Block, scene: Scene) -> None:
         """Let one process look where the snow can lie, and the others on this disk wait for it."""
-        if snow_to_lay(block.recipe) is not None:
-            folder = self._beds_dir()
+        if snow_of_recipe(block.recipe) is not None:
+            folder = self._snow_support_dir()
             with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
-                store_beds(scene, [block.recipe], folder, backend=self._setup.backend)
+                store_snow_supports(scene, [block.recipe], folder, backend=self._setup.backend)
 
 
 class _SceneFailed(ClimateGSError):

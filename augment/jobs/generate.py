@@ -448,7 +448,7 @@ def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
                 frames=[having[len(having) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
-                beds_dir=Path(folder) / "beds",
+                snow_support_dir=Path(folder) / "beds",
             )
             started = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)

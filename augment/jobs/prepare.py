@@ -29,7 +29,7 @@ from recipes.weather import Snow, Style
 
 
 @dataclass(frozen=True)
-class StoredBed:
+class StoredSnowSupport:
     """A snow support in its file, named by its content, for this snow and any that can lie in the
     same places; picklable.
     """
@@ -43,7 +43,7 @@ class StoredBed:
         remember(scene, self.snow, load_support(Path(self.path), self.key))
 
 
-def snow_to_lay(recipe: Recipe) -> Snow | None:
+def snow_of_recipe(recipe: Recipe) -> Snow | None:
     """The recipe's snow; None where there is none to be laid."""
     snow = recipe.weather.snow
     return snow if snow is not None and snow.lies else None
@@ -54,12 +54,12 @@ def remember(scene: Scene, snow: Snow, bed: SnowSupport) -> None:
     remember_support(scene, placement_settings(snow), bed)
 
 
-def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowSupport:
+def find_snow_support(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowSupport:
     """The support of a snow for all of the scene's cameras, remembered for this scene object."""
     return support_of(scene, placement_settings(snow), backend=backend)
 
 
-def store_beds(
+def store_snow_supports(
     scene: Scene,
     recipes: Iterable[Recipe],
     folder: Path,
@@ -67,7 +67,7 @@ def store_beds(
     cameras: Sequence[Camera] | None = None,
     backend: str = "auto",
     progress: bool = False,
-) -> tuple[StoredBed, ...]:
+) -> tuple[StoredSnowSupport, ...]:
     """The supports of all snow in the recipes, in `folder` and remembered for this scene object.
     cameras: all that a camera path has, or None for the scene's: never a selection, so that no
     image depends on what else is rendered. backend: that renders the images. progress: a bar on
@@ -75,7 +75,7 @@ def store_beds(
     """
     if cameras is None:
         cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    requested = {placement_settings(s): s for r in recipes if (s := snow_to_lay(r)) is not None}
+    requested = {placement_settings(s): s for r in recipes if (s := snow_of_recipe(r)) is not None}
     stored = []
     for settings, snow in requested.items():
         bed = support_of(
@@ -85,7 +85,7 @@ def store_beds(
         path = support_path(folder, key)
         if not path.is_file():  # this process knew it from a job in another folder
             save_support(path, bed, key)
-        stored.append(StoredBed(snow, str(path), key))
+        stored.append(StoredSnowSupport(snow, str(path), key))
     return tuple(stored)
 
 
@@ -125,8 +125,10 @@ def style_to_apply(recipe: Recipe) -> Style | None:
 def store_maps(
     scene: Scene, recipes: Iterable[Recipe], *, cameras: Sequence[Camera] | None = None
 ) -> tuple[StoredMaps, ...]:
-    """The maps of all styles in the recipes. cameras: as of `store_beds`. Raises StyleError: a
-    style's files cannot be used, or it cannot be had in this scene.
+    """The maps of all styles in the recipes. cameras: as of `store_snow_supports`.
+
+    Raises:
+        StyleError: a style's files cannot be used, or it cannot be had in this scene.
     """
     stored = []
     for style in {s: None for r in recipes if (s := style_to_apply(r)) is not None}:

@@ -27,7 +27,7 @@ from augment.errors import SceneError
 from augment.jobs.claims import try_claim
 from augment.jobs.files import trajectory_id
 from augment.jobs.layout import STATE_FOLDER, reading_back
-from augment.jobs.prepare import find_bed, remember, snow_to_lay, style_to_apply
+from augment.jobs.prepare import find_snow_support, remember, snow_of_recipe, style_to_apply
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
 from augment.metrics.image import flip
@@ -193,9 +193,9 @@ class Bench:
 
     def hand_over(self, settings: Mapping[str, Value], scene: Scene) -> None:
         """Let the scene know where snow of these settings can lie, if that was found here."""
-        snow = snow_to_lay(with_settings(self._recipe, settings))
+        snow = snow_of_recipe(with_settings(self._recipe, settings))
         if snow is not None and self._cameras is None:
-            remember(scene, snow, find_bed(self._scene, snow, backend=self._backend))
+            remember(scene, snow, find_snow_support(self._scene, snow, backend=self._backend))
 
     def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
         return self._trial(view, settings).picture
@@ -219,7 +219,7 @@ class Bench:
         """Find for a camera path what pictures would otherwise find for the scene's own cameras."""
         if self._cameras is None or self._renderer is not None:
             return
-        snow, style = snow_to_lay(recipe), style_to_apply(recipe)
+        snow, style = snow_of_recipe(recipe), style_to_apply(recipe)
         if snow is not None:
             settings = placement_settings(snow)
             support_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
@@ -386,11 +386,11 @@ def useful(costs: Sequence[Cost]) -> list[Cost]:
     each faster than all that are as accurate or more so.
     """
     reference = costs[-1]
-    least_ms = MIN_SAVED * reference.ms
+    min_ms = MIN_SAVED * reference.ms
     kept = [reference]
     # Of values with equal errors the fastest comes first, and the others save nothing then.
     for cost in sorted(costs[:-1], key=lambda cost: (cost.flip, cost.ms)):
-        if kept[-1].ms - cost.ms > least_ms:
+        if kept[-1].ms - cost.ms > min_ms:
             kept.append(cost)
     return kept
 

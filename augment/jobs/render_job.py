@@ -73,11 +73,11 @@ from augment.jobs.manifest import (
     write_manifest,
 )
 from augment.jobs.prepare import (
-    StoredBed,
     StoredMaps,
-    snow_to_lay,
-    store_beds,
+    StoredSnowSupport,
+    snow_of_recipe,
     store_maps,
+    store_snow_supports,
     style_to_apply,
 )
 from augment.jobs.processes import OutputLock, choose_backend, share_scene
@@ -574,8 +574,8 @@ class RenderJob:
     for all. cameras: names, or None for all. camera_path: frames to render in place of the scene's
     own, poses in the scene's world; labels and LiDAR pass through where a frame of the scene has
     the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
-    variants' folders, finished or not, and choose their settings anew. beds_dir: keeps the snow
-    supports for later jobs; the output folder's state if None.
+    variants' folders, finished or not, and choose their settings anew. snow_support_dir: keeps
+    the snow supports for later jobs; the output folder's state if None.
     """
 
     scene_uri: str
@@ -587,7 +587,7 @@ class RenderJob:
     workers: int = 1
     backend: str = "auto"
     overwrite: bool = False
-    beds_dir: Path | None = None
+    snow_support_dir: Path | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -680,7 +680,7 @@ class _Run:
         identities = [self._identity(recipe) for recipe in self.recipes]
         self.job_state = JobState(self.out_dir, self.index, self.recipes, identities)
         self.boxes = BoxCache(self.index)
-        self.beds: tuple[StoredBed, ...] = ()
+        self.snow_supports: tuple[StoredSnowSupport, ...] = ()
         self.maps: tuple[StoredMaps, ...] = ()
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
@@ -727,7 +727,7 @@ class _Run:
             backend=self.backend,
             labelled=self.index.labelled,
             instances=self.index.instances,
-            beds=self.beds,
+            snow_supports=self.snow_supports,
             maps=self.maps,
         )
         assert self.scene is not None
@@ -781,7 +781,7 @@ class _Run:
         """Find what images of these recipes share, for all cameras of the scene or the path. Where
         their snow can lie, and the colour maps of their styles.
         """
-        snowy = [recipe for recipe in recipes if snow_to_lay(recipe) is not None]
+        snowy = [recipe for recipe in recipes if snow_of_recipe(recipe) is not None]
         styled = [recipe for recipe in recipes if style_to_apply(recipe) is not None]
         assert self.scene is not None
         cameras, path = None, self.job.camera_path
@@ -794,10 +794,10 @@ class _Run:
                 self.maps = store_maps(self.scene, styled, cameras=cameras)
         if snowy:
             with self.times.spent("place"):
-                self.beds = store_beds(
+                self.snow_supports = store_snow_supports(
                     self.scene,
                     snowy,
-                    self.job.beds_dir or self.out_dir / STATE_FOLDER,
+                    self.job.snow_support_dir or self.out_dir / STATE_FOLDER,
                     cameras=cameras,
                     backend=self.backend,
                     progress=self.progress,

@@ -37,7 +37,7 @@ from augment.jobs.files import (
 )
 from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
-from augment.jobs.prepare import StoredBed, StoredMaps
+from augment.jobs.prepare import StoredMaps, StoredSnowSupport
 from augment.jobs.processes import (
     READY,
     ChildProcess,
@@ -199,8 +199,9 @@ class Pending(Protocol):
 @dataclass(frozen=True)
 class Setup:
     """What rendering needs besides scene and frames; small, and picklable. labelled: numbers of the
-    frames whose labels and LiDAR pass through. instances: of the scene's objects. beds: where the
-    recipes' snow can lie; the scene to render remembers them. maps: those of the recipes' styles.
+    frames whose labels and LiDAR pass through. instances: of the scene's objects. snow_supports:
+    where the recipes' snow can lie; the scene to render remembers them. maps: of the recipes'
+    styles.
     """
 
     out_dir: str
@@ -208,7 +209,7 @@ class Setup:
     backend: str
     labelled: frozenset[int]
     instances: Instances
-    beds: tuple[StoredBed, ...] = ()
+    snow_supports: tuple[StoredSnowSupport, ...] = ()
     maps: tuple[StoredMaps, ...] = ()
 
 
@@ -514,8 +515,8 @@ def worker_main(
     send = sender(connection)
     try:
         scene, frames = shared.open()
-        for bed in setup.beds:
-            bed.take_over(scene)
+        for support in setup.snow_supports:
+            support.take_over(scene)
     except Exception as error:
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return

@@ -42,14 +42,14 @@ class Conv:
 @dataclass(frozen=True)
 class Architecture:
     """slices: convolutions whose last output is compared, one slice after the other. pools: the
-    slices that begin with a max pooling of `pool_px` and stride 2. least_px: the smallest side.
+    slices that begin with a max pooling of `pool_px` and stride 2. min_px: the smallest side.
     """
 
     name: str
     slices: tuple[tuple[Conv, ...], ...]
     pools: tuple[int, ...]
     pool_px: int
-    least_px: int
+    min_px: int
 
 
 ALEX = Architecture(
@@ -63,7 +63,7 @@ ALEX = Architecture(
     ),
     pools=(1, 2),
     pool_px=3,
-    least_px=31,
+    min_px=31,
 )
 VGG16 = Architecture(
     "vgg16",
@@ -76,7 +76,7 @@ VGG16 = Architecture(
     ),
     pools=(1, 2, 3, 4),
     pool_px=2,
-    least_px=16,
+    min_px=16,
 )
 
 
@@ -95,7 +95,7 @@ class Lpips:
         """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones. Raises
         ValueError: shapes differ, or the pictures are too small for the network.
         """
-        least = self.architecture.least_px
+        least = self.architecture.min_px
         if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < least:
             raise ValueError(
                 f"pictures must be two of [B, 3, H, W] with H, W >= {least} for {self.name}; got "

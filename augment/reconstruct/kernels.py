@@ -171,11 +171,11 @@ CHUNK = 4096  # priors summed at a time
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d_expected, sums):
+def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_expected, sums):
     """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
 
     expected, alpha, d_expected: flat [H, W]; d_expected must be 0 and gets factor times the
-    derivative. pixels, depth, weight: the priors. Pixels with alpha <= least_alpha count nothing.
+    derivative. pixels, depth, weight: the priors. Pixels with alpha <= min_alpha count nothing.
     sums: float64, one per CHUNK of priors; -1 where a pixel lies outside of the image or the order
     does not increase.
     """
@@ -190,7 +190,7 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d
                 break
             before = pixel
             value = expected[pixel]
-            if not (alpha[pixel] > least_alpha and value > zero and depth[k] > zero):
+            if not (alpha[pixel] > min_alpha and value > zero and depth[k] > zero):
                 continue
             inverse = one / value
             error = inverse - one / depth[k]

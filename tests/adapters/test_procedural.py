@@ -174,9 +174,8 @@ def test_labels_survive_pickling_and_name_a_missing_frame(scene):
         scene.lidar(20)
 
 
-@pytest.mark.parametrize(
-    ("frame", "name"), [(0, "front"), pytest.param(10, "left", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("frame", "name"), [(0, "front"), (10, "left")])
 def test_splats_agree_with_the_truth(scene, truth, frame, name):
     camera = scene.frames[frame].cameras[name]
     view = truth.render(camera)

@@ -25,7 +25,7 @@ from augment.dataset import SceneDataset
 from augment.effects.snow import support as beds
 from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
-from augment.jobs.prepare import store_beds
+from augment.jobs.prepare import store_snow_supports
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe
 from recipes.weather import Snow
@@ -147,7 +147,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
     """One scene object, two output folders: workers of the second job need a file there."""
     scene = open_fake("fake:street")
     for name in "ab":
-        (bed,) = store_beds(scene, [snowy()], tmp_path / name)
+        (bed,) = store_snow_supports(scene, [snowy()], tmp_path / name)
         assert Path(bed.path).parent == tmp_path / name and Path(bed.path).is_file()
     assert len(placements) == 1
     other = open_fake("fake:street")
@@ -160,7 +160,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
 def test_a_folder_that_cannot_be_written_is_named(placements, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        store_beds(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
+        store_snow_supports(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
 
 
 def test_live_samples_share_one_search(placements) -> None:

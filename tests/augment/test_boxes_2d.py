@@ -222,7 +222,7 @@ def test_where_boxes_overlap_the_one_that_encloses_the_surface_has_it_then_the_s
     assert not (image == 4)[left].any() and not (image == 3)[left].mean() > 0.02
 
 
-@pytest.mark.parametrize("surface", ["solid", "scene"])
+@pytest.mark.parametrize("surface", ["solid", pytest.param("scene", marks=pytest.mark.long)])
 def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
     """Of 0.3 m, which raises the surface out of the box; seen from above. `scene` looks through."""
     scene = street(hidden_to_y=-4.0, eye_z_m=4.0)

@@ -137,6 +137,7 @@ def same_picture(there: FloodedImage, here: FloodedImage, budget: float) -> None
         assert float((~torch.isclose(a, b, rtol=1e-4, atol=1e-4)).float().mean()) <= budget, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("reflection", "smog", "deferred"),
     [("screen_space", LAYERED, False), ("mirrored", UNIFORM, True)],

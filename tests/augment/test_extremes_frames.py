@@ -61,6 +61,7 @@ def test_every_pair_of_effects(pair: frozenset[str], data: st.DataObject):
     rendered(place.scene(), camera, data.draw(recipes(pair)))
 
 
+@pytest.mark.long
 @drawing(4)
 @given(cameras(levels_m=(0.2,)), recipes(frozenset({"flood"})))
 def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):

@@ -96,6 +96,7 @@ def covariances(gaussians):
     return axes @ axes.mT
 
 
+@pytest.mark.long
 def test_colours_that_depend_on_the_view_are_mirrored(monkeypatch):
     """Splats of SH degree 3: the reflection shows their colours as seen from the mirrored eye."""
     splats = random_gaussians(400, seed=2, sh_degree=3)

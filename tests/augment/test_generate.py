@@ -314,6 +314,7 @@ def no_threads_left() -> Iterator[None]:
     assert not [t for t in threading.enumerate() if t.name.startswith(("publish", "writer"))]
 
 
+@pytest.mark.long
 def test_sweeps_that_show_another_world_are_told_of_once(tmp_path: Path, caplog) -> None:
     snowy = "weather: {snow: {depth_m: 0.1}}\noutput: {depth: none, lidar: true}\n"
     recipes = make_recipes(("snowy",), variants=2, texts={"snowy": snowy}, block_images=2)

@@ -19,6 +19,7 @@ def street():
     return scene, truth_view(scene, open_truth(parse_uri(STREET)[2]), camera)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
 @pytest.mark.parametrize("scale_height_m", [None, 15.0])
 def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):

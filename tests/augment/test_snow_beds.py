@@ -140,7 +140,7 @@ def test_files_of_something_else_are_refused(bed: SnowSupport, tmp_path: Path) -
     with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
         load_support(path, "other")
     save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(SceneError, match="no snow bed of this version"):
+    with pytest.raises(SceneError, match="no snow support of this version"):
         load_support(path, "k")
     path.write_text("no tensors")
     with pytest.raises(SceneError, match="damaged"):

@@ -26,7 +26,7 @@ from augment.effects.style.statistics import (
 from augment.semantics import SemanticClass
 
 # Nothing of the limits acts on ordinary statistics with these; the floor is far below any spread.
-FREE = Limits(floor=1e-9, most_gain=1e6, least_gain=1e-6, least_contrast=1e-6)
+FREE = Limits(floor=1e-9, max_gain=1e6, min_gain=1e-6, min_contrast=1e-6)
 METHODS = {"mkl": mkl_map, "reinhard": reinhard_map}
 
 
@@ -180,10 +180,10 @@ def test_any_pair_of_extremes_stays_within_the_limits(method, limits):
         matrix, offset = parts(METHODS[method](content, style, limits))
         gains = np.linalg.eigvalsh(matrix)
         assert np.isfinite(matrix).all() and np.isfinite(offset).all()
-        assert gains[0] >= limits.least_gain - 1e-9
+        assert gains[0] >= limits.min_gain - 1e-9
         # The contrast that is given back may lie along no axis of the rest: at most their sum.
-        assert gains[-1] <= limits.most_gain + limits.least_contrast + 1e-9
-        assert matrix.sum() / 3 >= limits.least_contrast - 1e-9, "contrast along grey"
+        assert gains[-1] <= limits.max_gain + limits.min_contrast + 1e-9
+        assert matrix.sum() / 3 >= limits.min_contrast - 1e-9, "contrast along grey"
         mean = matrix @ content.mean + offset
         assert (mean > -1e-12).all() and (mean < 1 + 1e-12).all()
 
@@ -194,7 +194,7 @@ def test_a_constant_style_tints_and_leaves_the_shapes():
         matrix, offset = parts(mkl_map(content, constant(*color)))
         mean = matrix @ content.mean + offset
         assert np.abs(mean - color).max() < 0.2
-        assert matrix.sum() / 3 == pytest.approx(LAND_LIMITS.least_contrast)
+        assert matrix.sum() / 3 == pytest.approx(LAND_LIMITS.min_contrast)
         # Two standard deviations on either side are still colours that a screen can show.
         deviations = np.sqrt(np.diag(matrix @ content.covariance @ matrix.T))
         assert (mean - 2 * deviations > -0.02).all() and (mean + 2 * deviations < 1.02).all()
@@ -210,7 +210,7 @@ def test_a_grey_style_takes_the_colour_out_and_keeps_the_contrast():
 
 
 def test_limits_are_checked():
-    for wrong in ({"floor": 0.0}, {"most_gain": 0.5}, {"least_gain": 0.6}, {"least_contrast": 2.0}):
+    for wrong in ({"floor": 0.0}, {"max_gain": 0.5}, {"min_gain": 0.6}, {"min_contrast": 2.0}):
         with pytest.raises(ValueError, match="limits need"):
             Limits(**wrong)
 

@@ -163,7 +163,7 @@ def test_the_networks_gains_are_limited(photo, network, monkeypatch, gain):
     expected = color_map[:, :3] @ mean + color_map[:, 3]
     torch.testing.assert_close(found[:, :3] @ mean + found[:, 3], expected, rtol=1e-5, atol=1e-5)
     gains = torch.linalg.svdvals(found[:, :3])
-    assert gains.max() == pytest.approx(min(gain, scene_maps.LAND_LIMITS.most_gain), rel=1e-6)
+    assert gains.max() == pytest.approx(min(gain, scene_maps.LAND_LIMITS.max_gain), rel=1e-6)
     if gain < 1:
         assert torch.equal(found, color_map)
 

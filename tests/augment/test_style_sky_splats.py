@@ -16,7 +16,7 @@ from augment.effects.style.color_maps import (
     style_gaussians,
     styled_scene,
 )
-from augment.effects.style.style import look_of, remember_maps
+from augment.effects.style.style import remember_maps, scene_style_of
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
@@ -105,7 +105,7 @@ def test_the_halo_changes_with_the_sky_in_pictures_and_in_styled_scenes():
     scene = scene_of(ball((30.0, 0.0, 12.0)), ball((30.0, 4.0, 12.0), (0.5, 0.3, 0.2)))
     remember_maps(scene, STYLE, maps())
     camera = scene.frames[0].cameras["ahead"]
-    look = look_of(scene, STYLE)
+    look = scene_style_of(scene, STYLE)
     rows = look.on(scene.parts_for(camera))[0].color_rows
     assert rows is not None and rows[-2:].tolist() == [LEVELS, 0] and not rows[:-2].any()
     fused = render_view(scene, camera, Recipe(style=STYLE))

@@ -12,7 +12,7 @@ from augment.dataset import SceneDataset
 from augment.effects.snow.snow import snow_layers_of
 from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import CLASSES, StyleMaps
-from augment.effects.style.style import SceneStyle, look_of, remember_maps, style_maps
+from augment.effects.style.style import SceneStyle, remember_maps, scene_style_of, style_maps
 from augment.plan import make_plan
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
@@ -141,7 +141,7 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     maps = known_maps(scene)
     recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
     plan = make_plan(recipe, scene)
-    look = look_of(scene, STYLE)
+    look = scene_style_of(scene, STYLE)
     styled, plain = snow_layers_of(scene, plan.snow, look), snow_layers_of(scene, plan.snow)
     parts = look.on(styled.parts_for(scene, camera_of(scene)))
     assert any(part.is_snow for part in parts)
@@ -166,11 +166,11 @@ def test_covers_of_two_styles_are_kept_beside_each_other(scene):
     for style in (STYLE, other):
         known_maps(scene, style)
     placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).snow
-    first = snow_layers_of(scene, placed, look_of(scene, STYLE))
-    second = snow_layers_of(scene, placed, look_of(scene, other))
+    first = snow_layers_of(scene, placed, scene_style_of(scene, STYLE))
+    second = snow_layers_of(scene, placed, scene_style_of(scene, other))
     assert first is not second
-    assert snow_layers_of(scene, placed, look_of(scene, STYLE)) is first
-    assert snow_layers_of(scene, placed, look_of(scene, other)) is second
+    assert snow_layers_of(scene, placed, scene_style_of(scene, STYLE)) is first
+    assert snow_layers_of(scene, placed, scene_style_of(scene, other)) is second
 
 
 def test_water_mirrors_the_styled_sky(scene):

@@ -66,6 +66,7 @@ def test_blends_are_those_of_the_definition():
     assert counted["entries"] <= int(lengths.sum()) and counted["used"] <= len(gaussians)
 
 
+@pytest.mark.long
 def test_the_floor_of_a_frame_whose_bytes_are_known_and_gsplat_beside_ours(monkeypatch):
     module = types.ModuleType("gsplat")
     module.__spec__ = importlib.machinery.ModuleSpec("gsplat", None)

@@ -566,6 +566,7 @@ def real_fit(recording, out, before_step=lambda step: None):
         return fit_scene(options, progress=False)
 
 
+@pytest.mark.long
 def test_a_recording_is_fitted_and_interruptions_change_no_bit(recording, tmp_path):
     whole = real_fit(recording, tmp_path / "whole")
     assert whole.code == 0

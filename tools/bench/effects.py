@@ -163,13 +163,15 @@ def cost_tables(
     camera = water_camera(scene, case.width, case.height)
     rows, stages = [], {}
     for name, (recipe, clean) in tqdm(cases.items(), "frames", leave=False):
-        seconds, laps = time_frames(scene, camera, {"effect": recipe, "clean": clean}, repeats)
+        seconds, stage_times = time_frames(
+            scene, camera, {"effect": recipe, "clean": clean}, repeats
+        )
         ratio = spread_ratio(seconds["effect"], seconds["clean"]).values()
         clean_ms, effect_ms = median_ms(seconds["clean"]), median_ms(seconds["effect"])
         rows.append([name, clean_ms, effect_ms, *ratio])
         if name in staged:
-            stages.setdefault("clean", {**laps["clean"], "whole": clean_ms})
-            stages[name] = {**laps["effect"], "whole": effect_ms}
+            stages.setdefault("clean", {**stage_times["clean"], "whole": clean_ms})
+            stages[name] = {**stage_times["effect"], "whole": effect_ms}
     names = dict.fromkeys(stage for each in stages.values() for stage in each if stage != "whole")
     shown = [stage for stage in names if any(each.get(stage, 0) >= 0.1 for each in stages.values())]
     by_stage = [[s, *(each.get(s) for each in stages.values())] for s in (*shown, "whole")]
@@ -191,18 +193,18 @@ def time_frames(
     scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], repeats: int
 ) -> tuple[dict[str, list[float]], dict[str, dict[str, float]]]:
     """Seconds of each recipe's frames as floats, and medians of their stages, milliseconds."""
-    laps: dict[str, list[dict[str, float]]] = {name: [] for name in recipes}
+    stage_times: dict[str, list[dict[str, float]]] = {name: [] for name in recipes}
 
     def frame(name: str, plan: Plan) -> None:
         with stopwatch() as seconds:
             render_buffers(scene, camera, plan)
-        laps[name].append(seconds)
+        stage_times[name].append(seconds)
 
     plans = {name: make_plan(recipe, scene) for name, recipe in recipes.items()}
     seconds = rounds({n: functools.partial(frame, n, plan) for n, plan in plans.items()}, repeats)
     return seconds, {
         name: {stage: median_ms([lap.get(stage, 0.0) for lap in each[1:]]) for stage in each[-1]}
-        for name, each in laps.items()
+        for name, each in stage_times.items()
     }
 
 

@@ -616,12 +616,12 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
     ladders = {path: useful(each)[::-1] for path, each in costs.items()}
     flips = {path: {cost.value: cost.flip for cost in each} for path, each in costs.items()}
 
-    def least_ms(path: str) -> float:
+    def min_ms(path: str) -> float:
         """Of the values that are within the bound alone."""
         return min(cost.ms for cost in ladders[path] if cost.flip <= bound)
 
     chosen = within_flip(
-        {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=least_ms)},
+        {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=min_ms)},
         bound,
         lambda path, value: flips[path][value],
         lambda settings: whole_flip(rows, settings) > bound,

@@ -158,7 +158,7 @@ def _store_three(pointer, values, mask):
 # ---- Which crystals throw the sun into the eye ---------------------------------------------------
 
 _FARTHEST_GLINT_M = tl.constexpr(near_camera.FARTHEST_M)
-_LEAST = tl.constexpr(near_camera.LEAST)
+_MIN_OPACITY = tl.constexpr(near_camera.MIN_OPACITY)
 _LOBE = tl.constexpr(1 - math.cos(math.radians(near_camera.LOBE_DEG)))
 
 
@@ -191,7 +191,7 @@ def find_glints(
     off = (1.0 - dot(half, three_where(mirrors, inside)) / length) / _LOBE  # 1 at the lobe's rim
     power = tl.load(view + 9) * tl.sqrt(tl.maximum(1.0 - off, 0.0))
     power *= 1.0 - distance / _FARTHEST_GLINT_M
-    shown = inside & (power > _LEAST)
+    shown = inside & (power > _MIN_OPACITY)
 
     room = tl.minimum(count, MAX_GLINTS)
     total = tl.sum(shown.to(tl.int32), 0)

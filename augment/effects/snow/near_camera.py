@@ -157,7 +157,7 @@ def _arrays(gaussians: Gaussians, slopes: Tensor | None) -> tuple[np.ndarray, ..
 
 FARTHEST_M = 15.0  # from the camera: glints fade until there
 LOBE_DEG = 9.0  # how far a mirror may be off what throws the sun at the camera
-LEAST = 0.02  # opacity below which a glint is none
+MIN_OPACITY = 0.02  # opacity below which a glint is none
 SIZE_M = 0.002  # standard deviation of a glint
 LIFTED = 4.0  # height over a disc's middle, in its thickness
 PER_DISC = 2  # crystals at most
@@ -193,7 +193,7 @@ class Crystals:
         aligned = (halves * self.mirrors.numpy()[near]).sum(1) / lengths
         off = (1 - aligned) / (1 - math.cos(math.radians(LOBE_DEG)))  # 1 at the lobe's rim
         power = self.strength * np.sqrt(np.maximum(1 - off, 0)) * (1 - distances / FARTHEST_M)
-        shown = power > LEAST
+        shown = power > MIN_OPACITY
         count = int(shown.sum())
         if count == 0:
             return None

@@ -338,7 +338,7 @@ _PAINT_M = 0.1  # so far beyond its own splats a marking may show
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # linear sRGB
 _SHARP_CELLS = 0.3  # a narrower blur leaves cells as they are
 _MIN_WEIGHT = 0.02
-_FEWEST = 50  # cells of a class, for its median to mean anything
+_MIN_CLASS_CELLS = 50  # cells of a class, for its median to mean anything
 # What differs in colour as much as in light: their brightness says half as much.
 _MOTLEY = (SemanticClass.UNKNOWN, SemanticClass.VEGETATION, SemanticClass.OTHER)
 _MARKING, _ROAD = int(SemanticClass.LANE_MARKING), int(SemanticClass.ROAD)
@@ -386,7 +386,7 @@ def relative_light(luminance: np.ndarray, classes: np.ndarray) -> np.ndarray:
     known = np.isfinite(luminance)
     for surface in np.unique(surfaces):
         here = known & (surfaces == surface)
-        usual = float(np.median(luminance[here])) if here.sum() >= _FEWEST else 0.0
+        usual = float(np.median(luminance[here])) if here.sum() >= _MIN_CLASS_CELLS else 0.0
         if usual <= 1e-4:
             continue
         ratio = luminance[here] / np.float32(usual)
@@ -523,13 +523,13 @@ def _plane_around(
     return np.linalg.lstsq(terms[used], z[used], rcond=None)[0], alike
 
 
-def _surrounds(inside: np.ndarray, alike: np.ndarray, fewest: int) -> bool:
+def _surrounds(inside: np.ndarray, alike: np.ndarray, min_cells: int) -> bool:
     """Whether cells lie in enough of the eight directions from the middle of a hole."""
     middle = [part.mean() for part in np.nonzero(inside)]
     rows, columns = np.nonzero(alike)
     angles = np.arctan2(rows - middle[0], columns - middle[1])
     octants = np.floor((angles + math.pi) * (4 / math.pi)).astype(np.int64) % 8
-    return len(np.unique(octants)) >= fewest
+    return len(np.unique(octants)) >= min_cells
 
 
 # ---- Wheel tracks: where the ego and the scene's vehicles drive ----------------------------------

@@ -82,7 +82,7 @@ def load_support(path: Path, key: str) -> SnowSupport:
     """The support of a file.
 
     Raises:
-        SceneError: there is no such file, it is damaged or no snow bed, or not that of `key`.
+        SceneError: there is no such file, it is damaged or no snow support, or not that of `key`.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -96,11 +96,11 @@ def load_support(path: Path, key: str) -> SnowSupport:
         }
         return SnowSupport(_cells(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
-        raise SceneError(f"{path}: no such file, so no snow bed to read") from error
+        raise SceneError(f"{path}: no such file, so no snow support to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise SceneError(
-            f"{path} is damaged or no snow bed ({type(error).__name__}: {error}); delete it, and "
-            f"it is made anew"
+            f"{path} is damaged or no snow support ({type(error).__name__}: {error}); delete it, "
+            f"and it is made anew"
         ) from error
 
 
@@ -108,13 +108,13 @@ def _check_about(path: Path, about: Any, key: str) -> None:
     about = about if isinstance(about, dict) else {}
     if about.get("format") != FORMAT:
         raise SceneError(
-            f"{path} is no snow bed of this version: its format is {about.get('format')!r}, "
+            f"{path} is no snow support of this version: its format is {about.get('format')!r}, "
             f"expected {FORMAT!r}; delete it, and it is made anew"
         )
     if about.get("key") != key:
         raise SceneError(
-            f"{path} is the snow bed of something else: its key is {about.get('key')!r}, expected "
-            f"{key!r}; the scene, the cameras or the settings have changed since"
+            f"{path} is the snow support of something else: its key is {about.get('key')!r}, "
+            f"expected {key!r}; the scene, the cameras or the settings have changed since"
         )
 
 

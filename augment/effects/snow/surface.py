@@ -69,13 +69,13 @@ def find_surface(
     may_carry: np.ndarray,
     *,
     max_slope_deg: float,
-    least_area_m2: float = MIN_AREA_M2,
+    min_area_m2: float = MIN_AREA_M2,
     floor_m: float | None = None,
 ) -> Surface:
     """The surface of a map, and where snow stays on it.
 
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
-    within the map and are smaller than least_area_m2 or MIN_CELLS carry nothing. floor_m: how
+    within the map and are smaller than min_area_m2 or MIN_CELLS carry nothing. floor_m: how
     high that lies which the map does not show; None for deep but in small gaps.
     """
     cell, covered = height_map.cell_m, height_map.covered.copy()
@@ -99,7 +99,7 @@ def find_surface(
     can_carry &= ~(steep & (rises > _highest_step(limit, cell)))
     step = max(STEP_M, math.tan(limit) * cell)
     sides = _compare(fitted, lowest, covered, can_carry, step)
-    least = max(MIN_CELLS, math.ceil(least_area_m2 / cell**2))
+    least = max(MIN_CELLS, math.ceil(min_area_m2 / cell**2))
     is_high = fitted - lowest > _HIGH_M
     can_carry &= ~_specks(can_carry, sides, is_high, least, max(least, round(_HIGH_M2 / cell**2)))
     filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
@@ -493,7 +493,7 @@ def find_actor_cells(
     body_only[[0, -1]] = body_only[:, [0, -1]] = False  # an edge all round, even of what is cut off
     view = dataclasses.replace(view, alpha=np.where(body_only, view.alpha, np.float32(0)))
     surface = find_surface(
-        view, body_only, max_slope_deg=limit, least_area_m2=_PATCH_M2, floor_m=float(bottom)
+        view, body_only, max_slope_deg=limit, min_area_m2=_PATCH_M2, floor_m=float(bottom)
     )
     rows, columns = np.nonzero(surface.can_carry)
     if len(rows) * cell**2 < MIN_ACTOR_AREA_M2:

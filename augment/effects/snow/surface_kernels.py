@@ -115,13 +115,13 @@ _LINE = 1e-9  # of the extents' product: cells that spread less across are in a 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def find_plane(rows, columns, heights, first_m, alike_m, fewest, used, fits):
+def find_plane(rows, columns, heights, first_m, alike_m, min_cells, used, fits):
     """Slopes per column and row of the plane of most of the cells, NaN where there is none.
 
     rows, columns: int64 [P]. heights: float64 [P]. Cells within first_m of the median of the
-    heights are taken at first, then, round by round, those within alike_m of the last plane; there
-    must be `fewest` of them, not in a line. used, fits: bool [P], what the last plane was fitted to
-    and what lies in it.
+    heights are taken at first, then, round by round, those within alike_m of the last plane: at
+    least `min_cells` of them, not in a line. used, fits: bool [P], what the last plane was fitted
+    to and what lies in it.
     """
     median = np.median(heights)
     for p in range(len(heights)):
@@ -133,7 +133,7 @@ def find_plane(rows, columns, heights, first_m, alike_m, fewest, used, fits):
             used[p] = fits[p]
             if used[p]:
                 n, x, y, z = n + 1.0, x + columns[p], y + rows[p], z + heights[p]
-        if n < fewest:
+        if n < min_cells:
             return math.nan, math.nan
         x, y, z = x / n, y / n, z / n
         xx = xy = yy = xz = yz = 0.0

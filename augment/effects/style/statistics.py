@@ -92,30 +92,29 @@ class Limits:
     """What a map may do.
 
     floor: standard deviation added to both sides (in quadrature), about one step of 8 bits: below
-    it lies rounding, not colour. most_gain: of any direction of colour; more shows noise and
-    banding. least_gain: of any direction; far below one, as a grey style does want grey.
-    least_contrast: of the grey axis; a constant style tints a scene, and leaves its shapes.
+    it lies rounding, not colour. max_gain: of any direction of colour; more shows noise and
+    banding. min_gain: of any direction; far below one, as a grey style does want grey.
+    min_contrast: of the grey axis; a constant style tints a scene, and leaves its shapes.
     """
 
     floor: float = 1 / 255
-    most_gain: float = 3.0
-    least_gain: float = 0.05
-    least_contrast: float = 0.4
+    max_gain: float = 3.0
+    min_gain: float = 0.05
+    min_contrast: float = 0.4
 
     def __post_init__(self) -> None:
         if not (
-            self.floor > 0
-            and 0 < self.least_gain <= self.least_contrast <= 1 <= self.most_gain < np.inf
+            self.floor > 0 and 0 < self.min_gain <= self.min_contrast <= 1 <= self.max_gain < np.inf
         ):
             raise ValueError(
-                "limits need floor > 0 and 0 < least_gain <= least_contrast <= 1 <= most_gain; "
+                "limits need floor > 0 and 0 < min_gain <= min_contrast <= 1 <= max_gain; "
                 f"got {self}"
             )
 
 
 LAND_LIMITS = Limits()
 # A sky is smooth: gains show its steps of 8 bits; and a plain sky (overcast) is a wish.
-SKY_LIMITS = Limits(most_gain=2.0, least_contrast=0.2)
+SKY_LIMITS = Limits(max_gain=2.0, min_contrast=0.2)
 
 _SMALL_SHARE, _LARGE_SHARE = 0.02, 0.15  # of a picture: where a region's own map begins and is full
 _ROOM = 2.0  # standard deviations that a limited map keeps between its mean and black or white
@@ -242,17 +241,17 @@ def _mkl_gain(content: np.ndarray, style: np.ndarray) -> np.ndarray:
 
 def _limited_channels(matrix: np.ndarray, limits: Limits) -> np.ndarray:
     """The diagonal matrix within the limits; each channel carries contrast, and keeps some."""
-    return np.diag(np.clip(np.diag(matrix), limits.least_contrast, limits.most_gain))
+    return np.diag(np.clip(np.diag(matrix), limits.min_contrast, limits.max_gain))
 
 
 def _limited(matrix: np.ndarray, limits: Limits) -> np.ndarray:
     """The symmetric matrix with its gains within the limits; itself where they are."""
     values, vectors = np.linalg.eigh(matrix)
-    if values[0] < limits.least_gain or values[-1] > limits.most_gain:
-        values = np.clip(values, limits.least_gain, limits.most_gain)
+    if values[0] < limits.min_gain or values[-1] > limits.max_gain:
+        values = np.clip(values, limits.min_gain, limits.max_gain)
         matrix = (vectors * values) @ vectors.T
         matrix = (matrix + matrix.T) / 2
-    missing = limits.least_contrast - _GREY @ matrix @ _GREY
+    missing = limits.min_contrast - _GREY @ matrix @ _GREY
     return matrix + max(missing, 0.0) * np.outer(_GREY, _GREY)
 
 

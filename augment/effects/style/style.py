@@ -182,9 +182,9 @@ def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float
     """The map with no gain above that of the closed forms; the mean colour goes where it went."""
     matrix, offset = color_map[:, :3], color_map[:, 3]
     u, gains, v = torch.linalg.svd(matrix)
-    if float(gains.max()) <= LAND_LIMITS.most_gain:
+    if float(gains.max()) <= LAND_LIMITS.max_gain:
         return color_map
-    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.most_gain)) @ v
+    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.max_gain)) @ v
     return torch.cat([tamed, (offset + (matrix - tamed) @ mean)[:, None]], 1)
 
 
@@ -336,7 +336,7 @@ class SceneStyle:
         return level_maps(self.maps), rows
 
 
-def look_of(scene: Scene, style: Style) -> SceneStyle:
+def scene_style_of(scene: Scene, style: Style) -> SceneStyle:
     """The style in the scene; remembered for as long as the scene lives and few others are asked
     for.
 

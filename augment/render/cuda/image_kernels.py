@@ -277,7 +277,7 @@ def make_images(
     rgb_out, depth_out, scene_depth_out, water_out, snow_out, semantic_out, instance_out,
     count, width, part_count, halvings,
     cx, cy, ifx, ify, fall_u, fall_v, fall_w, eye_m,
-    least_alpha, sky_class, water_class,
+    min_alpha, sky_class, water_class,
     SHOWS_WATER: tl.constexpr, IN_AIR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Every image that there is something to make of; None stands for the others.
@@ -314,7 +314,7 @@ def make_images(
         tl.store(depth_out + pixel, tl.where(covered, surface, z), here)
     if splat_ids is not None:
         splat = tl.load(splat_ids + pixel, here, -1)
-        solid = tl.load(alpha + pixel, here, 0.0) >= least_alpha
+        solid = tl.load(alpha + pixel, here, 0.0) >= min_alpha
         seen = here & solid & (splat >= 0) & ~covered
         row = parts + _part_of(splat, parts, part_count, halvings, seen) * COLUMNS
         if semantic_out is not None:
