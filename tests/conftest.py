@@ -75,7 +75,7 @@ LONG = {
     for name in (
         "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
         "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
-        "recording_flood", "render_backward", "smog_accuracy", "snow_accuracy", "trained_street",
+        "render_backward", "smog_accuracy", "snow_accuracy",
     )
 }  # fmt: skip
 

@@ -7,7 +7,6 @@ that its poses differ between the frames' and the cameras' times.
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 from collections.abc import Sequence
@@ -208,14 +207,6 @@ def write_members(root: Path, members: dict[str, bytes]) -> None:
     with zipfile.ZipFile(root / "pointcloud.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
             archive.writestr(name, data)
-
-
-def npy_of_pickle(pickled: bytes) -> bytes:
-    """A .npy file without axes whose only object comes from a pickle."""
-    file = io.BytesIO()
-    header = {"descr": "|O", "fortran_order": False, "shape": ()}
-    np.lib.format.write_array_header_1_0(file, header)
-    return file.getvalue() + pickled
 
 
 def track_row(facts: Facts, found: StreetObject, number: int, *, speed: bool = True) -> str:

@@ -115,14 +115,6 @@ def test_the_newest_checkpoint_is_taken_where_none_is_final(numbers):
         open_drivestudio(file, {"checkpoint": "checkpoint_15000.pth"})
 
 
-class _Malicious:
-    def __init__(self, path: str) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
-
-
 def put(model: str, name: str, value):
     def change(content):
         content["models"][model][name] = value

@@ -303,11 +303,6 @@ def test_weights_in_a_point_cloud_show_the_same_without_what_they_lack(
     assert by_file.name == "run" and by_file.made_by["iteration"] == 50000
 
 
-def scene_time(scene: Scene, frame: int) -> torch.Tensor:
-    stamp = scene.frame(frame).cameras["FRONT_LEFT"].timestamp_ns
-    return scene.actors[0].track.pose_at(stamp)
-
-
 def test_what_a_scene_knows(tmp_path: Path, drive: Facts) -> None:
     model = saved(tmp_path, drive, raw_model(drive))
     scene = open_scene(str(model))

@@ -83,6 +83,7 @@ def test_posed_parts_and_the_mirrored_eye(pose):
     assert_images_close(actual.rgb, expected.rgb, p999=2e-3, max_flips=4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keep", ["above", "below"])
 def test_a_clip_that_cuts_nothing_changes_no_bit(keep):
     gaussians, camera = random_gaussians(300), camera_ahead()

@@ -153,6 +153,7 @@ def test_a_flooded_view_stays_on_the_gpu_and_is_the_cpu_s(monkeypatch, reflectio
         same_picture(there, here, 0.05 if reflection == "screen_space" else 0.01)
 
 
+@pytest.mark.long
 def test_a_view_from_under_the_water_stays_on_the_gpu(monkeypatch):
     view, water = camera(z=-1.3, pitch=-0.3), medium("sky", "still")
     here = flooded("cpu", view, water, LAYERED, deferred=False)

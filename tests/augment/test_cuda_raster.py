@@ -203,6 +203,7 @@ def test_blending_random_splats(size):
     assert_agrees(blend_alone(in_float64(parts), camera), expected)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [0.25, 0.01, 1e-6])
 def test_a_pixel_is_finished_at_the_stop(stop):
     """Layers over layers; ids, depths and sums end where the definition's do."""
@@ -213,6 +214,7 @@ def test_a_pixel_is_finished_at_the_stop(stop):
     assert_agrees(blend_alone(in_float64(parts), camera, settings=settings), expected)
 
 
+@pytest.mark.long
 def test_no_pixel_is_lost_to_the_look_at_blocks():
     """Thin splats in all directions, whose ellipses graze blocks: every pixel that the definition
     gives them gets its share.
@@ -293,6 +295,7 @@ def check_stored_render(shared_dir, name: str, mode: str) -> None:
         assert_images_close(relative, expected / expected.clamp_min(1e-3), p999=1e-5, max_flips=5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "settings",
     [
@@ -308,6 +311,7 @@ def test_settings(settings):
     assert_matches_definition(parts, camera_ahead(25, 19, 20.0), settings)
 
 
+@pytest.mark.long
 def test_all_kinds_of_parts():
     """A street, an actor, snow lit pixel by pixel, splats under colour maps; seen through smog."""
     street, actor = random_gaussians(40, size=0.4), random_gaussians(20, seed=1, sh_degree=1)
@@ -324,6 +328,7 @@ def test_all_kinds_of_parts():
     assert_matches_definition(parts, camera_ahead(17, 13, 14.0), smog=hard_scenes.SMOGS["layered"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("clip", "is_orthographic"),
     [

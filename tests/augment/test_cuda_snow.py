@@ -64,6 +64,7 @@ def test_the_gpu_sees_what_the_cpu_sees(views, shift_m, monkeypatch):
     assert (seen != expected).sum() <= 1  # a threshold may lie within float32's rounding
 
 
+@pytest.mark.long
 def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
     ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)

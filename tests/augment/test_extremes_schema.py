@@ -123,6 +123,7 @@ def test_each_number_at_its_ends_makes_a_frame_or_is_refused_in_words(field: Fie
     assert made
 
 
+@pytest.mark.long
 def test_all_numbers_at_their_lowest_and_all_at_their_highest_make_frames():
     scene = Place(nothing(), sky=3, on_street=True).scene()
     for end in (0, 1):

@@ -102,7 +102,10 @@ def test_effects_without_strength_change_no_bit_of_another_effect(effect: str, d
     assert_same_bits(render_view(scene, camera, zero), render_view(scene, camera, recipe))
 
 
-@pytest.mark.parametrize("tier", ["sky", "screen_space", "mirrored"])
+@pytest.mark.parametrize(
+    "tier",
+    ["sky", *(pytest.param(t, marks=pytest.mark.long) for t in ("screen_space", "mirrored"))],
+)
 def test_waves_without_height_are_still_water(tier: str):
     scene = Place(nothing(), sky=3, on_street=True).scene()
     camera = camera_at((0.0, 0.0, 1.2), pitch_deg=-20)

@@ -51,6 +51,7 @@ def serial(out: Path, *scenes: list[str]) -> dict[str, str]:
     return outputs(out)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cluster")
 def test_an_actor_gives_the_serial_bytes(tmp_path):
     scenes = ["fake:a?frames=1"]

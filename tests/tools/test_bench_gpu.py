@@ -127,16 +127,9 @@ def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
     result = measure(GpuCase(), timing=once(), json_file=path, in_processes=False)
     tables, sections = check_figures(result), result["facts"]["sections"]
     assert path.is_file() and sections["style"] == {"failed": "KeyError: 'style'"}
-    assert [row[-1] for title, rows in tables.items() if "Street" in title for row in rows] == [
-        True
-    ] * 4
     rows = {row[0]: row for row in tables["Figures to reach"]}
     assert rows["clean frame"][1] == 1000 and rows["clean frame"][5] == "MISSED"
     assert rows["smog in splats, over clean"][5] == "met"
-    assert rows["rgb off the CPU backend's, 99.9 %"][5] == "MISSED"
-    assert "not installed" in rows["clean frame, over gsplat's"][5]
-    assert "no GPU memory" in rows["memory of the clean frame and its scene"][5]
-    assert "KeyError" in rows["style: fold and apply to all SH"][5]
     page = tmp_path / "performance.md"
     for text in (f"# Speed\n\n{gpu.START}\nof another day\n{gpu.END}\n\nEnd.\n", ""):
         page.write_text(text)

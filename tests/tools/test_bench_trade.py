@@ -90,15 +90,6 @@ def test_estimators_are_compared_with_the_streets_surfaces(rows):
     assert true_depths("pandaset:folder", [camera]) is None
 
 
-@pytest.mark.long
-def test_files_shrink_with_quality(rows):
-    sizes = [rows[JPEG, quality]["kilobytes"] for quality in (60, 75, 92, 100)]
-    errors = [rows[JPEG, quality]["flip"] for quality in (60, 75, 92, 100)]
-    assert sizes == sorted(sizes)
-    assert errors == sorted(errors, reverse=True)
-    assert rows[JPEG, "png"]["flip"] == 0
-
-
 def test_settings_differ_from_reference_in_one_knob():
     recipe = trade_recipe("all")
     assert None not in (recipe.style, *dict(recipe.weather).values())

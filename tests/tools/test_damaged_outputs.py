@@ -116,6 +116,7 @@ def changed_notes(note: Any, rng: random.Random) -> Iterator[bytes]:
     yield from (b"{", b"[]", b"null", b"[" * 10**5)
 
 
+@pytest.mark.long
 def test_readers_refuse_changed_label_files_and_never_fail_otherwise(
     output: Path, tmp_path: Path
 ) -> None:
@@ -136,6 +137,7 @@ def test_readers_refuse_changed_label_files_and_never_fail_otherwise(
     assert found["refused"] > 12 and outcomes(out) == {"read": len(READERS)}
 
 
+@pytest.mark.long
 def test_readers_refuse_changed_calibrations_and_never_fail_otherwise(
     output: Path, tmp_path: Path
 ) -> None:

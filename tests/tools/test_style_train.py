@@ -136,6 +136,7 @@ def test_an_interrupted_training_ends_with_the_same_bytes(tmp_path, photos, monk
     assert learning[0] == learning[1]
 
 
+@pytest.mark.long
 def test_the_seed_and_the_form_decide(tmp_path, photos):
     first, second, square = (
         options_of(tmp_path / name, photos, steps=1, warm_up=0.0, **changes)
