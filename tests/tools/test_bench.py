@@ -1,9 +1,7 @@
 """The benches: how the harness measures, and one small run of each subject."""
 
-import dataclasses
 import importlib.util
 import json
-import math
 import os
 import time
 
@@ -12,22 +10,15 @@ import pytest
 import torch
 
 from augment.errors import ClimateGSError
-from augment.metrics.consistency import DepthView
 from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
 from tests.streets import SMALL_STREET, open_street
 from tools.bench import dataset, effects, fit, jobs, raster
-from tools.bench.effects import EffectCase, MaskedView, clockwise, mask_agreement
+from tools.bench.effects import EffectCase
 from tools.bench.harness import (
-    Table,
     WallClock,
-    figures,
-    format_cell,
-    machine_facts,
-    markdown,
     peak_mib_in_subprocess,
-    print_figures,
     replace_marked,
     rounds,
     run_in_subprocess,
@@ -73,24 +64,6 @@ def test_spreads_are_quantiles_and_ratios_are_taken_pair_by_pair():
     found = spread([5.0, 1.0, 2.0, 3.0, 4.0])
     assert found == {"median": 3.0, "min": 1.0, "p90": np.quantile([1, 2, 3, 4, 5], 0.9)}
     assert spread_ratio([2.0, 9.0, 8.0], [1.0, 3.0, 8.0])["median"] == 2.0
-
-
-def test_numbers_are_shown_to_three_digits():
-    cells = [None, 0.0, 0.123456, 12.345, 1234.5, 1.234e-5, 1234567, True, "x", math.inf]
-    shown = ["", "0", "0.123", "12.3", "1,234", "1.2e-05", "1,234,567", "yes", "x", "inf"]
-    assert [format_cell(cell) for cell in cells] == shown
-
-
-def test_figures_print_and_become_markdown(capsys):
-    table = Table("Frames", ("scene", "ms"), [("small", 1.234), ("large", None)], "a note")
-    result = figures("raster", [table], machine=machine_facts(), warm_up_s=2.0)
-    check_figures(result)
-    print_figures(result)
-    shown = capsys.readouterr().out
-    assert "scene    ms\nsmall  1.23\nlarge\n  a note\n" in shown
-    assert result["machine"]["processor"] in shown and result["facts"] == {"warm_up_s": 2.0}
-    lines = ["**Frames**", "| scene | ms |", "| --- | ---: |", "| small | 1.23 |"]
-    assert [line for line in markdown(result).splitlines()[1:7] if line] == lines
 
 
 def test_a_document_keeps_all_but_what_is_between_its_markers():
@@ -146,35 +119,6 @@ def test_the_random_scene_is_as_described():
     splats = project_parts([PosedGaussians(gaussians)], camera, RasterSettings())
     inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([640, 480]))).all(1)
     assert float(inside.double().mean()) == pytest.approx(1 / 1.1**2, abs=0.01)
-
-
-def test_neighbours_go_once_around():
-    ring = ["front", "front_right", "right", "back", "left", "front_left"]
-    cameras = open_street().frames[0].cameras
-    assert clockwise(cameras) == list(zip(ring, [*ring[1:], ring[0]], strict=True))
-
-
-def test_views_agree_with_themselves_and_not_with_what_is_elsewhere():
-    camera = open_street().frames[0].cameras["front"].scaled(0.1)
-    size = (camera.height, camera.width)
-    rgb = np.random.default_rng(0).uniform(0.1, 0.9, (*size, 3))
-    mask = np.zeros(size, bool)
-    mask[: size[0] // 2] = True
-
-    def agreement(rgb2, mask2, depth_m):
-        other = dataclasses.replace(camera)
-        views = {
-            camera: MaskedView(DepthView(camera, rgb, np.full(size, 10.0), np.ones(size)), mask),
-            other: MaskedView(DepthView(other, rgb2, np.full(size, depth_m), np.ones(size)), mask2),
-        }
-        return mask_agreement([("same", camera, other)], views.__getitem__)[0][1:]
-
-    points, agreeing, worst, rms = agreement(rgb, mask, 10.0)
-    assert points > 0.9 * mask.size and agreeing == worst == 1
-    assert rms == pytest.approx(0, abs=1e-6)
-    assert agreement(rgb + 0.1, mask, 10.0)[3] == pytest.approx(25.5)
-    assert agreement(rgb, ~mask, 10.0)[1:] == [0, 0, None]
-    assert agreement(rgb, mask, 11.0) == [0, None, None, None]
 
 
 # ---- subjects -----------------------------------------------------------------------------------
