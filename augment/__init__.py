@@ -25,7 +25,7 @@ _PUBLIC = {
     "augment.semantics": ("SemanticClass",),
     "augment.sky": ("ConstantSky", "CubemapSky", "LatLongSky"),
     "augment.files.ply": ("read_splats", "write_ply", "write_splat"),
-    "augment.effects.smog": ("SmogMedium",),
+    "augment.render.fog": ("Fog",),
 }
 _HOMES = {name: module for module, names in _PUBLIC.items() for name in names}
 

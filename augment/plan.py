@@ -20,7 +20,6 @@ from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT
 from augment.effects.flood.water_plane import mirrored_camera, plane_window
 from augment.effects.flood.waves import make_waves
-from augment.effects.smog import SmogMedium
 from augment.effects.snow.near_camera import SIZE_M, Layer, SnowLayers
 from augment.effects.snow.snow import PlacedSnow, snow_layers_of
 from augment.effects.style.style import scene_style_of
@@ -32,11 +31,12 @@ from augment.render.buffers import (
     AUTO,
     DEPTH_ESTIMATORS,
     EXPECTED_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
 )
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
+from augment.render.fog import Fog
 from augment.scene import Actor, Gaussians, Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe
@@ -58,7 +58,7 @@ def place_style(recipe: Recipe) -> tuple[Style | None, str]:
     return style, f"{style.method} from {source} at strength {style.strength:g}"
 
 
-def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
+def place_smog(recipe: Recipe, scene: Scene) -> tuple[Fog | None, str]:
     """The recipe's smog in the scene's heights, or None where it would change nothing; and why."""
     smog = recipe.weather.smog
     if smog is None:
@@ -78,7 +78,7 @@ def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
         reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
     if not scene.has_metric_scale:
         reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
-    return SmogMedium(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
+    return Fog(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
 
 
 def place_flood(recipe: Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
@@ -199,8 +199,8 @@ class Plan:
 
     settings: RasterSettings
     buffers: frozenset[str]
-    smog_in_splats: SmogMedium | None
-    smog_on_buffers: SmogMedium | None
+    smog_in_splats: Fog | None
+    smog_on_buffers: Fog | None
     depth_buffer: str | None
     semantic: bool
     instance: bool
@@ -217,7 +217,7 @@ class Plan:
     styles_picture: bool = False
 
     @property
-    def smog(self) -> SmogMedium | None:
+    def smog(self) -> Fog | None:
         """The smog in front of the sky, whichever way it reaches the splats."""
         return self.smog_in_splats or self.smog_on_buffers
 
@@ -266,7 +266,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         without_snow, bare_buffers = {RGB, ALPHA}, for_images
     if (smog and not per_gaussian) or (finds_boxes and depth_buffer not in without_snow):
         without_snow.add(EXPECTED_DEPTH)
-    buffers = without_snow | {SNOW} if snow is not None else set(without_snow)
+    buffers = without_snow | {OVERLAY} if snow is not None else set(without_snow)
     settings = RasterSettings(
         near_m=recipe.render.near_m,
         alpha_max=recipe.render.alpha_max,
@@ -325,13 +325,13 @@ def _style_step(how: str, style: Style | None, chosen: bool, reason: str) -> Ste
     return Step(f"style {how}", style is not None and chosen, reason)
 
 
-def _smog_step(how: str, smog: SmogMedium | None, chosen: bool, reason: str) -> Step:
+def _smog_step(how: str, smog: Fog | None, chosen: bool, reason: str) -> Step:
     if smog is not None and not chosen:
         reason = "weather.smog.model chooses the other way"
     return Step(f"smog {how}", smog is not None and chosen, reason)
 
 
-def _sky_step(smog: SmogMedium | None) -> Step:
+def _sky_step(smog: Fog | None) -> Step:
     if smog is None:
         return Step("sky", True, "sampled behind the splats")
     if smog.scale_height_m is None:

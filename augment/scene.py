@@ -351,7 +351,8 @@ class PosedGaussians:
     """Gaussians placed in the world: what a rasteriser takes, so that nothing is concatenated.
 
     world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
-    1 + the actor's index otherwise. is_snow: whether they are snow, which the buffer "snow" counts.
+    1 + the actor's index otherwise. is_overlay: whether they lie on
+    the scene, as snow does: the buffer "overlay" counts them, and styles leave their colours.
     shading: None for splats of one colour each. color_maps [C, 3, 4]: of what every splat shows,
     c' = max(M[:, :3] @ c + M[:, 3], 0): the map in the row of color_rows int16 [N], without them of
     its class, the first where there is none such; None leaves the colours. A part has either
@@ -361,7 +362,7 @@ class PosedGaussians:
     gaussians: Gaussians
     world_from_part: Float[Tensor, "4 4"] | None = None
     instance_id: int = 0
-    is_snow: bool = False
+    is_overlay: bool = False
     shading: SplatShading | None = None
     color_maps: Float[Tensor, "C 3 4"] | None = None
     color_rows: Int16[Tensor, "N"] | None = None

@@ -13,12 +13,12 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.effects.flood.water_plane import plane_depth
-from augment.effects.smog import SmogMedium, fog_raster
 from augment.effects.style.style import scene_style_of
 from augment.jobs.processes import choose_backend
 from augment.plan import Plan, ViewPlan, make_plan, plan_view, snow_layers_for
 from augment.render.buffers import AUTO, CUDA, EXPECTED_DEPTH, RenderOutput, kernels_for
 from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.fog import Fog, fog_raster
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
@@ -90,7 +90,7 @@ class SmoggyView:
     water_level_z_m: of the flood, scene world; None where none is drawn.
     """
 
-    medium: SmogMedium | None
+    medium: Fog | None
     surface_depth_m: np.ndarray | None
     water_level_z_m: float | None
 
@@ -362,9 +362,9 @@ def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) ->
 
 def _snow_mask(raster: RenderOutput, water: Tensor | None) -> Tensor | None:
     """Where snow makes up half of the pixel or more, and not behind water."""
-    if raster.snow is None:
+    if raster.overlay is None:
         return None
-    is_shown = raster.snow >= SURFACE_ALPHA
+    is_shown = raster.overlay >= SURFACE_ALPHA
     return is_shown if water is None else is_shown & ~water
 
 
@@ -401,7 +401,7 @@ def _without_water(
             camera,
             buffers=buffers,
             settings=plan.settings,
-            smog=plan.smog_in_splats,
+            fog=plan.smog_in_splats,
             backend=backend,
         )
     assert raster.rgb is not None and raster.alpha is not None
@@ -411,7 +411,7 @@ def _without_water(
             rgb = fog_raster(raster, camera, plan.smog_on_buffers, backend=backend)
     uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
     with timed("airlight behind the splats" if uniform else "sky"):
-        rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, backend=backend)
+        rgb = composite_sky(rgb, raster.alpha, camera, sky, fog=plan.smog, backend=backend)
     return rgb, raster
 
 

@@ -68,8 +68,8 @@ def kernels_for(backend: str, *images: Tensor | None) -> str:
 
 
 RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH = "rgb", "alpha", "expected_depth", "median_depth"
-SPLAT_IDS, MODE_DEPTH, SNOW = "splat_ids", "mode_depth", "snow"
-BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW)
+SPLAT_IDS, MODE_DEPTH, OVERLAY = "splat_ids", "mode_depth", "overlay"
+BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, OVERLAY)
 # Depth estimators by the names that recipes and placement give them.
 DEPTH_ESTIMATORS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}
 DIFFERENTIABLE = frozenset({RGB, ALPHA, EXPECTED_DEPTH})  # by every backend that has gradients
@@ -86,8 +86,8 @@ class RenderOutput:
     where none does. splat_ids: index of the splat with the largest weight, counted through the
     parts in order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of
     the heaviest cluster of depths along the ray (augment.render.mode_depth), metres; 0 where
-    nothing was hit; z is that of expected_depth. snow: sum of weights of the splats that are snow,
-    in [0, alpha].
+    nothing was hit; z is that of expected_depth. overlay: sum of weights of the splats
+    of parts that lie on the scene (PosedGaussians.is_overlay), in [0, alpha].
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None
@@ -96,4 +96,4 @@ class RenderOutput:
     median_depth: Float[Tensor, "H W"] | None = None
     splat_ids: Int32[Tensor, "H W"] | None = None
     mode_depth: Float[Tensor, "H W"] | None = None
-    snow: Float[Tensor, "H W"] | None = None
+    overlay: Float[Tensor, "H W"] | None = None

@@ -1,6 +1,6 @@
 """The sky behind the splats, a camera's colour map, and the step to 8 bits: the torch definition.
 
-out = rgb + (1 - alpha) sky(direction),   sky seen through the smog that lies before it
+out = rgb + (1 - alpha) sky(direction),   sky seen through the fog that lies before it
 """
 
 from __future__ import annotations
@@ -11,31 +11,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.smog import (
-    SmogMedium,
-    blend_airlight,
-    sky_optical_depth,
-    vertical_optical_depth,
-)
 from augment.render import composite_kernels
 from augment.render.buffers import AUTO, CPU, CUDA, REFERENCE, kernels_for
+from augment.render.fog import Fog, blend_airlight, sky_optical_depth, vertical_optical_depth
 from augment.render.threads import kernel_threads
 from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
 
 ROWS = 32  # image rows a thread takes at a time
 
 
-def sky_behind(sky: Sky, smog: SmogMedium | None) -> tuple[Sky, SmogMedium | None]:
-    """What has to be evaluated per pixel: the sky and the smog before it, or less.
+def sky_behind(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
+    """What has to be evaluated per pixel: the sky and the fog before it, or less.
 
-    Uniform smog hides the sky altogether (infinite distance), so only its colour is left; smog
+    Uniform fog hides the sky altogether (infinite distance), so only its colour is left; fog
     without density changes nothing.
     """
-    if smog is None or smog.sigma_per_m == 0:
+    if fog is None or fog.sigma_per_m == 0:
         return sky, None
-    if smog.scale_height_m is None:
-        return ConstantSky(torch.tensor(smog.rgb, dtype=torch.float32)), None
-    return sky, smog
+    if fog.scale_height_m is None:
+        return ConstantSky(torch.tensor(fog.rgb, dtype=torch.float32)), None
+    return sky, fog
 
 
 def composite_sky(
@@ -44,18 +39,18 @@ def composite_sky(
     camera: Camera,
     sky: Sky,
     *,
-    smog: SmogMedium | None = None,
+    fog: Fog | None = None,
     backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
     """The finished display-encoded image, not clamped.
 
-    smog: with it the sky is seen through the smog up to infinity. backend: with kernels, cube maps
+    fog: with it the sky is seen through the fog up to infinity. backend: with kernels, cube maps
     (on a GPU, single colours too) in float32 go through them, equal to this definition within float
     rounding, unless gradients are recorded, which they have none of.
     """
-    sky, smog = sky_behind(sky, smog)
+    sky, fog = sky_behind(sky, fog)
     kernels = kernels_for(backend, rgb, alpha)
-    if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
+    if isinstance(sky, ConstantSky) and fog is None:  # no direction matters
         if kernels == CUDA:
             from augment.render.cuda import images as cuda_images
 
@@ -64,31 +59,31 @@ def composite_sky(
     if camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
-            f"direction only; composite a ConstantSky, without layered smog"
+            f"direction only; composite a ConstantSky, without layered fog"
         )
     if isinstance(sky, CubemapSky) and kernels == CPU:
-        return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
+        return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
     if isinstance(sky, CubemapSky) and kernels == CUDA:
         from augment.render.cuda import images as cuda_images
 
-        return cuda_images.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
+        return cuda_images.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
-    if smog is not None:
+    if fog is not None:
         slope = directions[..., 2] / directions.norm(dim=-1)
-        tau = sky_optical_depth(smog, slope, float(camera.centre[2]))
-        color = blend_airlight(color, tau, smog)
+        tau = sky_optical_depth(fog, slope, float(camera.centre[2]))
+        color = blend_airlight(color, tau, fog)
     return rgb + (1 - alpha)[..., None] * color
 
 
 def _composite_cubemap(
-    rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, smog: SmogMedium | None
+    rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, fog: Fog | None
 ) -> Tensor:
     out = np.empty((camera.height, camera.width, 3), np.float32)
     strength, airlight = -1.0, (0.0, 0.0, 0.0)
-    if smog is not None:
-        strength = vertical_optical_depth(smog, float(camera.centre[2]))
-        airlight = smog.rgb
+    if fog is not None:
+        strength = vertical_optical_depth(fog, float(camera.centre[2]))
+        airlight = fog.rgb
     with kernel_threads(ROWS):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(),

@@ -21,8 +21,8 @@ RUN = 4096  # pixels of a piece of work
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def renormalise_alpha(alpha, rgb, snow, least):
-    """alpha, snow: float32 [P]. rgb: [3 P]. rgb and snow may be empty. least: alpha of finished."""
+def renormalise_alpha(alpha, rgb, overlay, least):
+    """alpha, overlay: float32 [P]. rgb: [3 P]. rgb, overlay: may be empty. least: of finished."""
     one = np.float32(1)
     for run in numba.prange((alpha.size + RUN - 1) // RUN):
         for pixel in range(run * RUN, min((run + 1) * RUN, alpha.size)):
@@ -33,13 +33,13 @@ def renormalise_alpha(alpha, rgb, snow, least):
                     rgb[3 * pixel] *= scale
                     rgb[3 * pixel + 1] *= scale
                     rgb[3 * pixel + 2] *= scale
-                if snow.size > 0:
-                    snow[pixel] *= scale
+                if overlay.size > 0:
+                    overlay[pixel] *= scale
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
-    """out = rgb + (1 - alpha) sky of a cube map, through smog where strength >= 0.
+    """out = rgb + (1 - alpha) sky of a cube map, through fog where strength >= 0.
 
     faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border). rotation:
     world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.

@@ -99,7 +99,7 @@ STRIP = TILE_H * LANES  # pixels of a strip
 RECORD = 16
 MEAN_X, MEAN_Y, LEAN_X, SHARP_X, FALL_Y, LOG_OPACITY = 0, 1, 2, 3, 4, 5
 RADIUS_Y, FALL_X, LEAN_Y, BLUNT_Y, DEPTH = 6, 7, 8, 9, 10
-SPLAT_ID, RED, GREEN, BLUE, IS_SNOW = 11, 12, 13, 14, 15
+SPLAT_ID, RED, GREEN, BLUE, IS_OVERLAY = 11, 12, 13, 14, 15
 
 # The cut of a splat that is clipped at a height: CUT float32. With x and y from its mean, pixels,
 # the kept share of its alpha is clamp(C_AT + C_X x + C_Y y, 0, 1), and its surface's depth is its
@@ -115,7 +115,7 @@ V_FOCAL, V_CENTRE, V_SIZE = 15, 17, 19  # pixels, x and y each
 V_LOW, V_HIGH = 21, 23  # limits of x/z and y/z in the Jacobian
 V_GAIN = 25  # most that a semi-axis of one metre can reach at z = 1, pixels, in x and y
 V_NEAR, V_BLUR, V_ALPHA_MIN, V_LOG_CUT = 27, 28, 29, 30
-V_SIGMA, V_AIRLIGHT = 31, 32  # smog: extinction, and 3 of display-encoded colour
+V_SIGMA, V_AIRLIGHT = 31, 32  # fog: extinction, and 3 of display-encoded colour
 V_EYE_HEIGHT, V_UP = 35, 36  # camera and part axes upwards, in scale heights: 1 and 3
 V_CLIP_EYE = 39  # height of the camera on the kept side of the clip's plane, metres
 V_CLIP_PART, V_CLIP_CAMERA = 40, 43  # towards that side, in the part's axes and the camera's
@@ -124,7 +124,7 @@ V_CLIP_REACH = 48  # metres from the clip's plane beyond which nothing need be d
 V_CLIP_FALL = 49  # times inverse^2: how the cut's slope follows the surface's
 V_CLIP_LONGEST = 50  # most that a surface's depth may grow or shrink
 V_PARALLEL = 51  # 1 where rays are parallel, else 0
-V_SNOW = 52  # 1 where the part is snow, else 0
+V_OVERLAY = 52  # 1 where the part is an overlay, else 0
 V_SUN, V_WRAP = 53, 56  # towards the light, in the camera's axes; how far it is wrapped
 V_LIT = 57  # 1 where the part is lit pixel by pixel, else 0
 V_MAPS = 58  # how many colour maps the part has
@@ -139,7 +139,7 @@ ADDRESSES = 8
 MAP = 12  # numbers of a colour map
 
 # How to project: int64 each.
-M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions
+M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_FOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions
 M_CLIP, M_LIGHT = 4, 5
 MODES = 6
-NO_SMOG, UNIFORM_SMOG, LAYERED_SMOG = 0, 1, 2
+NO_FOG, UNIFORM_FOG, LAYERED_FOG = 0, 1, 2

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.render import layout
 from augment.render.constants import (
     ALPHA_MIN,
@@ -18,6 +17,7 @@ from augment.render.constants import (
     TAN_FOV_MARGIN,
     RasterSettings,
 )
+from augment.render.fog import Fog
 from augment.render.layout import LONGEST, HeightClip
 from augment.render.sh import MAX_DEGREE
 from augment.scene import PosedGaussians
@@ -30,13 +30,13 @@ def views_of(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None,
 ) -> np.ndarray:
-    """float32 [P, VIEW] of parts as they are: posed, snow or not, lit, with their colour maps."""
+    """float32 [P, VIEW] of parts as they are: posed, lit, with their colour maps."""
     poses = part_poses([part.world_from_part for part in parts])
-    views = part_views(poses, camera, settings, smog, clip)
-    views[:, layout.V_SNOW] = [part.is_snow for part in parts]
+    views = part_views(poses, camera, settings, fog, clip)
+    views[:, layout.V_OVERLAY] = [part.is_overlay for part in parts]
     views[:, layout.V_MAPS] = [_map_count(part) for part in parts]
     for view, part, pose in zip(views, parts, poses, strict=True):
         if part.shading is not None:
@@ -57,10 +57,10 @@ def part_views(
     poses: np.ndarray,
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
 ) -> np.ndarray:
-    """The float32 numbers of every part's view, [P, VIEW], formed in float64; none is snow.
+    """The float32 numbers of every part's view, [P, VIEW], formed in float64; none is an overlay.
 
     poses: world_from_part, float64 [P, 4, 4].
     """
@@ -86,13 +86,13 @@ def part_views(
     views[:, layout.V_GAIN :][:, :2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
     views[:, layout.V_NEAR], views[:, layout.V_BLUR] = settings.near_m, COV2D_BLUR
     views[:, layout.V_ALPHA_MIN], views[:, layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
-    if smog is not None:
-        views[:, layout.V_SIGMA] = smog.sigma_per_m
-        views[:, layout.V_AIRLIGHT :][:, :3] = smog.rgb
-        if smog.scale_height_m is not None:
-            above = float(camera.centre[2]) - smog.base_z_m
-            views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
-            views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
+    if fog is not None:
+        views[:, layout.V_SIGMA] = fog.sigma_per_m
+        views[:, layout.V_AIRLIGHT :][:, :3] = fog.rgb
+        if fog.scale_height_m is not None:
+            above = float(camera.centre[2]) - fog.base_z_m
+            views[:, layout.V_EYE_HEIGHT] = above / fog.scale_height_m
+            views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / fog.scale_height_m
     views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
@@ -118,11 +118,7 @@ def part_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
 
 
 def raster_modes(
-    settings: RasterSettings,
-    smog: SmogMedium | None,
-    clip: HeightClip | None = None,
-    *,
-    with_color: bool,
+    settings: RasterSettings, fog: Fog | None, clip: HeightClip | None = None, *, with_color: bool
 ) -> np.ndarray:
     """The kernels' modes, int64."""
     degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
@@ -131,7 +127,7 @@ def raster_modes(
     modes[layout.M_FUNCTIONS] = (degree + 1) ** 2
     modes[layout.M_ANTIALIASED] = settings.antialiased
     modes[layout.M_CLIP] = clip is not None
-    if smog is not None:
-        is_uniform = smog.scale_height_m is None
-        modes[layout.M_SMOG] = layout.UNIFORM_SMOG if is_uniform else layout.LAYERED_SMOG
+    if fog is not None:
+        is_uniform = fog.scale_height_m is None
+        modes[layout.M_FOG] = layout.UNIFORM_FOG if is_uniform else layout.LAYERED_FOG
     return modes

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
 from augment.render.buffers import (
     ALPHA,
@@ -31,6 +30,7 @@ from augment.render.buffers import (
     kernels_for,
 )
 from augment.render.constants import MAX_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.fog import Fog
 from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
 from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
@@ -43,14 +43,14 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
 
     Behind a raised transmittance stop nothing has been blended. Left transparent, that share of a
     pixel would show the sky through every wall; instead what the pixel has blended stands for it:
-    rgb and snow are divided by alpha, which becomes 1. (1e-4, the default, is less than 8 bits
+    rgb and overlay are divided by alpha, which becomes 1. (1e-4, the default, is less than 8 bits
     show, and gsplat leaves it transparent, too.)
 
     backend: with kernels, float32 without gradients goes through them, equal within float rounding.
     """
     alpha = output.alpha
     assert alpha is not None
-    images = {name: getattr(output, name) for name in ("rgb", "snow")}
+    images = {name: getattr(output, name) for name in ("rgb", "overlay")}
     images = {name: image for name, image in images.items() if image is not None}
     kernels = kernels_for(backend, alpha, *images.values())
     if kernels == CPU:
@@ -58,16 +58,16 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
         from augment.render.threads import kernel_threads
 
         flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
-        rgb, snow = (flat.get(name, np.empty(0, np.float32)) for name in ("rgb", "snow"))
+        rgb, overlay = (flat.get(name, np.empty(0, np.float32)) for name in ("rgb", "overlay"))
         with kernel_threads():
             composite_kernels.renormalise_alpha(
-                alpha.numpy().reshape(-1), rgb, snow, np.float32(1 - stop)
+                alpha.numpy().reshape(-1), rgb, overlay, np.float32(1 - stop)
             )
         return output
     if kernels == CUDA:
         from augment.render.cuda import images as cuda_images
 
-        cuda_images.renormalise_alpha(alpha, images.get("rgb"), images.get("snow"), stop)
+        cuda_images.renormalise_alpha(alpha, images.get("rgb"), images.get("overlay"), stop)
         return output
     finished = alpha >= 1 - stop
     scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
@@ -88,7 +88,7 @@ def rasterize(
     *,
     buffers: Collection[str] = (RGB, ALPHA),
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen, so sharing it is safe
-    smog: SmogMedium | None = None,
+    fog: Fog | None = None,
     clip: HeightClip | None = None,
     pixel_mask: torch.Tensor | None = None,
     backend: str = AUTO,
@@ -96,12 +96,12 @@ def rasterize(
     """Image buffers of the parts seen by the camera; the sky is not part of them.
 
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
-    through the parts in the order given. smog: fades every splat's colour towards the airlight by
+    through the parts in the order given. fog: fades every splat's colour towards the airlight by
     its own distance. clip: only what lies above, or below, a height is drawn
     (augment.render.layout).
     pixel_mask: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
-    without smog, clip, light per pixel or colour maps and where no other buffer is asked for),
+    without fog, clip, light per pixel or colour maps and where no other buffer is asked for),
     "cuda" (Triton, float32; parts may lie on either side, and are kept on the GPU as long as their
     tensors live; the buffers lie there; gradients as augment.render.cuda.backward says),
     "reference" (torch, float32 or float64, gradients of all, on the CPU), or "auto": cuda where the
@@ -113,10 +113,10 @@ def rasterize(
     """
     _check_arguments(parts, camera, buffers, settings)
     _check_places(parts, backend)
-    if smog is not None and camera.is_orthographic:
+    if fog is not None and camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
-            f"far the smog is looked through; render it without smog, or with a pinhole camera"
+            f"far the fog is looked through; render it without fog, or with a pinhole camera"
         )
     size = (camera.height, camera.width)
     if pixel_mask is not None and (
@@ -126,7 +126,7 @@ def rasterize(
             f"pixel_mask must be bool {list(size)} (the camera's size); got "
             f"{pixel_mask.dtype} {list(pixel_mask.shape)}"
         )
-    image = _Image(parts, camera, frozenset(buffers), settings, smog, clip, pixel_mask)
+    image = _Image(parts, camera, frozenset(buffers), settings, fog, clip, pixel_mask)
     chosen = _choose(image, backend)
     stop = settings.transmittance_stop
     if stop <= TRANSMITTANCE_STOP:
@@ -143,7 +143,7 @@ class _Image(NamedTuple):
     camera: Camera
     buffers: frozenset[str]
     settings: RasterSettings
-    smog: SmogMedium | None
+    fog: Fog | None
     clip: HeightClip | None
     pixel_mask: torch.Tensor | None
 
@@ -205,8 +205,8 @@ def _gradients_it_lacks(image: _Image, backend: str) -> str | None:
         return "of light per pixel"
     if any(part.color_maps is not None for part in image.parts):
         return "through colour maps"
-    if image.smog is not None:
-        return "through smog"
+    if image.fog is not None:
+        return "through fog"
     if image.clip is not None:
         return "of a clip"
     if backend == CUDA and not tracked_geometry(image.parts):

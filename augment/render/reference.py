@@ -22,15 +22,14 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium, blend_airlight, optical_depth
 from augment.geometry import rotmat_from_quat, transform_points
 from augment.render.buffers import (
     ALPHA,
     EXPECTED_DEPTH,
     MEDIAN_DEPTH,
     MODE_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
     RenderOutput,
 )
@@ -43,6 +42,7 @@ from augment.render.constants import (
     TRANSMITTANCE_STOP,
     RasterSettings,
 )
+from augment.render.fog import Fog, blend_airlight, optical_depth
 from augment.render.layout import FAR_PX, LONGEST, SHARP_PX2, HeightClip
 from augment.render.mode_depth import Clusters
 from augment.render.sh import evaluate_sh
@@ -61,8 +61,8 @@ class Splats:
 
     ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
     px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
-    and >= 0, in the smog where there is any; None where no colour was asked for. snow: 1 of those
-    that are snow, else 0. cuts: of splats
+    and >= 0, in the fog where there is any; None where no colour was asked for. overlay: 1 of those
+    of an overlay, else 0. cuts: of splats
     clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
     share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
     share per px (seen by an orthographic camera: metres per px), and the most that it may grow or
@@ -76,7 +76,7 @@ class Splats:
     dets: Float[Tensor, "M"]
     opacities: Float[Tensor, "M"]
     colors: Float[Tensor, "M 3"] | None
-    snow: Float[Tensor, "M"]
+    overlay: Float[Tensor, "M"]
     cuts: Float[Tensor, "M 6"] | None = None
     lights: Float[Tensor, "M 9"] | None = None
 
@@ -103,7 +103,7 @@ def project_parts(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None = None,
+    fog: Fog | None = None,
     clip: HeightClip | None = None,
     *,
     with_color: bool = True,
@@ -114,7 +114,7 @@ def project_parts(
     first_id = 0
     for part in parts:
         projected.append(
-            _project_part(part, first_id, camera, settings, smog, clip, with_color, any_light)
+            _project_part(part, first_id, camera, settings, fog, clip, with_color, any_light)
         )
         first_id += len(part.gaussians)
     if len(projected) == 1:
@@ -129,7 +129,7 @@ def _project_part(
     first_id: int,
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None,
     with_color: bool,
     any_light: bool,
@@ -160,7 +160,7 @@ def _project_part(
     if with_color:
         towards = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
         rows = None if part.map_rows is None else part.map_rows[index]
-        colors = _colors(gaussians, rows, towards, part, camera, settings, smog)
+        colors = _colors(gaussians, rows, towards, part, camera, settings, fog)
     splats = Splats(
         ids=index + first_id,
         depths=depths,
@@ -169,14 +169,14 @@ def _project_part(
         dets=dets,
         opacities=opacities,
         colors=colors,
-        snow=torch.full_like(depths, float(part.is_snow)),
+        overlay=torch.full_like(depths, float(part.is_overlay)),
     )
     if any_light:
         lights = splats.depths.new_zeros(len(splats), LINES)
         if part.shading is not None:
             lights = _lights(part, index, rotation, points, camera)
-            if smog is not None:
-                tau = _optical_depths(gaussians, offsets, part, camera, smog)
+            if fog is not None:
+                tau = _optical_depths(gaussians, offsets, part, camera, fog)
                 lights[:, 6:] *= torch.exp(-tau)[:, None]
         splats = dataclasses.replace(splats, lights=lights)
     if clip is not None:
@@ -316,18 +316,18 @@ def _colors(
     part: PosedGaussians,
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
 ) -> Float[Tensor, "M 3"]:
-    """max(SH + 0.5, 0), mapped, and seen through the smog. rows: of the colour maps. offsets: from
-    the eye, in the part's axes; without smog their lengths do not matter.
+    """max(SH + 0.5, 0), mapped, and seen through the fog. rows: of the colour maps. offsets: from
+    the eye, in the part's axes; without fog their lengths do not matter.
     """
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
     if part.color_maps is not None:
         colors = _mapped(colors, part.color_maps.to(colors.dtype), rows)
-    if smog is None:
+    if fog is None:
         return colors
-    return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, smog), smog)
+    return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, fog), fog)
 
 
 def _mapped(
@@ -346,15 +346,15 @@ def _optical_depths(
     offsets: Float[Tensor, "M 3"],
     part: PosedGaussians,
     camera: Camera,
-    smog: SmogMedium,
+    fog: Fog,
 ) -> Float[Tensor, "M"]:
-    """Of the smog before every splat."""
+    """Of the fog before every splat."""
     heights = None
-    if smog.scale_height_m is not None:
+    if fog.scale_height_m is not None:
         heights = gaussians.means[:, 2]
         if part.world_from_part is not None:
             heights = transform_points(part.world_from_part, gaussians.means)[:, 2]
-    return optical_depth(smog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+    return optical_depth(fog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
 
 
 def _lights(
@@ -406,7 +406,7 @@ def rasterize_reference(
     camera: Camera,
     buffers: frozenset[str],
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
 ) -> RenderOutput:
     """The image of the parts: project, order, blend. Arguments are checked by `rasterize`.
@@ -415,7 +415,7 @@ def rasterize_reference(
     threshold, transmittance stop) are taken as constant.
     """
     with_color = RGB in buffers
-    splats = project_parts(parts, camera, settings, smog, clip, with_color=with_color)
+    splats = project_parts(parts, camera, settings, fog, clip, with_color=with_color)
     splats = order_by_depth(splats)
     return blend(splats, bin_to_tiles(splats, camera), camera, buffers, settings)
 
@@ -499,7 +499,7 @@ def blend_tile(
     pixels = torch.stack([x.reshape(-1), y.reshape(-1)])  # [2, P]
     transmittance = torch.ones(TILE * TILE, dtype=dtype)
     rgb = torch.zeros(TILE * TILE, 3, dtype=dtype)
-    alpha, depth, median, snow = (torch.zeros(TILE * TILE, dtype=dtype) for _ in range(4))
+    alpha, depth, median, overlay = (torch.zeros(TILE * TILE, dtype=dtype) for _ in range(4))
     clusters = Clusters.empty(TILE * TILE, dtype)
     heaviest = torch.zeros(TILE * TILE, dtype=dtype)
     ids = torch.full((TILE * TILE,), -1, dtype=torch.int64)
@@ -510,8 +510,8 @@ def blend_tile(
             rgb = rgb + _weighted_sums(weights, near.colors)
             if near.lights is not None:
                 rgb = rgb + _shaded(near, pixels, weights, camera)
-        if SNOW in buffers:
-            snow = snow + (weights * near.snow[:, None]).sum(0)
+        if OVERLAY in buffers:
+            overlay = overlay + (weights * near.overlay[:, None]).sum(0)
         if buffers & {EXPECTED_DEPTH, MODE_DEPTH}:
             surfaces = _surface_depths(near, pixels, camera.is_orthographic)
             depth = depth + (weights * surfaces).sum(0)
@@ -538,7 +538,7 @@ def blend_tile(
         MEDIAN_DEPTH: median,
         SPLAT_IDS: ids.int(),
         MODE_DEPTH: clusters.heaviest_mode(),
-        SNOW: snow,
+        OVERLAY: overlay,
     }
     shaped = {name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers}
     return RenderOutput(**shaped)

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.smog import SmogMedium
 from augment.effects.snow.cells import OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.support import support_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
+from augment.render.fog import Fog
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
@@ -89,7 +89,7 @@ class FakeSnowy:
 
 @dataclass(frozen=True)
 class FakeSmoggy:
-    medium: SmogMedium | None
+    medium: Fog | None
     surface_depth_m: np.ndarray | None
     water_level_z_m: float | None
 
@@ -228,7 +228,7 @@ def fake_snow(camera: Camera, rng: np.random.Generator) -> dict:
 def fake_smog(camera: Camera, rng: np.random.Generator, smog: Smog) -> dict:
     """Surfaces where the boxes are."""
     depth = rng.uniform(0, 4, (camera.height, camera.width)).astype(np.float32)
-    medium = SmogMedium(smog.sigma_per_m, smog.color) if smog.sigma_per_m else None
+    medium = Fog(smog.sigma_per_m, smog.color) if smog.sigma_per_m else None
     return {"smoggy": FakeSmoggy(medium, depth, None)}
 
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.render import layout
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats
+from augment.render.fog import Fog
 from augment.render.layout import CUT, HeightClip
 from augment.render.reference import half_extents, project_parts
 from augment.render.shading import LINES
@@ -25,7 +25,7 @@ def drawn_splats(
     camera: Camera,
     settings: RasterSettings | None = None,
     clip: HeightClip | None = None,
-    smog: SmogMedium | None = None,
+    smog: Fog | None = None,
 ) -> CudaSplats:
     """The splats of the parts, computed in their own precision; NaN in rows that nobody may read.
 
@@ -53,7 +53,7 @@ def drawn_splats(
         layout.LEAN_Y: xy / xx,
         layout.BLUNT_Y: torch.sqrt(splats.dets / xx / _K),
         layout.DEPTH: splats.depths,
-        layout.IS_SNOW: splats.snow,
+        layout.IS_OVERLAY: splats.overlay,
     }
     assert splats.colors is not None
     fields |= {layout.RED + channel: splats.colors[:, channel] for channel in range(3)}

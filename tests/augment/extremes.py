@@ -501,12 +501,12 @@ def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
             if depth is not None:
                 assert bool(torch.isfinite(depth).all()), f"{name} is not finite"
                 assert bool((depth >= 0).all()), f"{name} {depth.min()}"
-        if raster.snow is not None:
+        if raster.overlay is not None:
             # Two sums of the same weights: they differ by rounding. An alpha below float32's step
             # at 1 is lost in transmittance, which thousands of splats then leave at 1.
             room = 1e-5 if recipe.render.alpha_max > 6e-8 else 1e-3
-            assert bool((raster.snow >= 0).all())
-            assert bool((raster.snow <= alpha + room).all()), "more snow than surface"
+            assert bool((raster.overlay >= 0).all())
+            assert bool((raster.overlay <= alpha + room).all()), "more snow than surface"
     if buffers.depth_m is not None:
         assert bool(torch.isfinite(buffers.depth_m).all()) and bool((buffers.depth_m >= 0).all())
 

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.geometry import rigid
 from augment.render.constants import ALPHA_MIN
+from augment.render.fog import Fog
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 
@@ -30,8 +30,8 @@ OPACITIES = np.array(
 )  # fmt: skip
 SMOGS = {
     "clear": None,
-    "uniform": SmogMedium(0.15, (0.8, 0.7, 0.5)),
-    "layered": SmogMedium(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0),
+    "uniform": Fog(0.15, (0.8, 0.7, 0.5)),
+    "layered": Fog(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0),
 }
 
 

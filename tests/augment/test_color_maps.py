@@ -5,14 +5,14 @@ import dataclasses
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
+from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, random_gaussians, random_pose
 
 CLASSES = 5
-SMOG = SmogMedium(0.2, (0.7, 0.75, 0.8), None, 0.0)
+SMOG = Fog(0.2, (0.7, 0.75, 0.8), None, 0.0)
 
 
 def some_maps(count: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
@@ -48,7 +48,7 @@ def test_the_kernel_maps_as_the_definition_does(count, smog):
         PosedGaussians(random_gaussians(100, seed=6, sh_degree=1)),
     ]
     fast, slow = (
-        rasterize(parts, camera_ahead(), smog=smog, backend=name) for name in ("cpu", "reference")
+        rasterize(parts, camera_ahead(), fog=smog, backend=name) for name in ("cpu", "reference")
     )
     assert_images_close(fast.rgb, slow.rgb, max_flips=2)
     assert_images_close(fast.alpha, slow.alpha, max_flips=2)

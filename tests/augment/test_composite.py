@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.geometry import rigid, rotmat_from_quat
 from augment.render.composite import composite_sky, map_colors, quantise, sky_behind
+from augment.render.fog import Fog
 from augment.sky import ConstantSky, CubemapSky
 
 
@@ -24,14 +24,14 @@ def cameras() -> list[Camera]:
 
 
 @pytest.mark.parametrize("camera", cameras(), ids=range(6))
-@pytest.mark.parametrize("smog", [None, SmogMedium(0.01, (0.5, 0.6, 0.7), 30.0, -2.0)])
+@pytest.mark.parametrize("smog", [None, Fog(0.01, (0.5, 0.6, 0.7), 30.0, -2.0)])
 def test_the_kernel_matches_the_definition(camera, smog):
     generator = torch.Generator().manual_seed(0)
     rgb = torch.rand(37, 61, 3, generator=generator)
     alpha = torch.rand(37, 61, generator=generator)
     sky = CubemapSky(torch.rand(6, 16, 16, 3, generator=generator))
-    fast = composite_sky(rgb, alpha, camera, sky, smog=smog)
-    slow = composite_sky(rgb, alpha, camera, sky, smog=smog, backend="reference")
+    fast = composite_sky(rgb, alpha, camera, sky, fog=smog)
+    slow = composite_sky(rgb, alpha, camera, sky, fog=smog, backend="reference")
     # Noise textures of 16 texels: float32 rounding of coordinates (1e-6) times 16 texels; a
     # pixel whose direction lies on an edge between faces may fall to either side.
     difference = (fast - slow).abs().amax(-1)
@@ -55,8 +55,8 @@ def test_a_constant_sky_needs_no_directions(monkeypatch):
     expected = rgb + (1 - alpha)[..., None] * grey
     camera, textured = cameras()[0], CubemapSky(torch.rand(6, 4, 4, 3))
     assert torch.equal(composite_sky(rgb, alpha, camera, ConstantSky(grey)), expected)
-    fog = SmogMedium(1e-3, (0.5, 0.6, 0.7))
-    assert torch.equal(composite_sky(rgb, alpha, camera, textured, smog=fog), expected)
+    fog = Fog(1e-3, (0.5, 0.6, 0.7))
+    assert torch.equal(composite_sky(rgb, alpha, camera, textured, fog=fog), expected)
 
 
 def test_gradients_pass_through_the_sky():
@@ -71,9 +71,9 @@ def test_gradients_pass_through_the_sky():
 
 def test_uniform_smog_leaves_no_sky_to_sample():
     sky = CubemapSky(torch.rand(6, 4, 4, 3))
-    airlight, remaining = sky_behind(sky, SmogMedium(1e-3, (0.5, 0.6, 0.7)))
+    airlight, remaining = sky_behind(sky, Fog(1e-3, (0.5, 0.6, 0.7)))
     assert isinstance(airlight, ConstantSky) and remaining is None
-    assert sky_behind(sky, SmogMedium(0.0, (0.5, 0.6, 0.7), 10.0)) == (sky, None)
+    assert sky_behind(sky, Fog(0.0, (0.5, 0.6, 0.7), 10.0)) == (sky, None)
     assert sky_behind(sky, None) == (sky, None)
 
 

@@ -29,11 +29,11 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import make_waves
-from augment.effects.smog import SmogMedium
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
+from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky
@@ -43,7 +43,7 @@ from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import sh_of
 
 ROAD_Z, LEVEL = -1.5, -1.1
-LAYERED, UNIFORM = (SmogMedium(0.03, (0.6, 0.6, 0.65), h, LEVEL) for h in (8.0, None))
+LAYERED, UNIFORM = (Fog(0.03, (0.6, 0.6, 0.65), h, LEVEL) for h in (8.0, None))
 
 
 @pytest.fixture(autouse=True)
@@ -111,7 +111,7 @@ def flooded(
     backend: str,
     view: Camera,
     water: FloodMedium,
-    smog: SmogMedium | None,
+    smog: Fog | None,
     *,
     deferred: bool,
     hidden_by: Gaussians | None = None,

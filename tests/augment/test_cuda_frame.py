@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium, fog_raster
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
 from augment.render.buffers import RenderOutput
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.cuda.runtime import upload
+from augment.render.fog import Fog, fog_raster
 from augment.render.rasterize import renormalise_alpha
 from augment.scene import Ground, Scene
 from augment.semantics import SemanticClass
@@ -32,8 +32,8 @@ from tests.augment import pretend_gpu
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 WIDTH, HEIGHT = 33, 21
-UNIFORM = SmogMedium(0.03, (0.5, 0.6, 0.7))
-LAYERED = SmogMedium(0.03, (0.5, 0.6, 0.7), 30.0, -2.0)
+UNIFORM = Fog(0.03, (0.5, 0.6, 0.7))
+LAYERED = Fog(0.03, (0.5, 0.6, 0.7), 30.0, -2.0)
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def images(seed: int = 0) -> RenderOutput:
     rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator) * alpha[..., None]
     depth = 200 * torch.rand(HEIGHT, WIDTH, generator=generator) ** 3
     depth[:3] = 0
-    return RenderOutput(rgb=rgb, alpha=alpha, expected_depth=depth, snow=0.7 * alpha)
+    return RenderOutput(rgb=rgb, alpha=alpha, expected_depth=depth, overlay=0.7 * alpha)
 
 
 def on_gpu(seen: RenderOutput) -> RenderOutput:
@@ -88,9 +88,9 @@ def test_the_sky_behind_the_splats(away, name, smog):
     sky = skies()[name]
     for seed in range(2 if name == "cube" else 1):
         seen, view = images(seed), camera(seed)
-        expected = composite_sky(seen.rgb, seen.alpha, view, sky, smog=smog, backend="reference")
+        expected = composite_sky(seen.rgb, seen.alpha, view, sky, fog=smog, backend="reference")
         moved = on_gpu(seen)
-        got = composite_sky(moved.rgb, moved.alpha, view, sky, smog=smog, backend="cuda")
+        got = composite_sky(moved.rgb, moved.alpha, view, sky, fog=smog, backend="cuda")
         # Textures of noise, whose coordinates float32 rounds, and edges between faces: see
         # test_composite.
         difference = (got.cpu() - expected).abs().amax(-1)
@@ -99,7 +99,7 @@ def test_the_sky_behind_the_splats(away, name, smog):
         assert torch.equal(got.cpu()[3:5], seen.rgb[3:5])  # opaque pixels show no sky
 
 
-@pytest.mark.parametrize("medium", [UNIFORM, LAYERED, SmogMedium(5.0, (0.1, 0.2, 0.3), 3.0)])
+@pytest.mark.parametrize("medium", [UNIFORM, LAYERED, Fog(5.0, (0.1, 0.2, 0.3), 3.0)])
 def test_smog_on_buffers(away, medium):
     seen, view = images(), camera()
     expected = fog_raster(seen, view, medium)
@@ -110,7 +110,7 @@ def test_smog_on_buffers(away, medium):
 def test_smog_without_density_is_the_identity_to_the_bit(away):
     seen = images()
     for height in (None, 20.0):
-        got = fog_raster(on_gpu(seen), camera(), SmogMedium(0.0, (0.5, 0.6, 0.7), height))
+        got = fog_raster(on_gpu(seen), camera(), Fog(0.0, (0.5, 0.6, 0.7), height))
         assert torch.equal(got.cpu(), seen.rgb)
 
 
@@ -124,12 +124,14 @@ def test_colour_maps(away):
     torch.testing.assert_close(double.cpu(), expected.double(), atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("without", [(), ("rgb",), ("snow",)], ids=["all", "no colour", "no snow"])
+@pytest.mark.parametrize(
+    "without", [(), ("rgb",), ("overlay",)], ids=["all", "no colour", "no overlay"]
+)
 def test_finished_pixels_become_opaque(away, without):
     seen = dataclasses.replace(images(), **dict.fromkeys(without))
     expected = renormalise_alpha(seen, 0.3, backend="reference")
     got = renormalise_alpha(on_gpu(seen), 0.3, backend="cuda")
-    for name in {"rgb", "alpha", "snow"} - set(without):
+    for name in {"rgb", "alpha", "overlay"} - set(without):
         value = getattr(got, name).cpu()
         torch.testing.assert_close(value, getattr(expected, name), atol=1e-6, rtol=0)
 

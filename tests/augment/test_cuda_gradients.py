@@ -14,7 +14,6 @@ import torch
 pytest.importorskip("triton")
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
 from augment.render import layout
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
@@ -22,6 +21,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.backward import color_gradients
 from augment.render.cuda.splats import HIDDEN, CudaSplats, CudaTiles
+from augment.render.fog import Fog
 from augment.render.gsplat_backend import draw_with_gsplat
 from augment.render.rasterize import rasterize
 from augment.render.reference import (
@@ -345,9 +345,9 @@ def test_what_is_compiled_into_gsplat_cannot_be_set(monkeypatch, settings, messa
 def test_gradients_that_no_kernel_has_are_refused():
     camera = camera_ahead(9, 9, 9.0)
     colour, shape = (tracked(PosedGaussians(one_gaussian()), name) for name in ("sh", "means"))
-    smog = SmogMedium(sigma_per_m=0.1, rgb=(0.5, 0.5, 0.5))
+    smog = Fog(sigma_per_m=0.1, rgb=(0.5, 0.5, 0.5))
     with pytest.raises(ValueError, match=r"gradients through smog.* 'reference', on the CPU"):
-        rasterize([colour], camera, smog=smog, backend="cuda")
+        rasterize([colour], camera, fog=smog, backend="cuda")
     with pytest.raises(ValueError, match="gradients of median_depth"):
         rasterize([shape], camera, buffers=(MEDIAN_DEPTH,), backend="cuda")
     above = dataclasses.replace(camera, is_orthographic=True)

@@ -100,7 +100,7 @@ def test_splats_are_the_definitions(kind, weather):
     seed = KINDS.index(kind) + 10 * WEATHERS.index(weather)
     camera = wide_camera((60.0, 10.0, 120.0)[seed % 3], at=(3.1, -2.2, 0.4), turn=0.2 * seed)
     gaussians = hard_gaussians(kind, camera, 100, seed=seed, sh_degree=3)
-    part = PosedGaussians(gaussians, is_snow=bool(seed % 2))
+    part = PosedGaussians(gaussians, is_overlay=bool(seed % 2))
     level = 0.397 if kind == "near" else 0.3
     clip = HeightClip(level, weather) if weather in (ABOVE, BELOW) else None
     if weather == "light":
@@ -216,9 +216,11 @@ def street_of_parts() -> list[PosedGaussians]:
         PosedGaussians(dataclasses.replace(one, semantic=classes), color_maps=colour_maps()),
         PosedGaussians(few[0], slight_pose(), instance_id=1),
         PosedGaussians(Gaussians.empty(3), slight_pose(), instance_id=2),
-        PosedGaussians(few[1], slight_pose((0.5, 0.1, 0.2)), is_snow=True, shading=snow_light(40)),
+        PosedGaussians(
+            few[1], slight_pose((0.5, 0.1, 0.2)), is_overlay=True, shading=snow_light(40)
+        ),
         PosedGaussians(few[2], color_maps=colour_maps(3)[1:2]),
-        PosedGaussians(few[3], slight_pose((1.0, 0.0, 0.0)), is_snow=True),
+        PosedGaussians(few[3], slight_pose((1.0, 0.0, 0.0)), is_overlay=True),
     ]
 
 

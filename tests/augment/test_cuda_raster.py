@@ -20,8 +20,8 @@ from augment.render.buffers import (
     EXPECTED_DEPTH,
     MEDIAN_DEPTH,
     MODE_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
     RenderOutput,
 )
@@ -87,7 +87,7 @@ def assert_same_bits(actual, expected, buffers=ALL):
 
 def assert_agrees(actual, expected, *, max_flips=2, depth_p999=2e-4, buffers=ALL):
     """As far as float32 allows: forty blends, an exp2 good to 3e-6, depths of up to 9 m."""
-    for name in buffers & {RGB, ALPHA, SNOW}:
+    for name in buffers & {RGB, ALPHA, OVERLAY}:
         assert_images_close(
             getattr(actual, name), getattr(expected, name), p999=1e-5, max_flips=max_flips
         )
@@ -115,7 +115,7 @@ def assert_matches_definition(
         camera,
         buffers=ALL,
         settings=settings,
-        smog=smog,
+        fog=smog,
         clip=clip,
         backend="reference",
     )
@@ -321,7 +321,7 @@ def test_all_kinds_of_parts():
     parts = [
         PosedGaussians(street),
         PosedGaussians(actor, slight_pose(), 1),
-        PosedGaussians(lit, is_snow=True, shading=snow_light(20)),
+        PosedGaussians(lit, is_overlay=True, shading=snow_light(20)),
         PosedGaussians(styled, color_maps=colour_maps(), color_rows=rows),
         PosedGaussians(Gaussians.empty(sh_degree=1)),
     ]
@@ -399,7 +399,7 @@ def test_everything_lies_on_the_gpu(monkeypatch):
     """A pretended one, which refuses what a real one would; and the bits are the same there."""
     street = PosedGaussians(random_gaussians(20, size=0.4))
     snow = PosedGaussians(
-        random_gaussians(10, seed=2, sh_degree=0), is_snow=True, shading=snow_light(10)
+        random_gaussians(10, seed=2, sh_degree=0), is_overlay=True, shading=snow_light(10)
     )
     camera, clip = camera_ahead(18, 9, 16.0), HeightClip(-0.2, "above")
     settings = RasterSettings(transmittance_stop=0.02)
@@ -433,7 +433,7 @@ def test_a_crowd_looks_as_on_the_cpu(crowd):
     actual = render(parts, camera)
     expected = rasterize(parts, camera, buffers=ALL, backend=CPU)
     pixels = camera.width * camera.height
-    for name in (RGB, ALPHA, SNOW):
+    for name in (RGB, ALPHA, OVERLAY):
         assert_images_close(
             getattr(actual, name), getattr(expected, name), p999=1e-3, max_flips=pixels // 2000
         )

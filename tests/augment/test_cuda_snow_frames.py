@@ -124,7 +124,7 @@ def test_near_discs_are_split_as_on_the_cpu(lit, monkeypatch):
     assert_alike(fine.gaussians, near.fine, flips=2)
     assert int((near.fine.sh[:, 0].std(0) > 0.01).sum()) == 3
     assert len(near.fine) <= len(fine.gaussians) <= 4 * len(near.fine)
-    assert whole.is_snow and fine.is_snow
+    assert whole.is_overlay and fine.is_overlay
     assert held_by(fine.gaussians.semantic).eq(int(SemanticClass.SNOW)).all()
     assert (fine.shading is None) == (not lit)
     if lit:
@@ -210,8 +210,8 @@ def test_a_street_full_of_snow_is_the_cpus(street, monkeypatch):
         again = cover.parts_for(scene, camera(), backend="cuda")
     assert len(expected) == 3 + 1 + 1 + 2 + 1  # own; ground and glints, twice that or no glints
     # A part whose crystals all face away is listed all the same, without one that shows.
-    assert [(p.instance_id, p.is_snow) for p in found] == [
-        (p.instance_id, p.is_snow) for p in expected
+    assert [(p.instance_id, p.is_overlay) for p in found] == [
+        (p.instance_id, p.is_overlay) for p in expected
     ]
     for a, b, c in zip(found, expected, again, strict=True):
         assert_alike(a.gaussians, b.gaussians, opacity=2e-4)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, BUFFERS, RGB, SNOW, SPLAT_IDS, RenderOutput
+from augment.render.buffers import ALPHA, BUFFERS, OVERLAY, RGB, SPLAT_IDS, RenderOutput
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
@@ -32,7 +32,7 @@ from tests.augment.hard_scenes import (
 from tests.scenes import one_gaussian, slight_pose, stack
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
-ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, SNOW})
+ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, OVERLAY})
 WEATHERS = ("clear", "uniform", "layered", "clip", "light", "maps")
 weathers = st.sampled_from(WEATHERS)
 seeds = st.integers(0, 2**31)
@@ -42,7 +42,7 @@ def part_of(gaussians: Gaussians, weather: str, seed: int = 0, pose=None) -> Pos
     part = PosedGaussians(gaussians, pose)
     if weather == "light":
         light = snow_light(len(gaussians), seed)
-        return dataclasses.replace(part, is_snow=True, shading=light)
+        return dataclasses.replace(part, is_overlay=True, shading=light)
     if weather == "maps":
         return dataclasses.replace(part, color_maps=colour_maps(seed))
     return part
@@ -52,7 +52,7 @@ def render(parts: list[PosedGaussians], camera: Camera, weather: str) -> RenderO
     clip = HeightClip(0.1, "above") if weather == "clip" else None
     buffers = SNOWY if weather == "light" else ALL
     smog = SMOGS.get(weather)
-    return rasterize(parts, camera, buffers=buffers, smog=smog, clip=clip, backend="cpu")
+    return rasterize(parts, camera, buffers=buffers, fog=smog, clip=clip, backend="cpu")
 
 
 def images(output: RenderOutput) -> dict[str, torch.Tensor]:
@@ -148,7 +148,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(kind, weather, seed):
 # Pixels are numbered from the image's corner, so that float32 rounds a mean's place elsewhere in
 # another image: by 2e-6 px in images of 33 px, 2.4e-4 px at column 8192. All else follows from it:
 # alpha by as much times a splat's slope, and the cut-offs of alpha and transmittance (flips).
-SHIFTED = {RGB: 3e-5, ALPHA: 3e-5, SNOW: 3e-5}
+SHIFTED = {RGB: 3e-5, ALPHA: 3e-5, OVERLAY: 3e-5}
 FLIP = 1e-3
 
 

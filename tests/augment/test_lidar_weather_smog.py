@@ -20,7 +20,7 @@ from augment.effects.lidar.beam import (
     wavelength_factor,
     weathered_sweep,
 )
-from augment.effects.smog import SmogMedium, optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth_of_arrays
 from recipes.schema import KOSCHMIEDER, Smog
 from tests.lidar_sweeps import ranges_of, recipe, some_points, street, sweep_of
 
@@ -139,7 +139,7 @@ def test_whole_numbers_stay_whole() -> None:
     st.integers(0, 2**31),
 )
 def test_extremes(sigma: float, height: float | None, base: float, seed: int) -> None:
-    medium = SmogMedium(sigma, (1.0, 1.0, 1.0), height, base)
+    medium = Fog(sigma, (1.0, 1.0, 1.0), height, base)
     rng = np.random.default_rng(seed)
     ends = np.array([0.0, 1e-3, 0.9, 0.91, 5.0, 200.0, 1e6])
     eyes = np.full(7, 1.8)

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, RGB
 from augment.render.composite import composite_sky
 from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.render.cpu import backward as cpu_backward
 from augment.render.cpu.driver import Scratch, gather_inputs
+from augment.render.fog import Fog
 from augment.render.layout import UNCUT, HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.reference import project_parts
@@ -246,7 +246,7 @@ def test_a_tilted_view_is_cut_at_the_height(backend):
 def test_smog_and_skies_are_refused():
     camera, scene = map_camera(), one_gaussian()
     with pytest.raises(ValueError, match="orthographic: there is no eye"):
-        rasterize([PosedGaussians(scene)], camera, smog=SmogMedium(0.1, (1.0, 1.0, 1.0)))
+        rasterize([PosedGaussians(scene)], camera, fog=Fog(0.1, (1.0, 1.0, 1.0)))
     rgb, alpha = torch.zeros(43, 61, 3), torch.zeros(43, 61)
     for backend in ("cpu", "cuda", "reference"):
         with pytest.raises(ValueError, match="see the sky in one"):

@@ -23,8 +23,8 @@ from augment.render.buffers import (
     EXPECTED_DEPTH,
     MEDIAN_DEPTH,
     MODE_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
 )
 from augment.render.layout import HeightClip
@@ -42,7 +42,7 @@ from tests.augment.hard_scenes import (
 )
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
-ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, SNOW})
+ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, OVERLAY})
 WEATHERS = ("clear", "uniform", "layered", "above", "below", "light", "maps")
 FOVS_DEG = (1, 10, 60, 120, 170)
 
@@ -55,13 +55,13 @@ def render(parts, camera: Camera, weather: str, backend: str) -> dict[str, torch
     )
     buffers = SNOWY if weather == "light" else ALL
     output = rasterize(
-        parts, camera, buffers=buffers, smog=SMOGS.get(weather), clip=clip, backend=backend
+        parts, camera, buffers=buffers, fog=SMOGS.get(weather), clip=clip, backend=backend
     )
     return {name: getattr(output, name) for name in buffers}
 
 
 def part_of(gaussians, weather: str, seed: int) -> PosedGaussians:
-    part = PosedGaussians(gaussians, is_snow=bool(seed % 2))
+    part = PosedGaussians(gaussians, is_overlay=bool(seed % 2))
     if weather == "light":
         return dataclasses.replace(part, shading=snow_light(len(gaussians), seed))
     if weather == "maps":
@@ -92,16 +92,16 @@ def errors(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -
 BOUNDS = {
     RGB: 3e-5,
     ALPHA: 1e-5,
-    SNOW: 1e-5,
+    OVERLAY: 1e-5,
     EXPECTED_DEPTH: 1e-4,
     MEDIAN_DEPTH: 1e-6,
     MODE_DEPTH: 3e-5,
     SPLAT_IDS: 0.0,
 }
 # A needle's mean may lie thousands of pixels beside the image: float32 places it to 1e-7 of that.
-NEEDLES = BOUNDS | {RGB: 5e-4, ALPHA: 5e-4, SNOW: 5e-4, EXPECTED_DEPTH: 1e-3, MODE_DEPTH: 3e-4}
+NEEDLES = BOUNDS | {RGB: 5e-4, ALPHA: 5e-4, OVERLAY: 5e-4, EXPECTED_DEPTH: 1e-3, MODE_DEPTH: 3e-4}
 # And a mean in column 8192 to 2.4e-4 px.
-LONG = BOUNDS | {RGB: 1e-4, ALPHA: 1e-4, SNOW: 1e-4, EXPECTED_DEPTH: 1e-3}
+LONG = BOUNDS | {RGB: 1e-4, ALPHA: 1e-4, OVERLAY: 1e-4, EXPECTED_DEPTH: 1e-3}
 FLIP, FLIPS, FLIP_SHARE = 1e-3, 3, 0.002  # off by more; so many in an image, plus such a share
 
 

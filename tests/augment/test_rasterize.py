@@ -5,12 +5,12 @@ import re
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
 from augment.render import buffers as backends
 from augment.render import rasterize as module
 from augment.render.buffers import BUFFERS, RenderOutput
 from augment.render.constants import RasterSettings
+from augment.render.fog import Fog
 from augment.render.rasterize import rasterize, renormalise_alpha
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
@@ -64,9 +64,9 @@ def test_only_the_buffers_asked_for(parts, backend):
 
 
 def test_backends_draw_the_same_picture(parts):
-    camera, smog = camera_ahead(61, 43, 55.0), SmogMedium(0.05, (0.7, 0.7, 0.7), 20.0)
+    camera, smog = camera_ahead(61, 43, 55.0), Fog(0.05, (0.7, 0.7, 0.7), 20.0)
     reference, cpu = (
-        rasterize(parts, camera, smog=smog, backend=name) for name in ("reference", "cpu")
+        rasterize(parts, camera, fog=smog, backend=name) for name in ("reference", "cpu")
     )
     # float32 in two orders of operations; flips at the 1/255 cut-off are allowed for
     assert_images_close(cpu.rgb, reference.rgb, p999=1e-4, max_flips=3)
@@ -90,14 +90,14 @@ def test_what_a_raised_stop_leaves_is_shared(parts, backend):
     expected = drawn.rgb[finished] / drawn.alpha[finished][:, None]
     torch.testing.assert_close(output.rgb[finished], expected, rtol=1e-6, atol=0)
     every = rasterize(parts, camera, buffers=BUFFERS, settings=settings, backend=backend)
-    assert torch.equal(every.rgb, output.rgb) and torch.equal(every.snow, 0 * every.snow)
+    assert torch.equal(every.rgb, output.rgb) and torch.equal(every.overlay, 0 * every.overlay)
     alone = rasterize(parts, camera, buffers={"rgb"}, settings=settings, backend=backend)
     assert alone.alpha is None and torch.equal(alone.rgb, output.rgb)
 
 
 def test_kernel_and_definition_share_the_rest_alike():
     rng = torch.Generator().manual_seed(0)
-    images = {"rgb": (9, 7, 3), "alpha": (9, 7), "snow": (9, 7)}
+    images = {"rgb": (9, 7, 3), "alpha": (9, 7), "overlay": (9, 7)}
     images = {name: torch.rand(shape, generator=rng) for name, shape in images.items()}
     images["alpha"][0, :3] = torch.tensor([0.75, 1.0, 0.0])
     slow = renormalise_alpha(RenderOutput(**images), 0.25, backend="reference")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
 from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, RGB
 from augment.render.composite import composite_sky, map_colors
 from augment.render.constants import ALPHA_MIN, RasterSettings
+from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians
@@ -502,7 +502,7 @@ def test_second_derivatives_are_refused():
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        ({"smog": SmogMedium(0.05, (0.5, 0.6, 0.7))}, "gradients through smog are asked for"),
+        ({"smog": Fog(0.05, (0.5, 0.6, 0.7))}, "gradients through smog are asked for"),
         (
             {"buffers": [RGB, "median_depth", "splat_ids"]},
             "gradients of median_depth, splat_ids are asked for",

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, transform_points
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
 from augment.render.cpu import driver as cpu_scratch
 from augment.render.cpu.driver import gather_inputs, rasterize_cpu
+from augment.render.fog import Fog
 from augment.render.reference import project_parts, rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
@@ -33,8 +33,8 @@ from tests.scenes import (
 ALL = frozenset(BUFFERS)
 COLOR = frozenset({RGB, ALPHA})
 DEFAULT = RasterSettings()
-UNIFORM = SmogMedium(0.15, (0.8, 0.7, 0.5))
-LAYERED = SmogMedium(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0)
+UNIFORM = Fog(0.15, (0.8, 0.7, 0.5))
+LAYERED = Fog(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0)
 GOLDEN_MODES = (
     *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
     *(f"a99_classic_sh{degree}" for degree in range(4)),
@@ -170,7 +170,7 @@ def test_smog(smog):
 @pytest.mark.parametrize("base_z_m", [-3000.0, 0.0, 3000.0])
 @pytest.mark.parametrize("scale_height_m", [0.05, 1e6])
 def test_smog_far_below_and_above_its_layer(scale_height_m, base_z_m):
-    smog = SmogMedium(0.2, (0.8, 0.7, 0.5), scale_height_m, base_z_m)
+    smog = Fog(0.2, (0.8, 0.7, 0.5), scale_height_m, base_z_m)
     assert_matches_definition(
         [PosedGaussians(random_gaussians(200))], camera_ahead(position=(0.0, 0.0, 0.4)), smog=smog
     )

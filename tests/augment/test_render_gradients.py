@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
 from augment.render import reference
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
+from augment.render.fog import Fog
 from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
 from tests.scenes import camera_ahead, random_gaussians, slight_pose, smooth_gaussians
@@ -26,7 +26,7 @@ def test_gradients_of_every_tensor(variant):
     camera = camera_ahead(4, 3, 7.0)
     gaussians = smooth_gaussians(3, sh_degree=1 if variant == "classic" else 0)
     pose = slight_pose((0.1, 0.2, -0.1))
-    smog = SmogMedium(0.1, (0.7, 0.6, 0.5), 3.0) if variant == "smog" else None
+    smog = Fog(0.1, (0.7, 0.6, 0.5), 3.0) if variant == "smog" else None
     settings = RasterSettings(antialiased=variant == "antialiased")
 
     def image(*tensors):
@@ -60,7 +60,7 @@ def test_gradients_stay_finite_at_every_cut_off(dtype):
         "sh": sh,
     }
     tensors = {name: value.clone().requires_grad_() for name, value in fields.items()}
-    smog = SmogMedium(0.05, (0.5, 0.6, 0.7), 10.0)
+    smog = Fog(0.05, (0.5, 0.6, 0.7), 10.0)
     settings = RasterSettings(antialiased=True)
     output = render(Gaussians(**tensors), camera_ahead(), settings, smog)
     total = output.rgb.sum() + output.alpha.sum() + output.expected_depth.sum()

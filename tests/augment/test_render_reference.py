@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.smog import SmogMedium
 from augment.geometry import multiply_quats, quat_from_rotmat, transform_points
 from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import MAX_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.fog import Fog
 from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
@@ -311,7 +311,7 @@ def test_a_posed_part_looks_like_its_gaussians_moved():
         sh=rotate_sh(actor.sh, pose[:3, :3]),
     )
     background = random_gaussians(80, seed=6, dtype=torch.float64)
-    smog = SmogMedium(0.1, (0.7, 0.7, 0.6), scale_height_m=2.0, base_z_m=-1.0)
+    smog = Fog(0.1, (0.7, 0.7, 0.6), scale_height_m=2.0, base_z_m=-1.0)
     posed = render([PosedGaussians(background), PosedGaussians(actor, pose, 1)], camera, smog=smog)
     expected = render(stack(background, moved), camera, smog=smog)
     assert_outputs_close(posed, expected, 1e-9)  # float64 through another chain of transforms
@@ -354,7 +354,7 @@ def test_smog_without_density_is_the_clear_image_to_the_bit():
     gaussians, camera = random_gaussians(), camera_ahead()
     clear = render(gaussians, camera)
     for height in (None, 30.0):
-        output = render(gaussians, camera, smog=SmogMedium(0.0, (0.7, 0.6, 0.5), height))
+        output = render(gaussians, camera, smog=Fog(0.0, (0.7, 0.6, 0.5), height))
         assert all(torch.equal(getattr(output, n), getattr(clear, n)) for n in BUFFERS)
 
 
@@ -362,7 +362,7 @@ def test_smog_fades_by_euclidean_distance():
     camera = camera_ahead(41, 31, 40.0)
     rgb, airlight = np.array([0.9, 0.5, 0.1]), np.array([0.6, 0.7, 0.8])
     gaussian = one_gaussian((5.0, 1.5, 0.5), 0.4, 0.8, rgb, torch.float64)
-    output = render(gaussian, camera, smog=SmogMedium(0.2, tuple(airlight)))
+    output = render(gaussian, camera, smog=Fog(0.2, tuple(airlight)))
     t = math.exp(-0.2 * math.sqrt(5.0**2 + 1.5**2 + 0.5**2))
     expected = output.alpha.numpy()[..., None] * (t * rgb + (1 - t) * airlight)
     np.testing.assert_allclose(output.rgb, expected, atol=1e-12)
@@ -372,7 +372,7 @@ def test_smog_with_a_scale_height_uses_world_heights():
     """A camera 2 m up looks at a splat 1 m up: integrate the density along the ray."""
     camera = camera_ahead(41, 31, 40.0, position=(0, 0, 2.0))
     gaussian = one_gaussian((5.0, 0.0, 1.0), 0.4, 0.8, (0, 0, 0), torch.float64)
-    smog = SmogMedium(0.3, (1.0, 1.0, 1.0), scale_height_m=1.5, base_z_m=0.5)
+    smog = Fog(0.3, (1.0, 1.0, 1.0), scale_height_m=1.5, base_z_m=0.5)
     steps = (np.arange(20000) + 0.5) / 20000
     heights = 2.0 + steps * (1.0 - 2.0)
     tau = 0.3 * np.exp(-(heights - 0.5) / 1.5).mean() * math.hypot(5.0, 1.0)
@@ -383,7 +383,7 @@ def test_smog_with_a_scale_height_uses_world_heights():
 
 def test_dense_smog_is_pure_airlight():
     gaussians, camera = random_gaussians(), camera_ahead()
-    output = render(gaussians, camera, smog=SmogMedium(1e6, (0.25, 0.5, 0.75)))
+    output = render(gaussians, camera, smog=Fog(1e6, (0.25, 0.5, 0.75)))
     airlight = torch.tensor([0.25, 0.5, 0.75])
     expected = output.alpha[..., None] * airlight
     torch.testing.assert_close(output.rgb, expected, rtol=0, atol=1e-6)  # float32 sums

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
-from augment.render.buffers import ALPHA, RGB, SNOW
+from augment.render.buffers import ALPHA, OVERLAY, RGB
+from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 
@@ -69,7 +69,7 @@ def some_parts(seed=0, count=300, shaded=True) -> list[PosedGaussians]:
     for pose, share in ((None, 0.4), (turn, 0.8)):
         light = SplatShading(draw(count, 3), sun, share)
         shading = light if shaded else None
-        parts.append(PosedGaussians(cloud(count), pose, is_snow=True, shading=shading))
+        parts.append(PosedGaussians(cloud(count), pose, is_overlay=True, shading=shading))
     return parts
 
 
@@ -81,12 +81,11 @@ def shaded(gaussians: Gaussians, sun, wrap=0.0, slopes=(0.5, 0.5, 0.5)) -> Posed
 
 def render(parts, view, **options):
     """With the buffers that pictures of snow ask for, whose kernel there is."""
-    return rasterize(parts, view, buffers=(RGB, ALPHA, SNOW), **options)
+    return rasterize(parts, view, buffers=(RGB, ALPHA, OVERLAY), **options)
 
 
 @pytest.mark.parametrize(
-    ("smog", "orthographic"),
-    [(None, False), (SmogMedium(0.2, (0.7, 0.6, 0.5)), False), (None, True)],
+    ("smog", "orthographic"), [(None, False), (Fog(0.2, (0.7, 0.6, 0.5)), False), (None, True)]
 )
 def test_the_kernel_shows_what_the_definition_says(smog, orthographic):
     view = camera(is_orthographic=True, fx=12.0, fy=11.0) if orthographic else camera()

@@ -3,22 +3,16 @@ import math
 import pytest
 import torch
 
-from augment.effects.smog import (
-    SmogMedium,
-    blend_airlight,
-    fog_buffers,
-    optical_depth,
-    sky_optical_depth,
-)
+from augment.render.fog import Fog, blend_airlight, fog_buffers, optical_depth, sky_optical_depth
 
 GREY = (0.7, 0.75, 0.8)
 
 
-def layered(sigma: float = 0.02, height: float = 15.0) -> SmogMedium:
-    return SmogMedium(sigma, GREY, scale_height_m=height, base_z_m=-1.0)
+def layered(sigma: float = 0.02, height: float = 15.0) -> Fog:
+    return Fog(sigma, GREY, scale_height_m=height, base_z_m=-1.0)
 
 
-def quadrature(medium: SmogMedium, distance: float, eye: float, point: float) -> float:
+def quadrature(medium: Fog, distance: float, eye: float, point: float) -> float:
     """The integral of the density along the ray by the midpoint rule."""
     steps = torch.linspace(0, 1, 20_001, dtype=torch.float64)
     z = eye + (point - eye) * (steps[1:] + steps[:-1]) / 2
@@ -28,7 +22,7 @@ def quadrature(medium: SmogMedium, distance: float, eye: float, point: float) ->
 
 
 def test_one_attenuation_length_leaves_one_part_in_e():
-    medium = SmogMedium(0.05, GREY)
+    medium = Fog(0.05, GREY)
     tau = optical_depth(medium, torch.tensor(20.0), 0.0)
     black = blend_airlight(torch.zeros(3), tau, medium)
     expected = (1 - math.exp(-1)) * torch.tensor(GREY)
@@ -37,7 +31,7 @@ def test_one_attenuation_length_leaves_one_part_in_e():
 
 def test_no_density_is_the_identity_to_the_bit():
     rgb = torch.rand(50, 3)
-    for medium in (SmogMedium(0.0, GREY), layered(sigma=0.0)):
+    for medium in (Fog(0.0, GREY), layered(sigma=0.0)):
         tau = optical_depth(medium, torch.rand(50) * 1e4, 1.0, torch.rand(50) * 100)
         assert torch.equal(blend_airlight(rgb, tau, medium), rgb)
         assert torch.equal(sky_optical_depth(medium, torch.linspace(-1, 1, 9), 1.0), torch.zeros(9))
@@ -73,8 +67,8 @@ def test_optical_depths_add_up_along_a_ray():
 def test_a_huge_scale_height_is_uniform_smog():
     distance = torch.rand(100, dtype=torch.float64) * 200
     z = torch.rand(100, dtype=torch.float64) * 20
-    uniform = optical_depth(SmogMedium(0.02, GREY), distance, 1.6)
-    tall = optical_depth(SmogMedium(0.02, GREY, scale_height_m=1e9), distance, 1.6, z)
+    uniform = optical_depth(Fog(0.02, GREY), distance, 1.6)
+    tall = optical_depth(Fog(0.02, GREY, scale_height_m=1e9), distance, 1.6, z)
     assert torch.allclose(tall, uniform, rtol=1e-7)  # (z - z0) / H is 2e-8 at most
 
 
@@ -93,7 +87,7 @@ def test_the_sky_is_the_limit_of_far_points():
 
 def test_the_sky_behind_uniform_smog_or_below_the_horizon_is_airlight():
     slopes = torch.linspace(-1, 1, 21)
-    uniform = SmogMedium(1e-5, GREY)
+    uniform = Fog(1e-5, GREY)
     assert torch.equal(
         blend_airlight(torch.rand(21, 3), sky_optical_depth(uniform, slopes, 0.0), uniform),
         torch.tensor(GREY).expand(21, 3),
@@ -105,7 +99,7 @@ def test_the_sky_behind_uniform_smog_or_below_the_horizon_is_airlight():
 @pytest.mark.parametrize("sigma", [0.0, 1e-30, 100.0])
 @pytest.mark.parametrize("height", [None, 1e-3, 1e5])
 def test_extremes_stay_finite(sigma, height):
-    medium = SmogMedium(sigma, GREY, scale_height_m=height, base_z_m=0.0)
+    medium = Fog(sigma, GREY, scale_height_m=height, base_z_m=0.0)
     distance = torch.tensor([0.0, 1e-30, 1.0, 1e8])
     z = torch.tensor([-1e6, 0.0, 1.0, 1e6])
     rgb = torch.rand(4, 3)
@@ -133,7 +127,7 @@ def test_gradients():
 
 
 def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky():
-    medium = SmogMedium(0.1, GREY)
+    medium = Fog(0.1, GREY)
     rgb = torch.tensor([[[0.2, 0.2, 0.2], [0.0, 0.0, 0.0]]])  # half covered; not covered
     alpha = torch.tensor([[0.5, 0.0]])
     out = fog_buffers(rgb, alpha, torch.tensor([[10.0, 0.0]]), medium, 0.0)
@@ -145,6 +139,6 @@ def test_deferred_smog_fogs_what_covers_the_pixel_and_leaves_the_rest_to_the_sky
 def test_impossible_densities_are_refused():
     for sigma in (-0.1, math.nan, math.inf):
         with pytest.raises(ValueError, match="sigma_per_m must be finite and >= 0"):
-            SmogMedium(sigma, GREY)
+            Fog(sigma, GREY)
     with pytest.raises(ValueError, match="scale_height_m must be finite and > 0; got 0"):
-        SmogMedium(0.1, GREY, scale_height_m=0.0)
+        Fog(0.1, GREY, scale_height_m=0.0)

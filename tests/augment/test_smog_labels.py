@@ -14,13 +14,14 @@ from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera
 
 from augment.boxes import BOTTOM_M, NOT_COUNTED, SIDES_M
 from augment.effects import smog
-from augment.effects.smog import SmogMedium, box_transmittance, optical_depth_of_arrays
+from augment.effects.smog import box_transmittance
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
+from augment.render.fog import Fog, optical_depth_of_arrays
 
 GREY = (0.7, 0.7, 0.7)
-THICK = SmogMedium(0.05, GREY)
-LAYERED = SmogMedium(0.08, GREY, scale_height_m=3.0, base_z_m=-0.5)
+THICK = Fog(0.05, GREY)
+LAYERED = Fog(0.08, GREY, scale_height_m=3.0, base_z_m=-0.5)
 SHAPE = (106, 160)
 POINT_M = (1e-6, 1e-6, 1e-6)
 EYE_Z_M = 1.6
@@ -52,7 +53,7 @@ def test_a_box_at_a_known_distance() -> None:
 
 
 @pytest.mark.parametrize("medium", [THICK, LAYERED])
-def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: SmogMedium) -> None:
+def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None:
     """Every pixel by hand, by the definition that images are fogged with."""
     rng = np.random.default_rng(4)
     boxes, camera = boxes_at_random(rng), make_camera(pitch=0.15)
@@ -85,8 +86,8 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: SmogMedium) 
     assert (got.pixels > 0).sum() > 30 and (got.pixels == 0).sum() > 5
 
 
-@pytest.mark.parametrize("medium", [THICK, LAYERED, SmogMedium(100.0, GREY, 0.1, -50.0)])
-def test_the_optical_depth_is_that_of_the_image(medium: SmogMedium) -> None:
+@pytest.mark.parametrize("medium", [THICK, LAYERED, Fog(100.0, GREY, 0.1, -50.0)])
+def test_the_optical_depth_is_that_of_the_image(medium: Fog) -> None:
     rng = np.random.default_rng(1)
     distance, z = rng.uniform(0, 300, 500), rng.uniform(-20, 80, 500)
     z[:3] = EYE_Z_M, EYE_Z_M + 1e-9, EYE_Z_M - 3e-5

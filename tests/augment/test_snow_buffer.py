@@ -1,4 +1,4 @@
-"""The buffer "snow": how much of a pixel is covered by parts that are snow."""
+"""The buffer "overlay": how much of a pixel is covered by parts that are snow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from augment.render.buffers import ALPHA, BUFFERS, MEDIAN_DEPTH, RGB, SNOW
+from augment.render.buffers import ALPHA, BUFFERS, MEDIAN_DEPTH, OVERLAY, RGB
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
@@ -23,14 +23,14 @@ def crowd(*snowy: bool) -> list[PosedGaussians]:
     scenes = [s.select(s.means[:, 0] > 2) for s in scenes]
     pose = slight_pose()
     return [
-        PosedGaussians(scene, pose if i else None, i, is_snow=is_snow)
-        for i, (scene, is_snow) in enumerate(zip(scenes, snowy, strict=True))
+        PosedGaussians(scene, pose if i else None, i, is_overlay=is_overlay)
+        for i, (scene, is_overlay) in enumerate(zip(scenes, snowy, strict=True))
     ]
 
 
 # Of what a picture of snow asks for: other sets of buffers would take kernels of their own, which
 # are compiled for seconds.
-def render(parts, backend="cpu", buffers=(RGB, ALPHA, SNOW), camera=CAMERA):
+def render(parts, backend="cpu", buffers=(RGB, ALPHA, OVERLAY), camera=CAMERA):
     return rasterize(parts, camera, buffers=buffers, backend=backend)
 
 
@@ -44,30 +44,30 @@ def test_kernels_match_the_definition():
         for part in parts
     ]
     actual, expected = render(parts), render(doubled, "reference")
-    assert_images_close(actual.snow, expected.snow, p999=1e-5, max_flips=2)
-    assert 0.2 < float(actual.snow.mean()) < 0.8 * float(actual.alpha.mean())
+    assert_images_close(actual.overlay, expected.overlay, p999=1e-5, max_flips=2)
+    assert 0.2 < float(actual.overlay.mean()) < 0.8 * float(actual.alpha.mean())
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_all_of_it_is_alpha_and_none_of_it_is_nothing(backend):
     image = render(crowd(True, True), backend)
     # One is a sum of weights, the other 1 - transmittance: forty roundings.
-    torch.testing.assert_close(image.snow, image.alpha, rtol=0, atol=1e-5)
-    assert not render(crowd(False, False), backend).snow.any()
+    torch.testing.assert_close(image.overlay, image.alpha, rtol=0, atol=1e-5)
+    assert not render(crowd(False, False), backend).overlay.any()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_shares_add_up_to_alpha(backend):
     first, second = render(crowd(True, False), backend), render(crowd(False, True), backend)
-    torch.testing.assert_close(first.snow + second.snow, first.alpha, rtol=0, atol=1e-5)
+    torch.testing.assert_close(first.overlay + second.overlay, first.alpha, rtol=0, atol=1e-5)
     assert torch.equal(first.alpha, second.alpha)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_hides_snow_counts_against_it(backend):
-    snow = PosedGaussians(one_gaussian((6.0, 0, 0), 30.0, 0.9), is_snow=True)
+    snow = PosedGaussians(one_gaussian((6.0, 0, 0), 30.0, 0.9), is_overlay=True)
     glass = PosedGaussians(one_gaussian((3.0, 0, 0), 30.0, 0.75))
-    middle = render([glass, snow], backend).snow[20:40, 40:60]
+    middle = render([glass, snow], backend).overlay[20:40, 40:60]
     torch.testing.assert_close(middle, torch.full_like(middle, 0.25 * 0.9), rtol=0, atol=1e-4)
 
 
@@ -75,25 +75,27 @@ def test_bits_do_not_depend_on_the_buffers_asked_for():
     parts = crowd(False, True)
     whole = render(parts, buffers=BUFFERS)
     for others in ({RGB, ALPHA}, {RGB, ALPHA, MEDIAN_DEPTH}):
-        image, without = render(parts, buffers=others | {SNOW}), render(parts, buffers=others)
-        assert torch.equal(image.snow, whole.snow) and without.snow is None
+        image, without = render(parts, buffers=others | {OVERLAY}), render(parts, buffers=others)
+        assert torch.equal(image.overlay, whole.overlay) and without.overlay is None
         for name in others:
             assert torch.equal(getattr(image, name), getattr(without, name)), name
             assert torch.equal(getattr(image, name), getattr(whole, name)), name
 
 
 def test_what_is_called_snow_changes_nothing_else():
-    colder, warmer = (render(crowd(False, is_snow), buffers=BUFFERS) for is_snow in (True, False))
-    for name in set(BUFFERS) - {SNOW}:
+    colder, warmer = (
+        render(crowd(False, is_overlay), buffers=BUFFERS) for is_overlay in (True, False)
+    )
+    for name in set(BUFFERS) - {OVERLAY}:
         assert torch.equal(getattr(colder, name), getattr(warmer, name)), name
 
 
 def test_gradients_take_the_definition():
-    part = PosedGaussians(random_gaussians(30, seed=2), is_snow=True)
+    part = PosedGaussians(random_gaussians(30, seed=2), is_overlay=True)
     opacities = part.gaussians.opacities.clone().requires_grad_()
     gaussians = dataclasses.replace(part.gaussians, opacities=opacities)
     image = render([dataclasses.replace(part, gaussians=gaussians)], "auto", camera=camera_ahead())
-    (slope,) = torch.autograd.grad(image.snow.sum(), opacities, retain_graph=True)
+    (slope,) = torch.autograd.grad(image.overlay.sum(), opacities, retain_graph=True)
     (expected,) = torch.autograd.grad(image.alpha.sum(), opacities)
     torch.testing.assert_close(slope, expected)
     assert float(slope.abs().max()) > 0

@@ -306,7 +306,7 @@ def test_two_shadings_agree_where_normals_do():
     part = _lay(bed, depth_m=0.1, shading="per_pixel").parts_for(
         FAR_AWAY, looking((2, 2, 3), (2, 2, 0))
     )[-1]
-    assert part.is_snow and part.shading is not None and part.shading.sun == SUN
+    assert part.is_overlay and part.shading is not None and part.shading.sun == SUN
 
 
 # --- what it buries -------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ def test_snow_on_a_vehicle_is_carried_along_and_lit_where_it_stands(shading):
         scene, bed = _driving_scene(yaw, cells)
         cover = _lay(bed, scene, depth_m=0.1, shading=shading)
         snow = cover.parts_for(scene, looking((5, 2, 9), (5, 2, 0)))[-1]
-        assert snow.is_snow and snow.instance_id == 1 and snow.world_from_part is not None
+        assert snow.is_overlay and snow.instance_id == 1 and snow.world_from_part is not None
         if shading == "per_splat":
             assert snow.shading is None
             brightness.append(float(_colors(snow.gaussians).mean()))
@@ -396,7 +396,7 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
         counts.append(len(parts[-1].gaussians) if parts[-1].gaussians.scales.max() < 0.005 else 0)
     assert counts[0] == 0 < 2 * counts[1] < counts[2] < 0.05 * 160 * 160
     glints = cover.parts_for(FAR_AWAY, camera)[-1]
-    assert glints.is_snow and glints.gaussians.scales.max() < 0.005
+    assert glints.is_overlay and glints.gaussians.scales.max() < 0.005
     moved = cover.parts_for(FAR_AWAY, looking((3.5, 5.0, 1.5), (6.0, 4.0, 0.0)))[-1]
     here, there = (set(map(tuple, p.gaussians.means.tolist())) for p in (glints, moved))
     assert len(here & there) < 0.6 * len(here)

@@ -9,7 +9,7 @@ import torch
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
-from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, SNOW, SPLAT_IDS
+from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, OVERLAY, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
@@ -192,7 +192,7 @@ def test_the_plan_names_what_runs_and_what_does_not(scene):
 
     plain = steps(recipe_of())
     assert not any(runs for name, runs in plain.items() if name.startswith("snow"))
-    assert SNOW not in make_plan(recipe_of(), scene).buffers
+    assert OVERLAY not in make_plan(recipe_of(), scene).buffers
     white = steps(recipe_of(snow()))
     assert white["snow: placement and layer"] and not white["snow: light per pixel"]
     assert not white["snow: bare surface"]

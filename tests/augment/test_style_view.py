@@ -144,8 +144,8 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     look = scene_style_of(scene, STYLE)
     styled, plain = snow_layers_of(scene, plan.snow, look), snow_layers_of(scene, plan.snow)
     parts = look.on(styled.parts_for(scene, camera_of(scene)))
-    assert any(part.is_snow for part in parts)
-    assert all((part.color_maps is None) == part.is_snow for part in parts)
+    assert any(part.is_overlay for part in parts)
+    assert all((part.color_maps is None) == part.is_overlay for part in parts)
     # Its light is read from the mapped ground and sky, and differs from the bare scene's.
     mean = {name: cover.ground.gaussians.sh.mean((0, 1))
             for name, cover in (("styled", styled), ("plain", plain))}  # fmt: skip
@@ -154,9 +154,9 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     seen = look.lighting_scene.background.sh[0, 0] * 0.28209479 + 0.5
     torch.testing.assert_close(seen, mapped(ground, maps.splats[0]), rtol=0, atol=1e-5)
     assert torch.equal(styled.ground.gaussians.means, plain.ground.gaussians.means)
-    drawn = rasterize([p for p in parts if p.is_snow], camera_of(scene))
+    drawn = rasterize([p for p in parts if p.is_overlay], camera_of(scene))
     view = render_buffers(scene, camera_of(scene), plan)
-    covered = view.raster.snow > 0.995
+    covered = view.raster.overlay > 0.995
     assert covered.sum() > 500
     torch.testing.assert_close(view.rgb[covered], drawn.rgb[covered], rtol=0, atol=0.02)
 

@@ -14,8 +14,8 @@ from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.refraction import is_smooth, smooth_variance
 from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.waves import WaveField, WaveSet
-from augment.effects.smog import SmogMedium, blend_airlight, optical_depth
 from augment.geometry import invert_rigid
+from augment.render.fog import Fog, blend_airlight, optical_depth
 from augment.render.threads import limit_threads
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from tests.augment.flood_programs import few_programs
@@ -141,11 +141,7 @@ def shade_water(
 
 
 ALL = pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
-SMOGS = {
-    "clear": None,
-    "uniform": SmogMedium(0.02, GREY),
-    "layered": SmogMedium(0.02, GREY, 8.0, LEVEL - 3),
-}
+SMOGS = {"clear": None, "uniform": Fog(0.02, GREY), "layered": Fog(0.02, GREY, 8.0, LEVEL - 3)}
 
 
 TIERS = ["sky", "mirrored", "screen_space"]
@@ -185,8 +181,8 @@ def test_the_kernel_matches_the_definition(backend, smog, tier, view):
         layers["screen"] = ScreenReflection(front, distance, weight)
         exact["screen"] = ScreenReflection(doubled(front), distance, weight)
     water = medium(fresnel=fresnel)
-    fast = shade_water(eye, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
-    slow = shade_water(eye, water, field, doubled(bed), sky=sky, smog=smog, **exact)
+    fast = shade_water(eye, water, field, bed, sky=sky, fog=smog, backend=backend, **layers)
+    slow = shade_water(eye, water, field, doubled(bed), sky=sky, fog=smog, **exact)
     assert slow.dtype == torch.float64 and bool((slow != 0).any())
     difference = (fast - slow).abs().amax(-1)
     # Float32 knows image coordinates to about 1e-5 pixels here, and colours change by up to 0.1 a
@@ -220,9 +216,9 @@ def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
     bed = constant_layer(margin(eye), GREY, 8.0, 1)
     field = wavy_field(eye, slope=0.3, variance=0.01)
     sky = ConstantSky(torch.tensor(GREY))
-    smogs = [None, *[SmogMedium(0.05, GREY, height) for height in (None, 5.0)]]
+    smogs = [None, *[Fog(0.05, GREY, height) for height in (None, 5.0)]]
     for smog in smogs[::2] if backend == "cuda" else smogs:
-        out = shade_water(eye, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
+        out = shade_water(eye, water, field, bed, sky=sky, fog=smog, backend=backend, **layers)
         met = eye.ray_directions(torch.float64)[..., 2] < 0
         # Mixtures of one colour by weights that sum to 1: some twenty float32 roundings.
         torch.testing.assert_close(
@@ -338,7 +334,7 @@ def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
     eye = camera(pitch_deg=-40)
     bed = constant_layer(margin(eye), MUD, 9.0, 1)
     water = medium(refraction_index=1.0, extinction_per_m=(math.inf,) * 3)
-    out = shade_water(eye, water, flat_field(eye), bed, smog=smog, backend=backend)
+    out = shade_water(eye, water, flat_field(eye), bed, fog=smog, backend=backend)
     rays = eye.ray_directions(torch.float64)
     height = float(eye.centre[2]) - LEVEL
     distance = height / -rays[..., 2] * rays.norm(dim=-1)
@@ -362,7 +358,7 @@ def test_extreme_views_stay_finite(backend, above, pitch_deg):
     )
     for extinction in (0.0, math.inf):
         out = shade_water(eye, medium(extinction_per_m=(extinction,) * 3), steep, bed,
-            mirror=mirror, screen=screen, smog=SMOGS["layered"], backend=backend
+            mirror=mirror, screen=screen, fog=SMOGS["layered"], backend=backend
         )  # fmt: skip
         assert bool(torch.isfinite(out).all()) and float(out.min()) >= -1e-5
         assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
@@ -423,9 +419,9 @@ def test_covered_pixels_are_one_colour(backend):
     bare = shade_water(eye, water, flat_field(eye), bed, sky=sky, backend=backend)
     covered = torch.tensor(water.rgb).expand_as(out[30:40])
     assert torch.equal(out[30:40], covered) and torch.equal(out[40:], bare[40:])
-    smog = SmogMedium(0.05, (0.5, 0.6, 0.7))
+    smog = Fog(0.05, (0.5, 0.6, 0.7))
     out = shade_water(
-        eye, water, flat_field(eye), bed, cover=cover, sky=sky, smog=smog, backend=backend
+        eye, water, flat_field(eye), bed, cover=cover, sky=sky, fog=smog, backend=backend
     )
     assert torch.equal(out[30:40], torch.tensor(smog.rgb).expand_as(out[30:40]))
 

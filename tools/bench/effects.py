@@ -25,7 +25,6 @@ from adapters.base import open_scene, parse_uri
 from adapters.procedural import RayHits, StreetTruth, TrueView, open_truth
 from augment.cameras import Camera
 from augment.effects.flood.water_plane import plane_depth
-from augment.effects.smog import blend_airlight, optical_depth
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.height_map import Estimator
 from augment.effects.snow.layer import build_snow_layer
@@ -51,6 +50,7 @@ from augment.plan import Plan, make_plan
 from augment.render.buffers import ALPHA, BUFFERS, RGB
 from augment.render.composite import quantise
 from augment.render.constants import RasterSettings
+from augment.render.fog import blend_airlight, optical_depth
 from augment.render.layout import ABOVE, BELOW, UNCUT, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, Scene
@@ -928,12 +928,12 @@ def _drawn(
     snow = Snow(depth_m=depth_m)
     layer = build_snow_layer(support, scene, snow, illumination_of(scene, snow), seed=0).ground
     without_snow = dataclasses.replace(scene.background, opacities=layer.opacities)
-    parts = [PosedGaussians(without_snow), PosedGaussians(layer.gaussians, is_snow=True)]
+    parts = [PosedGaussians(without_snow), PosedGaussians(layer.gaussians, is_overlay=True)]
     settings = RasterSettings(sh_degree=0)
     out = rasterize(parts, above, buffers=BUFFERS, settings=settings, clip=UNCUT)
-    assert out.mode_depth is not None and out.snow is not None
+    assert out.mode_depth is not None and out.overlay is not None
     height = SKY_Z_M - out.mode_depth.to(torch.float64).numpy()
-    shown = out.snow.numpy() >= 0.5
+    shown = out.overlay.numpy() >= 0.5
     z, there = height[pixels_of(above, flat.xy)], shown[pixels_of(above, flat.xy)]
     on_it = there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
     off = np.where(on_it, z - flat.z - depth_m, np.nan)
@@ -959,10 +959,10 @@ def snow_masks(
     def seen(camera: Camera) -> MaskedView:
         buffers = render_buffers(scene, camera, plan)
         depth, alpha = buffers.raster.expected_depth, buffers.raster.alpha
-        assert depth is not None and alpha is not None and buffers.snow is not None
+        assert depth is not None and alpha is not None and buffers.overlay is not None
         picture = buffers.rgb.clamp(0, 1).numpy()
         return MaskedView(
-            DepthView(camera, picture, depth.numpy(), alpha.numpy()), buffers.snow.numpy()
+            DepthView(camera, picture, depth.numpy(), alpha.numpy()), buffers.overlay.numpy()
         )
 
     return mask_agreement(view_pairs(scene, frames, scale), seen)

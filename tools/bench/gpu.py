@@ -29,7 +29,6 @@ from torch import Tensor
 
 from adapters.base import open_scene
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.effects.snow.placement import place_snow_support
 from augment.effects.snow.snow import placement_settings
 from augment.effects.style.color_maps import StyleMaps, style_gaussians
@@ -39,6 +38,7 @@ from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TRANSMITTANCE_STOP, 
 from augment.render.cuda.driver import list_tiles, project, rasterize_cuda
 from augment.render.cuda.runtime import gpu_device, launch
 from augment.render.cuda.splats import TILE, CudaSplats, CudaTiles, GpuStageTimer, gather_inputs
+from augment.render.fog import Fog
 from augment.render.layout import (
     C_AT,
     C_X,
@@ -103,7 +103,7 @@ from tools.output import write_json
 BACKEND = "cuda"
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
-MEDIUM = SmogMedium(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+MEDIUM = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
 STAGES = ("project", "list", "blend")
 PLACEMENTS = 3  # that count
 CLEAN, SMOG, FLOOD, SCREEN = "clean", "smog", "flood balanced", "flood balanced, screen space"
@@ -271,7 +271,7 @@ def count_blends(
 
 
 def draw(
-    parts: list[PosedGaussians], camera: Camera, smog: SmogMedium | None = None, timer: Any = None
+    parts: list[PosedGaussians], camera: Camera, smog: Fog | None = None, timer: Any = None
 ) -> RenderOutput:
     return rasterize_cuda(parts, camera, BUFFERS, SETTINGS, smog, timer=timer)
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.render.buffers import ALPHA, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cpu.driver import rasterize_cpu, warm_up
+from augment.render.fog import Fog
 from augment.render.reference import bin_to_tiles, project_parts, rasterize_reference
 from augment.scene import PosedGaussians
 from tools.bench.harness import (
@@ -32,7 +32,7 @@ from tools.bench.scenes import LARGE_CASE, SMALL_CASE, RasterCase, random_scene
 STAGES = ("project", "sort", "bin", "raster")
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
-SMOG = SmogMedium(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+SMOG = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
 COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
            "scene MiB", "frame MiB")  # fmt: skip
 REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",
@@ -109,9 +109,7 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
     }
 
 
-def _draw(
-    parts: list[PosedGaussians], camera: Camera, smog: SmogMedium | None = None
-) -> RenderOutput:
+def _draw(parts: list[PosedGaussians], camera: Camera, smog: Fog | None = None) -> RenderOutput:
     return rasterize_cpu(parts, camera, BUFFERS, SETTINGS, smog)
 
 

@@ -271,7 +271,7 @@ def standard_of(
     depth, alpha = buffers.depth_m, buffers.raster.alpha
     surfaces, nowhere = (alpha >= SURFACE_ALPHA) & (depth > 0), torch.zeros_like(alpha) > 0
     water = nowhere if buffers.water is None else buffers.water
-    snow = nowhere if buffers.snow is None else buffers.snow
+    snow = nowhere if buffers.overlay is None else buffers.overlay
     if plan.flood is not None:
         depth = torch.where(water, plane_depth(camera, plan.flood.level_z_m).to(depth.dtype), depth)
         alpha = torch.where(water, 1.0, alpha)

@@ -25,9 +25,9 @@ from augment.effects.flood.water_plane import (
     window_offset,
 )
 from augment.effects.flood.waves import WaveField, WaveSet, turns_at
-from augment.effects.smog import SmogMedium
 from augment.render.constants import DEPTH_EPS
 from augment.render.cuda.runtime import gpu_device, launch, resident, upload
+from augment.render.fog import Fog
 
 LANES = 512  # pixels of a program that puts layers together
 MAX_OTHERS = 4  # buffers that the kernel joins beside alpha and expected depth
@@ -266,7 +266,7 @@ def trace(
 def shade(water: Water) -> Float[Tensor, "h w 3"]:
     """As `water.shade_water`."""
     camera, medium, field, screen = water.camera, water.medium, water.field, water.screen
-    faces, size, layered = flat_faces(water.sky, water.smog)
+    faces, size, layered = flat_faces(water.sky, water.fog)
     cover = _on_gpu(water.cover)
     nothing = cover, cover, cover
     mirror = nothing if water.mirror is None else _images(water.mirror)
@@ -315,7 +315,7 @@ def _averages(
     return mips, levels
 
 
-def _numbers(water: Water, layered: SmogMedium | None) -> Float32[np.ndarray, " n"]:
+def _numbers(water: Water, layered: Fog | None) -> Float32[np.ndarray, " n"]:
     """What `kernels.shade` reads beside images."""
     camera, bed = water.camera, water.bed
     axes = camera.world_from_camera[:3, :3].numpy()

@@ -638,7 +638,7 @@ def average(rgb, alpha, width, height, across, levels, mips):
 # (`water.medium_numbers`); the largest cover of water that shows, the variance of smooth pixels.
 _AXES, _LENS, _BED, _MIRROR, _FRONT = (tl.constexpr(k) for k in (0, 9, 14, 36, 58))
 _PLANE_HEIGHT, _INDEX, _EXTINCTION, _RGB = (tl.constexpr(k) for k in (80, 81, 83, 86))
-_SMOG, _SMOG_ABOVE, _AIRLIGHT = (tl.constexpr(k) for k in (89, 90, 91))
+_FOG, _FOG_ABOVE, _AIRLIGHT = (tl.constexpr(k) for k in (89, 90, 91))
 _COVER, _SMOOTH = tl.constexpr(94), tl.constexpr(95)
 
 _FARTHEST_RAY = tl.constexpr(refraction.FARTHEST)
@@ -812,12 +812,12 @@ def shade(
     meets = falls(rows, i, j, inside_image)
     covered = tl.load(cover + pixel, mask=meets, other=2.0)
     shown = covered <= tl.load(numbers + _COVER)
-    smog = tl.load(numbers + _SMOG)
+    fog = tl.load(numbers + _FOG)
     red, green, blue = three(numbers + _RGB)
     fog_r, fog_g, fog_b = three(numbers + _AIRLIGHT)
-    sum_r = tl.where(meets, tl.where(smog > 0.0, fog_r, red), 0.0)
-    sum_g = tl.where(meets, tl.where(smog > 0.0, fog_g, green), 0.0)
-    sum_b = tl.where(meets, tl.where(smog > 0.0, fog_b, blue), 0.0)
+    sum_r = tl.where(meets, tl.where(fog > 0.0, fog_r, red), 0.0)
+    sum_g = tl.where(meets, tl.where(fog > 0.0, fog_g, green), 0.0)
+    sum_b = tl.where(meets, tl.where(fog > 0.0, fog_b, blue), 0.0)
     if tl.max(shown.to(tl.int32), 0) > 0:
         eye = tl.load(numbers + _PLANE_HEIGHT)
         index = tl.load(numbers + _INDEX)
@@ -832,7 +832,7 @@ def shade(
         length = tl.sqrt(dx * dx + dy * dy + dz * dz)
         inverse = 1.0 / length
         vx, vy, vz = -dx * inverse, -dy * inverse, -dz * inverse
-        near = smog * along * length
+        near = fog * along * length
         nx = tl.load(normal_x + pixel, mask=shown, other=0.0)
         ny = tl.load(normal_y + pixel, mask=shown, other=0.0)
         upright = tl.rsqrt(tl.maximum(1.0 - nx * nx - ny * ny, _STEEPEST))
@@ -936,7 +936,7 @@ def shade(
                     level = tl.where(rough, tl.minimum(level, (levels - 1).to(tl.float32)), 0.0)
                     low = tl.floor(level).to(tl.int32)
                     above = level - tl.floor(level)
-            smog_above = tl.load(numbers + _SMOG_ABOVE)
+            fog_above = tl.load(numbers + _FOG_ABOVE)
             for tap in range(taps):
                 offset = tl.where(tap == 0, 0.0, tl.where(tap == 1, spread, -spread))
                 part = tl.where(rough, tl.where(tap == 0, 2.0 / 3, 1.0 / 6), 1.0)
@@ -959,7 +959,7 @@ def shade(
                 transmittance = 1.0 - a
                 shines = transmittance > _FAINT
                 sky_r, sky_g, sky_b = _sky(faces, size, x, y, z, shown & shines & (part > 0.0))
-                t = tl.where(smog_above >= 0.0, tl.exp(-(near + smog_above / z)), 1.0)
+                t = tl.where(fog_above >= 0.0, tl.exp(-(near + fog_above / z)), 1.0)
                 whole = tl.where(shines, 1.0, 1.0 / tl.maximum(a, 0.5))
                 clear_sky = tl.where(shines, transmittance * t, 0.0)
                 hazy_sky = tl.where(shines, transmittance * (1.0 - t), 0.0)

@@ -42,7 +42,6 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import wave_field
-from augment.effects.smog import SmogMedium, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -57,6 +56,7 @@ from augment.render.buffers import (
 )
 from augment.render.composite import composite_sky, sky_behind
 from augment.render.constants import DEPTH_EPS, RasterSettings
+from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
@@ -98,7 +98,7 @@ def composite_water(
     window: Window,
     color: Float[Tensor, "h w 3"],
     sky: Sky,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     *,
     backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
@@ -110,7 +110,7 @@ def composite_water(
     rgb, alpha = front.rgb, front.alpha
     kernels = kernels_for(backend, rgb, alpha)
     if kernels == REFERENCE:
-        image = composite_sky(rgb, alpha, camera, sky, smog=smog, backend=backend)
+        image = composite_sky(rgb, alpha, camera, sky, fog=fog, backend=backend)
         mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
         meets = falling(window.of(camera))[..., None]
         window.paste(image, torch.where(meets, mixed, window.cut(image)))
@@ -121,13 +121,13 @@ def composite_water(
         part, dry = rgb, cuda.dry_rows(camera)
         if dry:
             above = camera.cropped(0, 0, camera.width, dry)
-            part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
+            part = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog, backend=backend)
         cuda.composite_water(rgb, alpha, camera, window, color, part, dry)
         return rgb
     dry = _dry_rows(camera)
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
-        part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog)
+        part = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog)
         # Rows that show both: what falls there belongs to the water, the rest to the sky.
         shared = rgb[window.top : dry].clone()
         rgb[:dry] = part
@@ -212,11 +212,11 @@ def merge_depths(
 
 
 def view_from_below(
-    front: Layer, air: Layer, medium: FloodMedium, sky: Sky, smog: SmogMedium | None = None
+    front: Layer, air: Layer, medium: FloodMedium, sky: Sky, fog: Fog | None = None
 ) -> Float[Tensor, "H W 3"]:
     """The picture of an eye at or below the water's surface, not clamped.
 
-    front: what lies under water. air: what lies above, from the same camera. smog: in the air.
+    front: what lies under water. air: what lies above, from the same camera. fog: in the air.
     What the surface reflects back down counts as water.
     """
     camera = front.camera
@@ -230,11 +230,11 @@ def view_from_below(
     up = directions[..., 2] / lengths
     bent = _into_air(directions / lengths[..., None], medium.refraction_index)
     reflected = exact(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
-    behind, smog = sky_behind(sky, smog)
+    behind, fog = sky_behind(sky, fog)
     sky_rgb = sample_at(behind, bent)
-    if smog is not None:
-        tau = sky_optical_depth(smog, bent[..., 2], medium.level_z_m)
-        sky_rgb = blend_airlight(sky_rgb, tau, smog)
+    if fog is not None:
+        tau = sky_optical_depth(fog, bent[..., 2], medium.level_z_m)
+        sky_rgb = blend_airlight(sky_rgb, tau, fog)
     outside = air.rgb + (1 - air.alpha)[..., None] * sky_rgb
     surface = (1 - reflected) * outside + reflected * deep
     depth = plane_depth(camera, medium.level_z_m, device).to(rgb.dtype)
@@ -274,19 +274,19 @@ MAX_SHIFT = 0.12  # of the image's height
 class LayerRenderer:
     """Draws the parts of a scene on one side of a level plane.
 
-    smog: blended per Gaussian. smog_on_buffers: applied to finished layers; at most one is set.
+    fog: blended per Gaussian. fog_on_buffers: applied to finished layers; at most one is set.
     """
 
     parts: Sequence[PosedGaussians]
     sky: Sky
     settings: RasterSettings
-    smog: SmogMedium | None
-    smog_on_buffers: SmogMedium | None
+    fog: Fog | None
+    fog_on_buffers: Fog | None
     backend: str
 
     @property
-    def medium(self) -> SmogMedium | None:
-        return self.smog or self.smog_on_buffers
+    def medium(self) -> Fog | None:
+        return self.fog or self.fog_on_buffers
 
     def draw(
         self,
@@ -295,22 +295,22 @@ class LayerRenderer:
         buffers: frozenset[str],
         pixel_mask: Bool[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """The layer's buffers; its colours are seen through the smog."""
-        if self.smog_on_buffers is not None:
+        """The layer's buffers; its colours are seen through the fog."""
+        if self.fog_on_buffers is not None:
             buffers = buffers | {EXPECTED_DEPTH}
         raster = rasterize(
             self.parts,
             camera,
             buffers=buffers,
             settings=self.settings,
-            smog=self.smog,
+            fog=self.fog,
             clip=clip,
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
-        if self.smog_on_buffers is None:
+        if self.fog_on_buffers is None:
             return raster
-        return replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
+        return replace(raster, rgb=fog_raster(raster, camera, self.fog_on_buffers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +351,7 @@ def render_flooded(
     with timed("rasterise"):
         front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
-    sky, smog = renderer.sky, renderer.medium
+    sky, fog = renderer.sky, renderer.medium
     backend = renderer.backend
     if backend == AUTO and front.alpha.device.type != "cpu":
         backend = CUDA  # also passes without an image of their own run where the layers lie
@@ -359,7 +359,7 @@ def render_flooded(
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - water_kernels.HIDDEN_COVER:
         with timed("sky"):
-            image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, backend=backend)
+            image = composite_sky(front.rgb, front.alpha, camera, sky, fog=fog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
@@ -390,11 +390,11 @@ def render_flooded(
             mirror=mirror,
             screen=screen,
             sky=sky,
-            smog=smog,
+            fog=fog,
             backend=backend,
         )
     with timed("flood: layers joined"):
-        image = composite_water(front, camera, window, color, sky, smog, backend=backend)
+        image = composite_water(front, camera, window, color, sky, fog, backend=backend)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
 
@@ -478,7 +478,7 @@ def _from_below(
 ) -> FloodedImage:
     """From under the water, or exactly at its surface."""
     requested = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    in_air = replace(renderer, smog=None, smog_on_buffers=None)
+    in_air = replace(renderer, fog=None, fog_on_buffers=None)
     with timed("rasterise"):
         front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
         above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)

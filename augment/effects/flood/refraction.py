@@ -29,8 +29,8 @@ from augment.effects.flood.water_kernels import (
 )
 from augment.effects.flood.water_plane import window_offset
 from augment.effects.flood.waves import WaveField
-from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.composite import sky_behind
+from augment.render.fog import Fog, optical_depth, vertical_optical_depth
 from augment.sky import Sky
 
 # ---- What a layer's image shows in a direction ---------------------------------------------------
@@ -234,7 +234,7 @@ def through_the_surface(
     camera: Camera,
     medium: FloodMedium,
     bed: Layer,
-    smog: SmogMedium | None,
+    fog: Fog | None,
 ) -> Float[Tensor, "H W 3"]:
     """Colour of the light that comes up through the surface: T = a bed + (1 - a) water.
 
@@ -242,7 +242,7 @@ def through_the_surface(
     where it leaves the bed's image or meets a hole; the water's own colour where there is no bed
     behind the pixel, or too deep to be seen.
     """
-    water = water_color(surface, camera, medium, smog)
+    water = water_color(surface, camera, medium, fog)
     own_column, own_row = _own_pixel(bed.camera, camera, normal.dtype)
     own_inside = is_inside(bed.camera, own_column, own_row)
     own_solid, own_point = point_at(bed, own_column, own_row)
@@ -305,23 +305,23 @@ def _depth_below(surface: Surface, point: Tensor) -> Float[Tensor, "H W"]:
 
 
 def water_color(
-    surface: Surface, camera: Camera, medium: FloodMedium, smog: SmogMedium | None
+    surface: Surface, camera: Camera, medium: FloodMedium, fog: Fog | None
 ) -> Float[Tensor, "H W 3"]:
-    """Deep water's own colour, seen through the smog before it."""
+    """Deep water's own colour, seen through the fog before it."""
     dtype = surface.points.dtype
     own = torch.tensor(medium.rgb, dtype=dtype).expand(surface.points.shape)
-    if smog is None:
+    if fog is None:
         return own
-    t = torch.exp(-smog_before(surface, camera, medium.level_z_m, smog))[..., None]
-    return t * own + (1 - t) * torch.tensor(smog.rgb, dtype=dtype)
+    t = torch.exp(-fog_before(surface, camera, medium.level_z_m, fog))[..., None]
+    return t * own + (1 - t) * torch.tensor(fog.rgb, dtype=dtype)
 
 
-def smog_before(
-    surface: Surface, camera: Camera, level_z_m: float, smog: SmogMedium
+def fog_before(
+    surface: Surface, camera: Camera, level_z_m: float, fog: Fog
 ) -> Float[Tensor, "H W"]:
-    """Optical depth of the smog between the eye and the surface."""
+    """Optical depth of the fog between the eye and the surface."""
     level = torch.full_like(surface.distance, level_z_m)
-    return optical_depth(smog, surface.distance, float(camera.centre[2]), level)
+    return optical_depth(fog, surface.distance, float(camera.centre[2]), level)
 
 
 # ---- What the surface reflects: the sky, the mirrored layer, the image itself --------------------
@@ -335,14 +335,14 @@ def reflect_sky(
     camera: Camera,
     level_z_m: float,
     sky: Sky,
-    smog: SmogMedium | None,
+    fog: Fog | None,
 ) -> Colours:
-    """The sky in unit directions that climb, through the smog before it and before the surface."""
-    seen, layered = sky_behind(sky, smog)
+    """The sky in unit directions that climb, through the fog before it and before the surface."""
+    seen, layered = sky_behind(sky, fog)
     colors = [seen.sample(ray) for ray in rays]
     if layered is None:
         return colors
-    near = smog_before(surface, camera, level_z_m, layered)
+    near = fog_before(surface, camera, level_z_m, layered)
     above = vertical_optical_depth(layered, level_z_m)
     airlight = torch.tensor(layered.rgb, dtype=near.dtype)
     transmittances = [torch.exp(-(near + above / ray[..., 2]))[..., None] for ray in rays]

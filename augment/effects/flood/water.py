@@ -37,9 +37,9 @@ from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.water_kernels import HIDDEN_COVER, MIN_COSINE
 from augment.effects.flood.water_plane import image_coordinates, window_offset
 from augment.effects.flood.waves import WaveField
-from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.buffers import CPU, REFERENCE, kernels_for
 from augment.render.composite import sky_behind
+from augment.render.fog import Fog, optical_depth, vertical_optical_depth
 from augment.render.threads import kernel_threads
 from augment.sky import (
     ConstantSky,
@@ -53,7 +53,7 @@ from augment.sky import (
 
 
 class Water(NamedTuple):
-    """What `shade_water` is given; smog is None where it has no density."""
+    """What `shade_water` is given; fog is None where it has no density."""
 
     camera: Camera
     cover: Float[Tensor, "h w"]
@@ -63,7 +63,7 @@ class Water(NamedTuple):
     mirror: Layer | None
     screen: ScreenReflection | None
     sky: Sky
-    smog: SmogMedium | None
+    fog: Fog | None
 
 
 # ---- The kernels' arrays -------------------------------------------------------------------------
@@ -77,7 +77,7 @@ LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 def _shade(water: Water) -> Tensor:
     camera, field, mirror, screen = water.camera, water.field, water.mirror, water.screen
-    faces, size, layered = flat_faces(water.sky, water.smog)
+    faces, size, layered = flat_faces(water.sky, water.fog)
     limit = smooth_variance(camera)
     rough = bool((field.slope_variance >= limit).any())
     out = np.empty((camera.height, camera.width, 3), np.float32)
@@ -113,12 +113,12 @@ def _array(part: Tensor) -> np.ndarray:
     return part.detach().float().contiguous().numpy()
 
 
-def flat_faces(sky: Sky, smog: SmogMedium | None) -> tuple[Tensor, int, SmogMedium | None]:
-    """(flat cube map, size of its faces with border, the smog before them).
+def flat_faces(sky: Sky, fog: Fog | None) -> tuple[Tensor, int, Fog | None]:
+    """(flat cube map, size of its faces with border, the fog before them).
 
     The map of an image is the same tensor until the image changes.
     """
-    seen, layered = sky_behind(sky, smog)
+    seen, layered = sky_behind(sky, fog)
     if isinstance(seen, ConstantSky):
         return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
     if not isinstance(seen, CubemapSky | LatLongSky):
@@ -186,14 +186,14 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
     return mips.reshape(-1), np.asarray(shapes, np.int64)
 
 
-def medium_numbers(water: Water, layered: SmogMedium | None) -> np.ndarray:
-    """`kernels.Medium`. layered: the smog before the sky."""
+def medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
+    """`kernels.Medium`. layered: the fog before the sky."""
     medium, eye_z = water.medium, float(water.camera.centre[2])
     level = medium.level_z_m
     per_m, above, airlight = 0.0, -1.0, (0.0, 0.0, 0.0)
-    if water.smog is not None:
+    if water.fog is not None:
         metre, height = torch.tensor([1.0, level], dtype=torch.float64)
-        per_m, airlight = float(optical_depth(water.smog, metre, eye_z, height)), water.smog.rgb
+        per_m, airlight = float(optical_depth(water.fog, metre, eye_z, height)), water.fog.rgb
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]
@@ -214,22 +214,22 @@ def shade_water(
     mirror: Layer | None = None,
     screen: ScreenReflection | None = None,
     sky: Sky,
-    smog: SmogMedium | None = None,
+    fog: Fog | None = None,
     backend: str = CPU,
 ) -> Float[Tensor, "h w 3"]:
     """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
 
     cover: alpha of what stands before the water; above HIDDEN_COVER the result is the water's own
-    colour, or the smog's. bed: from a window of the same image. mirror: from the mirrored eye.
-    screen: serves the smooth pixels. Layers are fogged already; smog here dims the sky and the
+    colour, or the fog's. bed: from a window of the same image. mirror: from the mirrored eye.
+    screen: serves the smooth pixels. Layers are fogged already; fog here dims the sky and the
     water's own colour. backend: kernels equal the definition within float rounding.
 
     Raises:
         ValueError: the bed's camera and this one are not windows of one image.
     """
-    if smog is not None and smog.sigma_per_m == 0:
-        smog = None
-    water = Water(camera, cover, medium, field, bed, mirror, screen, sky, smog)
+    if fog is not None and fog.sigma_per_m == 0:
+        fog = None
+    water = Water(camera, cover, medium, field, bed, mirror, screen, sky, fog)
     layers = (bed, mirror, None if screen is None else screen.layer)
     images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]
     backend = kernels_for(backend, cover, *(part for parts in images for part in parts))
@@ -242,11 +242,11 @@ def shade_water(
     surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
     smooth = is_smooth(field, camera)
     taps = tilted_normals(surface, field, smooth)
-    below = through_the_surface(surface, taps[0][1], camera, medium, bed, smog)
+    below = through_the_surface(surface, taps[0][1], camera, medium, bed, fog)
     out = below
     if medium.refraction_index != 1:
         rays = [mirrored(surface.to_eye, normal) for _, normal in taps]
-        above = reflect_sky(surface, rays, camera, medium.level_z_m, sky, smog)
+        above = reflect_sky(surface, rays, camera, medium.level_z_m, sky, fog)
         seen = [torch.zeros_like(below[..., :1]).expand(*cover.shape, 4)] * len(taps)
         if mirror is not None:
             seen = reflect_mirror(surface, rays, mirror, smooth)
@@ -257,6 +257,6 @@ def shade_water(
             cosine = (normal * surface.to_eye).sum(-1).clamp(MIN_COSINE, 1)
             share = weight * reflectance(cosine, medium.refraction_index, medium.fresnel)
             out = out + share[..., None] * (before_sky(color, behind) - below)
-    plain = torch.tensor(medium.rgb if smog is None else smog.rgb, dtype=out.dtype)
+    plain = torch.tensor(medium.rgb if fog is None else fog.rgb, dtype=out.dtype)
     out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain)
     return torch.where(surface.meets[..., None], out, 0)

@@ -192,10 +192,10 @@ class View(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """The water and the smog over it.
+    """The water and the fog over it.
 
-    height: of the eye over the water. smog_per_m: optical depth between eye and water per metre of
-    the ray, 0 without smog. smog_above: from the water straight up, < 0 where the sky is seen
+    height: of the eye over the water. fog_per_m: optical depth between eye and water per metre of
+    the ray, 0 without fog. fog_above: from the water straight up, < 0 where the sky is seen
     clearly (or replaced by the airlight already). least_extinction: of the three.
     """
 
@@ -204,8 +204,8 @@ class Medium(NamedTuple):
     schlick: bool
     extinction: tuple[np.float32, ...]
     rgb: tuple[np.float32, ...]
-    smog_per_m: np.float32
-    smog_above: np.float32
+    fog_per_m: np.float32
+    fog_above: np.float32
     airlight: tuple[np.float32, ...]
     least_extinction: np.float32
 
@@ -513,7 +513,7 @@ def _fetch_level(s, starts, second, column, row, mips):
 
 @inner()
 def _sky(s, faces, size, x, y, z, near, medium):
-    """Colours of a flat, bordered cube map in directions that climb, behind smog."""
+    """Colours of a flat, bordered cube map in directions that climb, behind fog."""
     zero = v8.splat(ZERO)
     ax, ay = v8.absolute(x), v8.absolute(y)
     by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
@@ -535,8 +535,8 @@ def _sky(s, faces, size, x, y, z, near, medium):
         r, g, b, _ = _between(faces, at, at + size, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k] = r, g, b
     seen = _load3(s, R, G, B)
-    if medium.smog_above >= ZERO:
-        t = _exponential(near + v8.splat(medium.smog_above) / z)
+    if medium.fog_above >= ZERO:
+        t = _exponential(near + v8.splat(medium.fog_above) / z)
         seen = _blend3(t, seen, _splat3(medium.airlight))
     return seen
 
@@ -753,7 +753,7 @@ def shade(
                 # The order of these sums is that of Camera.ray_directions: the sign has to agree.
                 fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
                 if not (fall < 0.0 and cover[i, j] <= F(HIDDEN_COVER)):
-                    plain = medium.airlight if medium.smog_per_m > ZERO else medium.rgb
+                    plain = medium.airlight if medium.fog_per_m > ZERO else medium.rgb
                     met = ONE if fall < 0.0 else ZERO
                     for c in range(3):
                         out[i, j, c] = met * plain[c]
@@ -811,7 +811,7 @@ def shade(
                 inverse = one / length
                 vx, vy = v8.negate(dx) * inverse, v8.negate(dy) * inverse
                 view = vx, vy, v8.negate(dz) * inverse
-                near = v8.splat(medium.smog_per_m) * along * length
+                near = v8.splat(medium.fog_per_m) * along * length
                 nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
                 upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(F(STEEPEST)))
                 upright = one / v8.sqrt(upright)
@@ -819,7 +819,7 @@ def shade(
                 normal, c, inside, share, ray = _facet(sx, sy, view, medium)
                 # Through the surface.
                 water = _splat3(medium.rgb)
-                if medium.smog_per_m > ZERO:
+                if medium.fog_per_m > ZERO:
                     water = _blend3(_exponential(near), water, _splat3(medium.airlight))
                 below = water
                 own_depth = v8.load(q, OWN_DEPTH + at)

@@ -33,13 +33,13 @@ from augment.effects.lidar.codes import (
     SCATTERED,
     UNCHANGED,
 )
-from augment.effects.smog import MAX_EXPONENT, SmogMedium, optical_depth_of_arrays
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.layer import find_depths, profile_on
 from augment.effects.snow.snow import PlacedSnow, placement_settings
 from augment.effects.snow.support import support_of
 from augment.labels import KnowsLidarOrigins, LidarSweep
 from augment.plan import Plan, make_plan
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
 from augment.rng import rng_for
 from augment.scene import Scene
 from recipes.schema import KOSCHMIEDER, Recipe
@@ -308,7 +308,7 @@ def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> 
     return (wavelength_um / VISIBLE_UM) ** -(slope * visibility_km + offset)
 
 
-def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
+def extinction_at(medium: Fog, z_m: np.ndarray) -> np.ndarray:
     """alpha [N] at heights, 1/metre."""
     if medium.scale_height_m is None:
         return np.full(len(z_m), medium.sigma_per_m)
@@ -364,7 +364,7 @@ class Scatter(NamedTuple):
 
 
 def scatter_before(
-    medium: SmogMedium,
+    medium: Fog,
     eyes_z_m: np.ndarray,
     ends_m: np.ndarray,
     model: LidarModel,
@@ -716,9 +716,7 @@ def _meet_water(echoes: Echoes, medium: FloodMedium) -> None:
     echoes.replace(water.rows[mud], water.surface_m[mud], water.reflectance[mud], SCATTERED)
 
 
-def _meet_smog(
-    echoes: Echoes, medium: SmogMedium, model: LidarModel, rng: np.random.Generator
-) -> None:
+def _meet_smog(echoes: Echoes, medium: Fog, model: LidarModel, rng: np.random.Generator) -> None:
     factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
     medium = dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
     eyes_z, air = echoes.origins[:, 2], echoes.air_m

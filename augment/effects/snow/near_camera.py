@@ -342,7 +342,7 @@ class SnowLayers:
         lights = (None if s is None else SplatShading(s, sun, self.wrap) for _, s in drawn)
         pose = (part.world_from_part, part.instance_id)
         return [
-            PosedGaussians(splats, *pose, is_snow=True, shading=light)
+            PosedGaussians(splats, *pose, is_overlay=True, shading=light)
             for (splats, _), light in zip(drawn, lights, strict=True)
         ]
 

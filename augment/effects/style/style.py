@@ -298,7 +298,7 @@ class SceneStyle:
         self, parts: Sequence[PosedGaussians], *, backend: str = AUTO
     ) -> tuple[PosedGaussians, ...]:
         """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
-        return tuple(part if part.is_snow else self._mapped(part, backend) for part in parts)
+        return tuple(part if part.is_overlay else self._mapped(part, backend) for part in parts)
 
     @cached_property
     def lighting_scene(self) -> Scene:

@@ -181,7 +181,7 @@ def rasterize_with_gradients(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> RenderOutput:
-    """As `cpu.rasterize_cpu` without smog, recorded by autograd. buffers: some of DIFFERENTIABLE.
+    """As `cpu.rasterize_cpu` without fog, recorded by autograd. buffers: some of DIFFERENTIABLE.
 
     All splats are listed at once instead of slice by slice, so this takes more memory than a plain
     render: 48 bytes for every pair of a splat and a tile, kept until backward.

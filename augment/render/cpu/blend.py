@@ -268,9 +268,9 @@ GROUP = 8  # tiles a thread takes at a time
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
 # is negative where blending has stopped; its size is then the final one. An image needs its plane
 # and all before, so those that cost most come last.
-TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_SNOW = (U(i * PIXELS) for i in range(5))
+TRANSMITTANCE, P_RED, P_GREEN, P_BLUE, P_OVERLAY = (U(i * PIXELS) for i in range(5))
 P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
-COLOR_STATE, SNOW_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
+COLOR_STATE, OVERLAY_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
 STATE = MODELESS_STATE + MODE_PLANES * PIXELS
 
 CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
@@ -279,7 +279,7 @@ CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 @kernel
 def blend_tiles(
     records, tile_splat_ids, tile_offsets, tiles, states, is_last, size, limits, rgb, alpha,
-    expected, median, ids, mode, snow, cuts, lights,
+    expected, median, ids, mode, overlay, cuts, lights,
 ):  # fmt: skip
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
@@ -288,7 +288,7 @@ def blend_tiles(
     wait for the next slice. size: image width and height. limits: float32, alpha_max,
     log2(ALPHA_MIN), what a splat must leave more of than this to be blended, 1 where rays are
     parallel, mode depth's floor, 1/fx^2, 1/fy^2, the transmittance at which a pixel is finished.
-    rgb to snow: flat images; all but alpha may be None. cuts, lights: flat, of each slot as
+    rgb to overlay: flat images; all but alpha may be None. cuts, lights: flat, of each slot as
     geometry has them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
@@ -315,8 +315,8 @@ def blend_tiles(
                 _copy(states, U(tile * used), state, U(0), U(used))
             is_open = _blend_list(
                 records, tile_splat_ids, first, last, np.float32(left), np.float32(top), limits,
-                state, staged, spans, values, places, rows, rgb, expected, median, ids, mode, snow,
-                cuts, lines, edges, surfaces, lights, lit,
+                state, staged, spans, values, places, rows, rgb, expected, median, ids, mode,
+                overlay, cuts, lines, edges, surfaces, lights, lit,
             )  # fmt: skip
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
@@ -324,7 +324,9 @@ def blend_tiles(
             else:
                 if mode is not None:
                     close_clusters(state, P_MODE)
-                _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow)
+                _write_pixels(
+                    state, left, top, size, rgb, alpha, expected, median, ids, mode, overlay
+                )
                 tiles[tile] = CLOSED
 
 
@@ -353,7 +355,7 @@ def _clear(state, used, width, height):
 @inner()
 def _blend_list(
     records, tile_splat_ids, first, last, left, top, limits, state, staged, spans, values, places,
-    rows, rgb, expected, median, ids, mode, snow, cuts, lines, edges, surfaces, lights, lit,
+    rows, rgb, expected, median, ids, mode, overlay, cuts, lines, edges, surfaces, lights, lit,
 ):  # fmt: skip
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
@@ -367,7 +369,7 @@ def _blend_list(
             v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
         stage(
             records, tile_splat_ids, U(at), U(count), left, top,
-            rgb, expected, median, ids, mode, snow, staged,
+            rgb, expected, median, ids, mode, overlay, staged,
         )  # fmt: skip
         if lights is not None and rgb is not None:
             stage_lights(lights, tile_splat_ids, U(at), U(count), lit)
@@ -389,19 +391,19 @@ def _blend_list(
                 list_lines(lines, SHARE, U(count), strip, spans, edges)
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    snow, cuts, lines, edges, surfaces, lights, lit,
+                    overlay, cuts, lines, edges, surfaces, lights, lit,
                 )  # fmt: skip
             elif (median is not None or ids is not None or mode is not None) and _can_change(
                 state, strip, rows, median, ids, mode
             ):
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    snow, cuts, lines, None, surfaces, lights, lit,
+                    overlay, cuts, lines, None, surfaces, lights, lit,
                 )  # fmt: skip
             else:
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, None, None, None,
-                    snow, cuts, lines, None, surfaces, lights, lit,
+                    overlay, cuts, lines, None, surfaces, lights, lit,
                 )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
@@ -449,7 +451,7 @@ def shrink(state, strip, rows):
 
 @inner()
 def _blend_items(
-    state, staged, values, places, items, limits, rgb, expected, median, ids, mode, snow, cuts,
+    state, staged, values, places, items, limits, rgb, expected, median, ids, mode, overlay, cuts,
     lines, edges, surfaces, lights, lit,
 ):  # fmt: skip
     """Blend all items in turn. The next one's alpha is begun before this one is blended.
@@ -486,8 +488,8 @@ def _blend_items(
             _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
             _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
             _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
-        if snow is not None:
-            _add(state, at + P_SNOW, weight, staged[U(L.IS_SNOW) * n + splat])
+        if overlay is not None:
+            _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
         if expected is not None or mode is not None:
             centre = staged[U(L.DEPTH) * n + splat]
             depth = v8.splat(centre)
@@ -534,7 +536,7 @@ def _add(state, at, weight, value):
 
 
 @inner()
-def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow):
+def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, overlay):
     """Pixels of a finished tile to the images, which are flat."""
     for y in range(U(min(TILE_H, size[1] - top))):
         for strip in range(U(STRIPS)):
@@ -558,5 +560,5 @@ def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mod
                     ids[pixel + lane] = np.float32(state[at + lane + P_ID]).view(np.int32)
                 if mode is not None:
                     mode[pixel + lane] = state[at + lane + P_MODE + MODE]
-                if snow is not None:
-                    snow[pixel + lane] = state[at + lane + P_SNOW]
+                if overlay is not None:
+                    overlay[pixel + lane] = state[at + lane + P_OVERLAY]

@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.geometry import any_in_squares
 from augment.render import layout
 from augment.render.buffers import (
@@ -32,8 +31,8 @@ from augment.render.buffers import (
     BUFFERS,
     MEDIAN_DEPTH,
     MODE_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
     RenderOutput,
 )
@@ -41,6 +40,7 @@ from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettin
 from augment.render.cpu import blend as blend_kernels
 from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
+from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, thread_count
@@ -75,7 +75,7 @@ def gather_inputs(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
     *,
     with_color: bool,
@@ -93,13 +93,13 @@ def gather_inputs(
         firsts = range(0, count, layout.BLOCK)
         blocks += [(number, first, min(first + layout.BLOCK, count)) for first in firsts]
     counts = [size[0] for size in sizes]
-    modes = raster_modes(settings, smog, clip, with_color=with_color)
+    modes = raster_modes(settings, fog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
     return Inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, layout.ADDRESSES),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        views=views_of(parts, camera, settings, smog, clip),
+        views=views_of(parts, camera, settings, fog, clip),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=modes,
         arrays=arrays,
@@ -181,7 +181,7 @@ def rasterize_cpu(
     camera: Camera,
     buffers: frozenset[str],
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
     pixel_mask: np.ndarray | None = None,
     *,
@@ -196,7 +196,7 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     timer = StageTimer(stage_times)
-    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
+    inputs = gather_inputs(parts, camera, settings, fog, clip, with_color=RGB in buffers)
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = Tiles(camera, images, settings, scratch)
@@ -451,9 +451,9 @@ def _state_size(images: dict[str, np.ndarray]) -> int:
     names = set(images) - {RGB, ALPHA}
     if MODE_DEPTH in names:
         return blend_kernels.STATE
-    if names - {SNOW}:
+    if names - {OVERLAY}:
         return blend_kernels.MODELESS_STATE
-    return blend_kernels.SNOW_STATE if names else blend_kernels.COLOR_STATE
+    return blend_kernels.OVERLAY_STATE if names else blend_kernels.COLOR_STATE
 
 
 def _splats_in(rects: np.ndarray, limit: int) -> int:

@@ -23,7 +23,7 @@ ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the sur
 
 @inner()
 def stage(
-    records, tile_splat_ids, at, count, left, top, rgb, expected, median, ids, mode, snow, staged
+    records, tile_splat_ids, at, count, left, top, rgb, expected, median, ids, mode, overlay, staged
 ):
     """Records of a batch, turned to one row a field, relative to the tile's corner."""
     n = U(BATCH)
@@ -37,8 +37,8 @@ def stage(
             staged[U(L.DEPTH) * n + k] = records[record + U(L.DEPTH)]
         if ids is not None:
             staged[U(L.SPLAT_ID) * n + k] = records[record + U(L.SPLAT_ID)]
-        if snow is not None:
-            staged[U(L.IS_SNOW) * n + k] = records[record + U(L.IS_SNOW)]
+        if overlay is not None:
+            staged[U(L.IS_OVERLAY) * n + k] = records[record + U(L.IS_OVERLAY)]
         if rgb is not None:
             staged[U(L.RED) * n + k] = records[record + U(L.RED)]
             staged[U(L.GREEN) * n + k] = records[record + U(L.GREEN)]

@@ -12,7 +12,6 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.effects.smog import MAX_EXPONENT
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.geometry import (
@@ -38,14 +37,15 @@ from augment.render.cpu.geometry import (
 )
 from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
+from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import BIN_SHIFT, BLOCK, CUT, LANES, MAP, RECORD, TILE_H, TILE_W, U
 
-# ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog -----
+# ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then fog -----
 # Eight splats at a time for what depends on the direction alone (`prepare_colors`), one at a time
 # for the sum over its coefficients (`write_color`), which are read where they lie in the scene.
 
 MAX_FUNCTIONS = 16
-TRANSMITTANCE = MAX_FUNCTIONS  # row of the smog's transmittance, after those of the SH functions
+TRANSMITTANCE = MAX_FUNCTIONS  # row of the fog's transmittance, after those of the SH functions
 COLOR_ROWS = MAX_FUNCTIONS + 1
 
 _C0 = np.float32(math.sqrt(1 / (4 * math.pi)))
@@ -61,7 +61,7 @@ _C3_ZXX = np.float32(math.sqrt(105 / (16 * math.pi)))
 
 
 @inner()
-def prepare_colors(dx, dy, dz, view, functions, smog, rows):
+def prepare_colors(dx, dy, dz, view, functions, fog, rows):
     """SH functions and transmittance of eight splats, d from the eye in the part's axes.
 
     rows: flat, COLOR_ROWS of eight, filled.
@@ -69,9 +69,9 @@ def prepare_colors(dx, dy, dz, view, functions, smog, rows):
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     inverse = v8.splat(np.float32(1)) / distance
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
-    if smog != L.NO_SMOG:
+    if fog != L.NO_FOG:
         tau = v8.splat(view[L.V_SIGMA]) * distance
-        if smog == L.LAYERED_SMOG:
+        if fog == L.LAYERED_FOG:
             tau = tau * _layered_density(dx, dy, dz, view)
         lowest = v8.splat(np.float32(-126))  # 1e-38: nothing is seen through it
         transmittance = exp2_fine(v8.maximum(tau * v8.splat(-LOG2_E), lowest))
@@ -82,7 +82,7 @@ def prepare_colors(dx, dy, dz, view, functions, smog, rows):
 def _layered_density(dx, dy, dz, view):
     """Mean density along the way, relative to the base: exp(-min(a, b)) (1 - exp(-x)) / x.
 
-    a, b: heights of eye and splat in scale heights, x = |b - a|; see weather.smog.
+    a, b: heights of eye and splat in scale heights, x = |b - a|; see weather.fog.
     """
     one, zero = v8.splat(np.float32(1)), v8.splat(np.float32(0))
     up = v8.splat(view[L.V_UP + 2]) * dz
@@ -130,8 +130,8 @@ def write_basis(x, y, z, functions, rows):
 
 
 @inner()
-def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records, slot):
-    """max(0.5 + sum sh Y, 0), mapped and in the smog, to the record that starts at `slot`.
+def write_color(sh, at, functions, maps, at_map, view, fog, rows, lane, records, slot):
+    """max(0.5 + sum sh Y, 0), mapped and in the fog, to the record that starts at `slot`.
 
     sh, maps: flat; the splat's coefficients start at `at`, its colour map at `at_map`, which is
     negative where it has none.
@@ -150,7 +150,7 @@ def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records
         mapped_g = _map_channel(maps, U(at_map) + U(4), r, g, b)
         b = _map_channel(maps, U(at_map) + U(8), r, g, b)
         r, g = mapped_r, mapped_g
-    if smog != L.NO_SMOG:
+    if fog != L.NO_FOG:
         t = rows[U(TRANSMITTANCE * LANES) + lane]
         hidden = np.float32(1) - t
         r = scalar_fmuladd(t, r, hidden * view[L.V_AIRLIGHT])
@@ -352,12 +352,12 @@ def project_slice(
                 splat = picked[at + lane]
                 record = slot * U(RECORD)
                 _write_record(rows, lane, first_ids[part] + splat, records, record)
-                records[record + U(L.IS_SNOW)] = views[part, L.V_SNOW]
+                records[record + U(L.IS_OVERLAY)] = views[part, L.V_OVERLAY]
                 if modes[L.M_COLOR]:
                     from_sh = U(splat) * U(functions * 3)
                     at_map = _map_of(map_rows, splat, map_count)
                     write_color(
-                        sh, from_sh, used, maps, at_map, views[part], modes[L.M_SMOG], rows, lane,
+                        sh, from_sh, used, maps, at_map, views[part], modes[L.M_FOG], rows, lane,
                         records, record,
                     )  # fmt: skip
                 if modes[L.M_CLIP]:
@@ -365,7 +365,7 @@ def project_slice(
                         cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
                 if modes[L.M_LIGHT]:
                     _write_lights(
-                        slopes, splat, modes[L.M_SMOG], views[part], rows, lane, lights, slot
+                        slopes, splat, modes[L.M_FOG], views[part], rows, lane, lights, slot
                     )
                 keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
                 slot += U(1)
@@ -425,7 +425,7 @@ def _write_record(rows, lane, number, records, record):
 
 
 @inner()
-def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
+def _write_lights(slopes, splat, fog, view, rows, lane, lights, slot):
     first = slot * U(SHADING_LINES)
     if not view[L.V_LIT] > np.float32(0):
         for line in range(U(SHADING_LINES)):
@@ -434,7 +434,7 @@ def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
     for line in range(U(L_RED)):
         lights[first + line] = rows[(U(_LIGHTS) + line) * U(LANES) + lane]
     transmittance = np.float32(1)
-    if smog != L.NO_SMOG:
+    if fog != L.NO_FOG:
         transmittance = rows[U(TRANSMITTANCE * LANES) + lane]
     for channel in range(U(3)):
         slope = slopes[U(splat) * U(3) + channel]
@@ -447,7 +447,7 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
     d = from_eye(means, picked, at, view)
     if modes[L.M_COLOR]:
         towards = rotation_row(view, U(2)) if view[L.V_PARALLEL] > 0 else d
-        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[L.M_SMOG], rows)
+        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[L.M_FOG], rows)
     x, y, z = to_camera(d, view)
     inverse = inverse_divisor(z, view)
     xx, xy, yy, minors = image_covariance(quats, scales, picked, at, x, y, inverse, view)

@@ -103,7 +103,7 @@ def rasterize_with_gradients(
     buffers: frozenset[str],
     settings: RasterSettings,
 ) -> RenderOutput:
-    """As `cuda.rasterize_cuda` without smog and clip, recorded by autograd; no part has light per
+    """As `cuda.rasterize_cuda` without fog and clip, recorded by autograd; no part has light per
     pixel or colour maps. buffers: some of DIFFERENTIABLE where geometry asks for gradients.
 
     The splats' records and the tiles' lists are kept until backward.

@@ -358,17 +358,17 @@ MARGIN = tl.constexpr(0.0625)
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def blend_blocks(
     records, tile_splat_ids, tile_offsets, cuts, lights, rgb, alpha, expected, median, ids, mode,
-    snow, width, height, columns, alpha_max, log_cut, least, end, parallel, floor, inverse_fx2,
+    overlay, width, height, columns, alpha_max, log_cut, least, end, parallel, floor, inverse_fx2,
     inverse_fy2,
     HAS_CUTS: tl.constexpr, HAS_LIGHTS: tl.constexpr, HAS_RGB: tl.constexpr,
     HAS_EXPECTED: tl.constexpr, HAS_MEDIAN: tl.constexpr, HAS_IDS: tl.constexpr,
-    HAS_MODE: tl.constexpr, HAS_SNOW: tl.constexpr, IS_COARSE: tl.constexpr, BLOCK_W: tl.constexpr,
-    BLOCK_H: tl.constexpr,
+    HAS_MODE: tl.constexpr, HAS_OVERLAY: tl.constexpr, IS_COARSE: tl.constexpr,
+    BLOCK_W: tl.constexpr, BLOCK_H: tl.constexpr,
 ):  # fmt: skip
     """Blend one block of BLOCK_W x BLOCK_H pixels of a tile; a tile's blocks are neighbours.
 
     records, cuts, lights: as in CudaSplats. tile_splat_ids, tile_offsets: as in CudaTiles. rgb to
-    snow: images; of those that are not asked for, and of cuts and lights that are not there,
+    overlay: images; of those that are not asked for, and of cuts and lights that are not there,
     nothing is read or written. width, height: of the image; columns: of its tiles. least: what a
     splat must leave more of than this to be blended. end: the transmittance at which a pixel is
     finished; IS_COARSE where it is not `least`. parallel: 1 where rays are parallel, else 0. floor:
@@ -444,14 +444,14 @@ def blend_blocks(
             is_kept = after > least
             weight = tl.where(is_kept, weight, 0.0)
 
-            if HAS_RGB or HAS_SNOW:
-                splat_red, splat_green, splat_blue, is_snow = _quarter(record, 3)
+            if HAS_RGB or HAS_OVERLAY:
+                splat_red, splat_green, splat_blue, is_overlay = _quarter(record, 3)
             if HAS_RGB:
                 red += weight * splat_red[None, :]
                 green += weight * splat_green[None, :]
                 blue += weight * splat_blue[None, :]
-            if HAS_SNOW:
-                white += weight * is_snow[None, :]
+            if HAS_OVERLAY:
+                white += weight * is_overlay[None, :]
             if HAS_EXPECTED or HAS_MEDIAN or HAS_MODE or HAS_IDS:
                 _, _, depth, own_id = _quarter(record, 2)
             if HAS_EXPECTED or HAS_MODE:
@@ -515,8 +515,8 @@ def blend_blocks(
     if HAS_MODE:
         z = heaviest_mode(first, mass, moment, square, best, best_mode)
         tl.store(mode + pixel, z, mask=is_inside)
-    if HAS_SNOW:
-        tl.store(snow + pixel, white, mask=is_inside)
+    if HAS_OVERLAY:
+        tl.store(overlay + pixel, white, mask=is_inside)
 
 
 @triton.jit

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Int32
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.render import layout, shading
 from augment.render.buffers import (
     ALPHA,
@@ -25,8 +24,8 @@ from augment.render.buffers import (
     EXPECTED_DEPTH,
     MEDIAN_DEPTH,
     MODE_DEPTH,
+    OVERLAY,
     RGB,
-    SNOW,
     SPLAT_IDS,
     RenderOutput,
 )
@@ -44,6 +43,7 @@ from augment.render.cuda.splats import (
     GpuStageTimer,
     gather_inputs,
 )
+from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.scene import PosedGaussians
 
@@ -73,7 +73,7 @@ def project(inputs: CudaInputs) -> CudaSplats:
         inputs.block_parts, splats.records, splats.keys, splats.rects, splats.counts, splats.cuts,
         splats.lights,
         COLOR=modes[layout.M_COLOR], FUNCTIONS=modes[layout.M_FUNCTIONS],
-        ANTIALIASED=modes[layout.M_ANTIALIASED], SMOG=modes[layout.M_SMOG],
+        ANTIALIASED=modes[layout.M_ANTIALIASED], FOG=modes[layout.M_FOG],
         CLIP=modes[layout.M_CLIP], LIGHT=modes[layout.M_LIGHT], BLOCK=BLOCK, num_warps=BLOCK // 32,
     )  # fmt: skip
     return splats
@@ -161,7 +161,7 @@ _BLOCK_W, _BLOCK_H = 16, 8
 assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2, 3)
 assert (layout.FALL_Y, layout.LOG_OPACITY, layout.LEAN_Y) == (4, 5, 8)
 assert (layout.DEPTH, layout.SPLAT_ID) == (10, 11)
-assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_SNOW) == (12, 13, 14, 15)
+assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_OVERLAY) == (12, 13, 14, 15)
 assert (layout.C_AT, layout.C_X, layout.C_Y, layout.C_RIGHT) == (0, 1, 2, 3)
 assert (layout.C_DOWN, layout.C_REACH) == (4, 5)
 
@@ -188,7 +188,7 @@ def blend(
         HAS_CUTS=splats.cuts is not None, HAS_LIGHTS=splats.lights is not None and RGB in images,
         HAS_RGB=RGB in images, HAS_EXPECTED=EXPECTED_DEPTH in images,
         HAS_MEDIAN=MEDIAN_DEPTH in images, HAS_IDS=SPLAT_IDS in images,
-        HAS_MODE=MODE_DEPTH in images, HAS_SNOW=SNOW in images,
+        HAS_MODE=MODE_DEPTH in images, HAS_OVERLAY=OVERLAY in images,
         IS_COARSE=settings.transmittance_stop > least, BLOCK_W=_BLOCK_W, BLOCK_H=_BLOCK_H,
         num_warps=1,
     )  # fmt: skip
@@ -209,7 +209,7 @@ def rasterize_cuda(
     camera: Camera,
     buffers: frozenset[str],
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
     pixel_mask: torch.Tensor | None = None,
     *,
@@ -222,7 +222,7 @@ def rasterize_cuda(
     told of "project", "list" and "blend", and of the counts "visible" (splats that touch a tile)
     and "pairs" (of splats and tiles).
     """
-    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
+    inputs = gather_inputs(parts, camera, settings, fog, clip, with_color=RGB in buffers)
     splats = project(inputs)
     if timer is not None:
         timer.end_stage("project")

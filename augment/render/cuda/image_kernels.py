@@ -10,15 +10,15 @@ import math
 import triton
 import triton.language as tl
 
-from augment.effects import smog
+from augment.render import fog
 from augment.render import sh as sh_layout
 
 # --------------------------------------------------------------------------------------------------
-# Triton functions: the sky in a direction, and what is seen of it and of surfaces through smog.
-# Definitions: augment.sky, augment.effects.smog.
+# Triton functions: the sky in a direction, and what is seen of it and of surfaces through fog.
+# Definitions: augment.sky, augment.render.fog.
 
 LOG2_E = tl.constexpr(math.log2(math.e))
-MAX_EXPONENT = tl.constexpr(smog.MAX_EXPONENT)
+MAX_EXPONENT = tl.constexpr(fog.MAX_EXPONENT)
 # exp(-tau) from there on is below the least normal float32.
 MAX_DEPTH = tl.constexpr(126.0)
 
@@ -31,7 +31,7 @@ def transmittance(tau):
 
 @triton.jit
 def mean_density(eye_height, up):
-    """Mean density of layered smog from the eye to a point, relative to its base.
+    """Mean density of layered fog from the eye to a point, relative to its base.
 
     exp(-min(a, b)) (1 - exp(-x)) / x with x = |b - a|. eye_height: a, the eye's height above the
     base in scale heights. up: b - a, likewise.
@@ -51,9 +51,9 @@ def mean_density(eye_height, up):
 
 @triton.jit
 def sky_transmittance(x, y, z, strength):
-    """What layered smog lets through of the sky in a direction of any length.
+    """What layered fog lets through of the sky in a direction of any length.
 
-    strength: the smog's optical depth straight up. 0 for rays that do not climb.
+    strength: the fog's optical depth straight up. 0 for rays that do not climb.
     """
     climbs = z > 0
     tau = strength * tl.sqrt(x * x + y * y + z * z) / tl.where(climbs, z, 1.0)
@@ -98,7 +98,7 @@ def _bilinear(first, side, fc, fr, mask):
 
 
 # --------------------------------------------------------------------------------------------------
-# Triton kernels: the sky behind the splats, smog on finished images, colour maps, finished pixels.
+# Triton kernels: the sky behind the splats, fog on finished images, colour maps, finished pixels.
 # Images are flat: pixel p is column p % width of row p // width.
 
 
@@ -147,19 +147,19 @@ def composite_cubemap(
     count, width, side, cx, cy, ifx, ify,
     xu, xv, xw, yu, yv, yw, zu, zv, zw,
     strength, red, green, blue,
-    SMOG: tl.constexpr, BLOCK: tl.constexpr,
+    FOG: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """out = rgb + (1 - alpha) sky of a cube map, with SMOG through the layered smog before it.
+    """out = rgb + (1 - alpha) sky of a cube map, with FOG through the layered fog before it.
 
     side: of a face with its border. xu ... zw: rows of world_from_camera. strength: optical depth
-    of the smog straight up; red, green, blue: its airlight.
+    of the fog straight up; red, green, blue: its airlight.
     """
     pixel, here, u, v = pixels_of(count, width, cx, cy, ifx, ify, BLOCK)
     x = tl.fma(xu, u, tl.fma(xv, v, xw))
     y = tl.fma(yu, u, tl.fma(yv, v, yw))
     z = tl.fma(zu, u, tl.fma(zv, v, zw))
     sky_r, sky_g, sky_b = cubemap_color(faces, side, x, y, z, here)
-    if SMOG:
+    if FOG:
         visible = sky_transmittance(x, y, z, strength)
         hidden = 1.0 - visible
         sky_r = tl.fma(visible, sky_r, hidden * red)
@@ -182,9 +182,9 @@ def fog(
     sigma, red, green, blue, eye_height, up_u, up_v, up_w,
     LAYERED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Deferred smog on premultiplied colour (augment.effects.smog.fog_buffers).
+    """Deferred fog on premultiplied colour (augment.render.fog.fog_buffers).
 
-    eye_height: above the smog's base. up_u, up_v, up_w: what x / z, y / z and 1 of a ray climb per
+    eye_height: above the fog's base. up_u, up_v, up_w: what x / z, y / z and 1 of a ray climb per
     metre of depth. Both in scale heights; read with LAYERED only.
     """
     pixel, here, u, v = pixels_of(count, width, cx, cy, ifx, ify, BLOCK)
@@ -220,10 +220,10 @@ def map_colors(
 
 
 @triton.jit(do_not_specialize=["count"])
-def renormalise_alpha(alpha, rgb, snow, count, least, BLOCK: tl.constexpr):
+def renormalise_alpha(alpha, rgb, overlay, count, least, BLOCK: tl.constexpr):
     """Pixels of alpha >= least become opaque, and what they hold grows with it, in place.
 
-    rgb, snow: None where there is no such image.
+    rgb, overlay: None where there is no such image.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     a = tl.load(alpha + pixel, pixel < count, 0.0)
@@ -233,9 +233,9 @@ def renormalise_alpha(alpha, rgb, snow, count, least, BLOCK: tl.constexpr):
     if rgb is not None:
         r, g, b = _load_color(rgb, pixel, done)
         _store_color(rgb, pixel, r * scale, g * scale, b * scale, done)
-    if snow is not None:
-        value = tl.load(snow + pixel, done, 0.0)
-        tl.store(snow + pixel, value * scale, done)
+    if overlay is not None:
+        value = tl.load(overlay + pixel, done, 0.0)
+        tl.store(overlay + pixel, value * scale, done)
 
 
 # Columns of the table of parts, int64 [parts, 3].
@@ -273,8 +273,8 @@ def _class_of(splat, row, here):
 
 @triton.jit(do_not_specialize=["count", "width", "part_count", "halvings"])
 def make_images(
-    rgb, depth, scene_depth, water, snow, alpha, splat_ids, parts,
-    rgb_out, depth_out, scene_depth_out, water_out, snow_out, semantic_out, instance_out,
+    rgb, depth, scene_depth, water, overlay, alpha, splat_ids, parts,
+    rgb_out, depth_out, scene_depth_out, water_out, overlay_out, semantic_out, instance_out,
     count, width, part_count, halvings,
     cx, cy, ifx, ify, fall_u, fall_v, fall_w, eye_m,
     min_alpha, sky_class, water_class,
@@ -282,7 +282,7 @@ def make_images(
 ):  # fmt: skip
     """Every image that there is something to make of; None stands for the others.
 
-    water, snow: uint8, 1 where they are. alpha, splat_ids: of the surfaces that classes and
+    water, overlay: uint8, 1 where they are. alpha, splat_ids: of the surfaces that classes and
     instances are of. parts: int64 [part_count, 3], of each part its first splat, the address of its
     splats' int16 classes, 0 without, and its instance. halvings: bits of part_count - 1.
     SHOWS_WATER: where water is, it is what depth, classes and instances show; IN_AIR: its surface,
@@ -300,9 +300,9 @@ def make_images(
         tl.store(water_out + pixel, tl.where(wet, 255, 0).to(tl.uint8), here)
         if SHOWS_WATER:
             covered = wet
-    if snow is not None:
-        white = tl.load(snow + pixel, here, 0) != 0
-        tl.store(snow_out + pixel, tl.where(white, 255, 0).to(tl.uint8), here)
+    if overlay is not None:
+        white = tl.load(overlay + pixel, here, 0) != 0
+        tl.store(overlay_out + pixel, tl.where(white, 255, 0).to(tl.uint8), here)
     if scene_depth is not None:
         tl.store(scene_depth_out + pixel, tl.load(scene_depth + pixel, here, 0.0), here)
     if depth is not None:

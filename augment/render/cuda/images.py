@@ -12,18 +12,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium, vertical_optical_depth
 from augment.render.cuda import image_kernels as kernels
 from augment.render.cuda.runtime import Download, address_of, gpu_device, launch, resident, upload
+from augment.render.fog import Fog, vertical_optical_depth
 from augment.scene import PosedGaussians
 from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, RequestedImages, ViewImages
 
 # ---- Passes over finished images, float32 without gradients --------------------------------------
-# Definitions: augment.render.composite, augment.effects.smog, augment.render.rasterize.
+# Definitions: augment.render.composite, augment.render.fog, augment.render.rasterize.
 
 BLOCK = 128  # pixels of a program: one a thread, which needs few registers and no exchange
-MAX_STRENGTH = 1e30  # of smog before the sky: finite in float32, and nothing is seen through it
+MAX_STRENGTH = 1e30  # of fog before the sky: finite in float32, and nothing is seen through it
 
 
 def composite_color(
@@ -42,17 +42,17 @@ def composite_cubemap(
     alpha: Float[Tensor, "H W"],
     camera: Camera,
     faces: Float[Tensor, "6 S S 3"],
-    smog: SmogMedium | None,
+    fog: Fog | None,
 ) -> Float[Tensor, "H W 3"]:
     """The sky of a cube map behind the image. faces: with a border, on either side; kept on the GPU
-    for as long as they live. smog: layered.
+    for as long as they live. fog: layered.
     """
     rgb, alpha, faces = rgb.detach().contiguous(), alpha.detach().contiguous(), resident(faces)
     out = torch.empty_like(rgb)
     strength, airlight = 0.0, (0.0, 0.0, 0.0)
-    if smog is not None:
-        vertical = vertical_optical_depth(smog, float(camera.centre[2]))
-        strength, airlight = min(vertical, MAX_STRENGTH), smog.rgb
+    if fog is not None:
+        vertical = vertical_optical_depth(fog, float(camera.centre[2]))
+        strength, airlight = min(vertical, MAX_STRENGTH), fog.rgb
     launch(
         kernels.composite_cubemap,
         _grid(alpha.numel()),
@@ -60,7 +60,7 @@ def composite_cubemap(
         *_rays(camera),
         *camera.world_from_camera[:3, :3].flatten().tolist(),
         *(strength, *airlight),
-        SMOG=smog is not None,
+        FOG=fog is not None,
         BLOCK=BLOCK,
     )
     return out
@@ -71,9 +71,9 @@ def fog(
     alpha: Float[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     camera: Camera,
-    medium: SmogMedium,
+    medium: Fog,
 ) -> Float[Tensor, "H W 3"]:
-    """Deferred smog: the image through what lies before its surfaces. depth: z over alpha."""
+    """Deferred fog: the image through what lies before its surfaces. depth: z over alpha."""
     rgb, alpha, depth = (image.detach().contiguous() for image in (rgb, alpha, depth))
     out = torch.empty_like(rgb)
     eye, up = 0.0, (0.0, 0.0, 0.0)
@@ -100,11 +100,16 @@ def map_colors(rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"]) -> 
     launch(kernels.map_colors, _grid(count), rgb.detach(), count, *numbers, BLOCK=BLOCK)
 
 
-def renormalise_alpha(alpha: Tensor, rgb: Tensor | None, snow: Tensor | None, stop: float) -> None:
+def renormalise_alpha(
+    alpha: Tensor, rgb: Tensor | None, overlay: Tensor | None, stop: float
+) -> None:
     """Finished pixels become opaque, in place; all contiguous."""
     count = alpha.numel()
     launch(
-        kernels.renormalise_alpha, _grid(count), *(alpha, rgb, snow, count, 1 - stop), BLOCK=BLOCK
+        kernels.renormalise_alpha,
+        _grid(count),
+        *(alpha, rgb, overlay, count, 1 - stop),
+        BLOCK=BLOCK,
     )
 
 
@@ -125,7 +130,7 @@ KINDS = {
     "depth_m": (torch.float32, np.float32),
     "scene_depth_m": (torch.float32, np.float32),
     "water": (torch.uint8, np.uint8),
-    "snow": (torch.uint8, np.uint8),
+    "overlay": (torch.uint8, np.uint8),
     "semantic": (torch.uint8, np.uint8),
     "instance": (torch.int16, np.uint16),
 }
@@ -159,7 +164,7 @@ def begin_cuda_images(requested: RequestedImages, camera: Camera) -> Callable[[]
         "depth_m": requested.depth_m is not None,
         "scene_depth_m": requested.scene_depth_m is not None and not shares_depth,
         "water": requested.water is not None,
-        "snow": requested.snow is not None,
+        "overlay": requested.overlay is not None,
         "semantic": requested.semantic,
         "instance": requested.instance,
     }
@@ -208,7 +213,7 @@ def _make(images: dict[str, Tensor], requested: RequestedImages, camera: Camera)
         _plain(requested.depth_m),
         _plain(requested.scene_depth_m if "scene_depth_m" in images else None),
         _plain(requested.water),
-        _plain(requested.snow),
+        _plain(requested.overlay),
         _plain(shown.alpha if looked_up else None),
         _plain(shown.splat_ids if looked_up else None),
         table,

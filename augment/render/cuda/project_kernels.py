@@ -154,9 +154,9 @@ def image_axes(x, y, inverse, columns, sizes, view):
     return along_axes(right, columns, sizes), along_axes(down, columns, sizes)
 
 
-# ---- Triton functions: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog --
+# ---- Triton functions: what colour a splat shows to the camera. SH of degrees 0 to 3, then fog --
 
-LAYERED_SMOG = tl.constexpr(layout.LAYERED_SMOG)
+LAYERED_FOG = tl.constexpr(layout.LAYERED_FOG)
 MAP = tl.constexpr(layout.MAP)
 V_SIGMA, V_AIRLIGHT = tl.constexpr(layout.V_SIGMA), tl.constexpr(layout.V_AIRLIGHT)
 V_EYE_HEIGHT, V_UP = tl.constexpr(layout.V_EYE_HEIGHT), tl.constexpr(layout.V_UP)
@@ -174,10 +174,10 @@ C3_ZXX = tl.constexpr(math.sqrt(105 / (16 * math.pi)))
 
 
 @triton.jit
-def through_smog(d, distance, view, SMOG: tl.constexpr):
+def through_fog(d, distance, view, FOG: tl.constexpr):
     """Transmittance from the eye to splats; d: from the eye, in the part's axes."""
     tau = tl.load(view + V_SIGMA) * distance
-    if SMOG == LAYERED_SMOG:
+    if FOG == LAYERED_FOG:
         tau = tau * mean_density(tl.load(view + V_EYE_HEIGHT), dot(three(view + V_UP), d))
     return transmittance(tau)
 
@@ -289,8 +289,8 @@ def _map_channel(at, color, mask):
 
 
 @triton.jit
-def in_smog(color, transmittance, view):
-    """Colours seen through the smog; where all comes through, the same bits."""
+def in_fog(color, transmittance, view):
+    """Colours seen through the fog; where all comes through, the same bits."""
     air, hidden = three(view + V_AIRLIGHT), 1.0 - transmittance
     return (
         tl.fma(transmittance, color[0], hidden * air[0]),
@@ -370,7 +370,7 @@ def store_lights(lines, normals, points, slopes, transmittance, lit, mask, view)
     """Write the lines of splats, all 0 where they are not lit.
 
     lines: pointers to every splat's. normals: unit, in the part's axes; points: in the camera.
-    slopes: 0 where not lit; transmittance: of the smog before them.
+    slopes: 0 where not lit; transmittance: of the fog before them.
     """
     r, s, t = rotation_rows(view)
     nx, ny, nz = dot(r, normals), dot(s, normals), dot(t, normals)
@@ -405,9 +405,9 @@ VIEW = tl.constexpr(layout.VIEW)
 V_SIZE, V_NEAR = tl.constexpr(layout.V_SIZE), tl.constexpr(layout.V_NEAR)
 V_BLUR, V_ALPHA_MIN = tl.constexpr(layout.V_BLUR), tl.constexpr(layout.V_ALPHA_MIN)
 V_LOG_CUT, V_RADIUS_CLIP = tl.constexpr(layout.V_LOG_CUT), tl.constexpr(layout.V_RADIUS_CLIP)
-V_SNOW = tl.constexpr(layout.V_SNOW)
+V_OVERLAY = tl.constexpr(layout.V_OVERLAY)
 V_LIT, V_MAPS = tl.constexpr(layout.V_LIT), tl.constexpr(layout.V_MAPS)
-NO_SMOG = tl.constexpr(layout.NO_SMOG)
+NO_FOG = tl.constexpr(layout.NO_FOG)
 HIDDEN, TILE = tl.constexpr(splats.HIDDEN), tl.constexpr(splats.TILE)
 K = tl.constexpr(0.5 * math.log2(math.e))  # exponents of alpha are of 2
 HUGE = tl.constexpr(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
@@ -418,7 +418,7 @@ RECORD = tl.constexpr(layout.RECORD)
 @triton.jit
 def project_gaussians(
     table, views, block_parts, records, keys, rects, counts, cuts, lights,
-    COLOR: tl.constexpr, FUNCTIONS: tl.constexpr, ANTIALIASED: tl.constexpr, SMOG: tl.constexpr,
+    COLOR: tl.constexpr, FUNCTIONS: tl.constexpr, ANTIALIASED: tl.constexpr, FOG: tl.constexpr,
     CLIP: tl.constexpr, LIGHT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Splats of the Gaussians of every part; each program takes BLOCK of one part.
@@ -486,19 +486,19 @@ def project_gaussians(
             maps = floats_at(tl.load(row + A_MAPS))
             map_rows = tl.load(row + A_ROWS).to(tl.pointer_type(tl.int16)) + first + lane
             color = mapped(color, maps, map_rows, map_count, drawn)
-        if SMOG != NO_SMOG:
-            transmittance = through_smog(towards, distance, view, SMOG)
-            color = in_smog(color, transmittance, view)
+        if FOG != NO_FOG:
+            transmittance = through_fog(towards, distance, view, FOG)
+            color = in_fog(color, transmittance, view)
 
     number = (out.to(tl.int32) + lane).to(tl.float32, bitcast=True)
-    snow = zero + tl.load(view + V_SNOW)
+    overlay = zero + tl.load(view + V_OVERLAY)
     # In layout's order of fields, those of even number and those of odd number.
     even = eight(
         mean_x, xy * inverse_y, inverse_y * K, radius_y, xy * inverse_x, z, color[0], color[2]
     )
     odd = eight(
         mean_y, tl.sqrt(1.0 / along * K), log_opacity, inverse_x * K,
-        tl.sqrt(along * blurred_y * inverse_x / K), number, color[1], snow,
+        tl.sqrt(along * blurred_y * inverse_x / K), number, color[1], overlay,
     )  # fmt: skip
     record = tl.reshape(tl.join(even, odd), (BLOCK, RECORD))
     _store_rows(records + out * RECORD, record, drawn, BLOCK, RECORD)

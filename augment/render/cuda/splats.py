@@ -12,10 +12,10 @@ from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.smog import SmogMedium
 from augment.render import layout
 from augment.render.constants import RasterSettings
 from augment.render.cuda.runtime import address_of, gpu_device, resident, upload, version_of
+from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.scene import Gaussians, PosedGaussians
@@ -55,7 +55,7 @@ def gather_inputs(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     settings: RasterSettings,
-    smog: SmogMedium | None,
+    fog: Fog | None,
     clip: HeightClip | None = None,
     *,
     with_color: bool,
@@ -76,9 +76,9 @@ def gather_inputs(
     blocks = -(-table[:, T_COUNT] // BLOCK)
     for column, sizes in ((T_FIRST, table[:, T_COUNT]), (T_BLOCK, blocks)):
         table[1:, column] = np.cumsum(sizes[:-1])
-    modes = raster_modes(settings, smog, clip, with_color=with_color)
+    modes = raster_modes(settings, fog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
-    views = views_of(parts, camera, settings, smog, clip)
+    views = views_of(parts, camera, settings, fog, clip)
     block_parts = np.repeat(np.arange(len(parts), dtype=np.int32), blocks)
     packed = upload(np.concatenate([*(a.reshape(-1).view(np.int32) for a in (table, views)),
                                     block_parts]))  # fmt: skip
