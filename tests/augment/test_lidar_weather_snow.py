@@ -10,9 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.effects.lidar import MOVED, UNCHANGED, beam
-from augment.effects.lidar.beam import LidarSnow, layer_of, meet_layers, snow_in, weathered_sweep
+from augment.effects.lidar import MOVED, UNCHANGED
+from augment.effects.lidar.beam import weathered_sweep
 from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
 from augment.effects.snow.snow import PlacedSnow, placement_settings, snow_layers_of
 from augment.effects.snow.support import remember_support
 from recipes.weather import Snow
@@ -108,7 +109,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     rows, columns = layer.base.shape
     inside = ((index >= 0) & (index < [columns, rows])).all(-1)
     row, column = np.clip(index[..., 1], 0, rows - 1), np.clip(index[..., 0], 0, columns - 1)
-    low, high = layer.base[row, column] - beam._GROUND_SLACK_M, layer.top[row, column]
+    low, high = layer.base[row, column] - GROUND_SLACK_M, layer.top[row, column]
     within = inside & (at[..., 2] >= low) & (at[..., 2] <= high) & (steps < ends[:, None])
     first = np.where(within.any(1), steps[within.argmax(1)], ends)
     entered = directions[:, 2] < 0  # a step from below may be taken for one from a side
