@@ -11,13 +11,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.flood.flood_view import LayerRenderer, render_flooded
+from augment.drawing import LayerRenderer
+from augment.effects.flood.flood_view import render_flooded
 from augment.effects.flood.water_plane import plane_depth
 from augment.effects.style.style import scene_style_of
 from augment.jobs.processes import choose_backend
 from augment.plan import Plan, ViewPlan, make_plan, plan_view, snow_layers_for
-from augment.render.buffers import AUTO, CUDA, EXPECTED_DEPTH, RenderOutput, kernels_for
-from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.buffers import AUTO, EXPECTED_DEPTH, RenderOutput
+from augment.render.composite import composite_sky, map_colors, to_bytes
+from augment.render.cuda.runtime import download, resident
 from augment.render.fog import Fog, fog_raster
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
@@ -151,7 +153,7 @@ class PendingView:
 
 
 # ---- Buffers into images as files hold them ------------------------------------------------------
-# On a GPU one kernel makes all of them, and one copy brings them back (augment.render.cuda.images).
+# On a GPU they are made there, and nobody waits for their copies before they are needed.
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +193,7 @@ class RequestedImages:
     snow: Tensor | None
 
 
-def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callable[[], ViewImages]:
+def begin_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]:
     """The images that the plan asks for; what is returned waits for those on a GPU."""
     shown = view.bare or view
     in_air = plan.flood is not None and float(view.camera.centre[2]) > plan.flood.level_z_m
@@ -210,77 +212,78 @@ def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callabl
         water=view.water,
         snow=view.snow,
     )
-    if kernels_for(backend, view.rgb.detach()) == CUDA:
-        from augment.render.cuda.images import begin_cuda_images
-
-        with timed("images"):
-            return begin_cuda_images(requested, view.camera)
-    images = _make_images(requested, view.camera)
-    return lambda: images
+    with timed("images"):
+        images = download(_make_images(requested, view.camera))
+    return lambda: ViewImages(**images())
 
 
-def _make_images(requested: RequestedImages, camera: Camera) -> ViewImages:
-    """The definition, on the CPU."""
-    semantic = instance = None
+def _make_images(requested: RequestedImages, camera: Camera) -> dict[str, Tensor]:
+    """Fields of ViewImages, where the buffers lie."""
     shown, parts, depth = requested.shown, requested.parts, requested.depth_m
-    first = None if requested.first is None else requested.first.numpy()
+    first, device = requested.first, requested.rgb.device
+    out: dict[str, Tensor | None] = {}
     if requested.semantic:
-        with timed("semantic image"):
-            semantic = _look_up(shown, _semantic_table(parts), int(SemanticClass.SKY), np.uint8)
-            if first is not None:
-                semantic[first] = int(SemanticClass.WATER)
+        classes = _look_up(shown, _semantic_table(parts, device), int(SemanticClass.SKY))
+        out["semantic"] = _with(classes, first, int(SemanticClass.WATER)).to(torch.uint8)
     if requested.instance:
-        with timed("instance image"):
-            counts = [len(part.gaussians) for part in parts]
-            table = np.repeat(np.array([part.instance_id for part in parts], np.uint16), counts)
-            instance = _look_up(shown, table, 0, np.uint16)
-            if first is not None:
-                instance[first] = 0
-    if depth is not None and requested.first is not None:
-        with timed("depth image"):
-            surface = torch.zeros_like(depth)
-            if requested.plane_z_m is not None:
-                surface = plane_depth(camera, requested.plane_z_m).to(depth.dtype)
-            depth = torch.where(requested.first, surface, depth)
-    with timed("8 bits"):
-        rgb = quantise(requested.rgb)
-    return ViewImages(
-        rgb=rgb,
-        depth_m=_floats(depth),
-        semantic=semantic,
-        instance=instance,
-        water=_mask(requested.water),
-        snow=_mask(requested.snow),
-        scene_depth_m=_floats(requested.scene_depth_m),
-    )
+        instances = _with(_instances(shown, parts, device), first, 0)
+        out["instance"] = instances.to(torch.int16).view(torch.uint16)  # torch has little for these
+    if depth is not None and first is not None:
+        surface = torch.zeros_like(depth)
+        if requested.plane_z_m is not None:
+            surface = plane_depth(camera, requested.plane_z_m, device).to(depth.dtype)
+        depth = torch.where(first, surface, depth)
+    out |= {"rgb": to_bytes(requested.rgb), "depth_m": depth}
+    out["scene_depth_m"] = requested.scene_depth_m
+    out |= {"water": _mask(requested.water), "snow": _mask(requested.snow)}
+    found = {name: image.detach() for name, image in out.items() if image is not None}
+    return {n: i.float() if i.dtype == torch.float64 else i for n, i in found.items()}
 
 
-def _floats(image: Tensor | None) -> np.ndarray | None:
-    return None if image is None else image.detach().float().numpy()
-
-
-def _mask(shown: Tensor | None) -> np.ndarray | None:
+def _mask(shown: Tensor | None) -> Tensor | None:
     """uint8 [H, W]: 255 where `shown`, else 0."""
-    return None if shown is None else shown.numpy().astype(np.uint8) * np.uint8(255)
+    return None if shown is None else shown.to(torch.uint8) * 255
 
 
-def _semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
+def _with(image: Tensor, first: Tensor | None, value: int) -> Tensor:
+    """The image, but for `value` where water comes first."""
+    return image if first is None else image.masked_fill(first, value)
+
+
+def _semantic_table(parts: tuple[PosedGaussians, ...], device: torch.device) -> Tensor:
     """int16 [total splats]: the class of every splat, in the order splat_ids counts them."""
-    return np.concatenate([
-        np.zeros(len(p.gaussians), np.int16)
-        if p.gaussians.semantic is None
-        else p.gaussians.semantic.numpy()
-        for p in parts
+    classes = [p.gaussians.semantic for p in parts]
+    return torch.cat([
+        torch.zeros(len(p.gaussians), dtype=torch.int16, device=device)
+        if own is None
+        else own if own.device == device else resident(own)
+        for p, own in zip(parts, classes, strict=True)
     ])  # fmt: skip
 
 
-def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) -> np.ndarray:
-    assert raster.splat_ids is not None and raster.alpha is not None
-    index = raster.splat_ids.numpy()
+def _instances(
+    raster: RenderOutput, parts: tuple[PosedGaussians, ...], device: torch.device
+) -> Tensor:
+    """int32 [H, W]: the instance of the part whose surface every pixel shows, else 0."""
+    assert raster.splat_ids is not None
+    ends = np.cumsum([len(part.gaussians) for part in parts])
+    table = np.stack([ends, [part.instance_id for part in parts]]).astype(np.int32)
+    own = torch.from_numpy(table).to(device)
+    part = torch.searchsorted(own[0], raster.splat_ids, right=True).clamp_max(len(parts) - 1)
+    return torch.where(_is_surface(raster), own[1][part], 0)
+
+
+def _look_up(raster: RenderOutput, table: Tensor, none: int) -> Tensor:
+    index = raster.splat_ids
+    assert index is not None
     if len(table) == 0:  # no part has a splat: an empty background, and actors that are not there
-        return np.full(index.shape, none, dtype)
-    seen = (index >= 0) & (raster.alpha.detach().numpy() >= SURFACE_ALPHA)
-    return np.where(seen, table[np.maximum(index, 0)], none).astype(dtype)
+        return torch.full_like(index, none)
+    return torch.where(_is_surface(raster), table[index.clamp_min(0)], none)
+
+
+def _is_surface(raster: RenderOutput) -> Tensor:
+    assert raster.splat_ids is not None and raster.alpha is not None
+    return (raster.splat_ids >= 0) & (raster.alpha.detach() >= SURFACE_ALPHA)
 
 
 # ---- A plan carried out: the order of the effects in plain sight ---------------------------------
@@ -303,7 +306,7 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     with timed("plan"):
         plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
-    images = begin_images(buffers, plan, backend=backend)
+    images = begin_images(buffers, plan)
     camera = buffers.camera  # and not the buffers, which the images may long outlive
     return PendingView(lambda: _weathered(images(), camera, plan, recipe))
 
@@ -327,9 +330,8 @@ def render_buffers(
         parts, sky = style_parts.on(parts, backend=backend), style_parts.sky
     flooded = None
     if plan.flood is not None and view.water:
-        renderer = LayerRenderer(
-            parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
-        )
+        fogs_buffers = plan.smog_on_buffers is not None
+        renderer = LayerRenderer(parts, sky, plan.smog, fogs_buffers, plan.settings, backend)
         flooded = render_flooded(renderer, camera, plan.flood, view.buffers)
     if flooded is None:
         rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
@@ -408,7 +410,7 @@ def _without_water(
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
         with timed("smog on buffers"):
-            rgb = fog_raster(raster, camera, plan.smog_on_buffers, backend=backend)
+            rgb = fog_raster(raster, camera, plan.smog_on_buffers)
     uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
     with timed("airlight behind the splats" if uniform else "sky"):
         rgb = composite_sky(rgb, raster.alpha, camera, sky, fog=plan.smog, backend=backend)

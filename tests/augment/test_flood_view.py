@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.flood.flood_view import LayerRenderer, render_flooded
+from augment.drawing import LayerRenderer
+from augment.effects.flood.flood_view import render_flooded
 from augment.geometry import rigid
 from augment.labels import Boxes
 from augment.plan import make_plan
@@ -342,7 +343,7 @@ def test_infinite_extinction_shows_water_alone(scene, level_m):
     plan = make_plan(recipe_of(flood(level_m, refraction_index=1.0)), scene)
     medium = dataclasses.replace(plan.flood, extinction_per_m=(np.inf, np.inf, np.inf))
     view = camera()
-    renderer = LayerRenderer(scene.parts_for(view), scene.sky, plan.settings, None, None, "auto")
+    renderer = LayerRenderer(scene.parts_for(view), scene.sky, None, False, plan.settings, "auto")
     got = render_flooded(renderer, view, medium, plan.buffers)
     assert got is not None and bool(torch.isfinite(got.rgb).all())
     rgb = quantise(got.rgb)[got.water.numpy()]

@@ -16,7 +16,6 @@ and nothing in front of the water can leak into refraction or reflection.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.drawing import LayerRenderer
 from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
 from augment.effects.flood.refraction import is_smooth
@@ -55,12 +55,10 @@ from augment.render.buffers import (
     kernels_for,
 )
 from augment.render.composite import composite_sky, sky_behind
-from augment.render.constants import DEPTH_EPS, RasterSettings
-from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
+from augment.render.constants import DEPTH_EPS
+from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
-from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
-from augment.scene import PosedGaussians
 from augment.sky import Sky, sample_at
 from augment.timing import timed
 
@@ -271,49 +269,6 @@ MAX_SHIFT = 0.12  # of the image's height
 
 
 @dataclass(frozen=True, eq=False)
-class LayerRenderer:
-    """Draws the parts of a scene on one side of a level plane.
-
-    fog: blended per Gaussian. fog_on_buffers: applied to finished layers; at most one is set.
-    """
-
-    parts: Sequence[PosedGaussians]
-    sky: Sky
-    settings: RasterSettings
-    fog: Fog | None
-    fog_on_buffers: Fog | None
-    backend: str
-
-    @property
-    def medium(self) -> Fog | None:
-        return self.fog or self.fog_on_buffers
-
-    def draw(
-        self,
-        camera: Camera,
-        clip: HeightClip,
-        buffers: frozenset[str],
-        pixel_mask: Bool[Tensor, "H W"] | None = None,
-    ) -> RenderOutput:
-        """The layer's buffers; its colours are seen through the fog."""
-        if self.fog_on_buffers is not None:
-            buffers = buffers | {EXPECTED_DEPTH}
-        raster = rasterize(
-            self.parts,
-            camera,
-            buffers=buffers,
-            settings=self.settings,
-            fog=self.fog,
-            clip=clip,
-            pixel_mask=pixel_mask,
-            backend=self.backend,
-        )
-        if self.fog_on_buffers is None:
-            return raster
-        return replace(raster, rgb=fog_raster(raster, camera, self.fog_on_buffers))
-
-
-@dataclass(frozen=True, eq=False)
 class FloodedImage:
     """rgb: with sky and water, not clamped. scene: alpha and the requested buffers of the scene's
     surfaces through the water; empty if only colour and alpha are requested. water: where a ray
@@ -351,7 +306,7 @@ def render_flooded(
     with timed("rasterise"):
         front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
-    sky, fog = renderer.sky, renderer.medium
+    sky, fog = renderer.sky, renderer.fog
     backend = renderer.backend
     if backend == AUTO and front.alpha.device.type != "cpu":
         backend = CUDA  # also passes without an image of their own run where the layers lie
@@ -478,13 +433,12 @@ def _from_below(
 ) -> FloodedImage:
     """From under the water, or exactly at its surface."""
     requested = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    in_air = replace(renderer, fog=None, fog_on_buffers=None)
     with timed("rasterise"):
-        front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
+        front = renderer.without_fog().draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
         above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
         air = renderer.draw(camera, above, requested)
     layers = as_layer(camera, front), as_layer(camera, air)
-    image = view_from_below(*layers, medium, renderer.sky, renderer.medium)
+    image = view_from_below(*layers, medium, renderer.sky, renderer.fog)
     water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
     scene = merge_depths(front, air, whole, buffers, backend=renderer.backend)
