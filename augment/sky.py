@@ -60,11 +60,7 @@ class CubemapSky:
     faces: Float[Tensor, "6 R R 3"]
 
     def sample(self, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-        face, s, t = cubemap_coordinates(directions)
-        size = self.faces.shape[1]
-        column = (s * 0.5 + 0.5) * size + 0.5
-        row = (t * 0.5 + 0.5) * size + 0.5
-        return _bilinear(bordered_faces(self), row, column, face=face)
+        return _sample_bordered(bordered_faces(self), directions)
 
 
 def is_stand_in(sky: Sky) -> bool:
@@ -82,7 +78,19 @@ def sample_at(sky: Sky, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 
         return ConstantSky(sky.rgb.to(directions.device)).sample(directions)
     if isinstance(sky, LatLongSky):
         return LatLongSky(resident(sky.image)).sample(directions)
+    if isinstance(sky, CubemapSky):
+        return _sample_bordered(resident(bordered_faces(sky)), directions)
     return sky.sample(directions.cpu()).to(directions.device)
+
+
+def _sample_bordered(
+    faces: Float[Tensor, "6 S S 3"], directions: Float[Tensor, "*B 3"]
+) -> Float[Tensor, "*B 3"]:
+    face, s, t = cubemap_coordinates(directions)
+    size = faces.shape[1] - 2
+    column = (s * 0.5 + 0.5) * size + 0.5
+    row = (t * 0.5 + 0.5) * size + 0.5
+    return _bilinear(faces, row, column, face=face)
 
 
 def sample_within_faces(

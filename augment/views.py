@@ -212,8 +212,7 @@ def begin_images(view: WeatheredBuffers, plan: Plan) -> Callable[[], ViewImages]
         water=view.water,
         snow=view.snow,
     )
-    with timed("images"):
-        images = download(_make_images(requested, view.camera))
+    images = download(_make_images(requested, view.camera))
     return lambda: ViewImages(**images())
 
 
@@ -223,20 +222,24 @@ def _make_images(requested: RequestedImages, camera: Camera) -> dict[str, Tensor
     first, device = requested.first, requested.rgb.device
     out: dict[str, Tensor | None] = {}
     if requested.semantic:
-        classes = _look_up(shown, _semantic_table(parts, device), int(SemanticClass.SKY))
-        out["semantic"] = _with(classes, first, int(SemanticClass.WATER)).to(torch.uint8)
+        with timed("semantic image"):
+            classes = _look_up(shown, _semantic_table(parts, device), int(SemanticClass.SKY))
+            out["semantic"] = _with(classes, first, int(SemanticClass.WATER)).to(torch.uint8)
     if requested.instance:
-        instances = _with(_instances(shown, parts, device), first, 0)
-        out["instance"] = instances.to(torch.int16).view(torch.uint16)  # torch has little for these
+        with timed("instance image"):
+            instances = _with(_instances(shown, parts, device), first, 0)
+            out["instance"] = instances.to(torch.int16).view(torch.uint16)
     if depth is not None and first is not None:
-        surface = torch.zeros_like(depth)
-        if requested.plane_z_m is not None:
-            surface = plane_depth(camera, requested.plane_z_m, device).to(depth.dtype)
-        depth = torch.where(first, surface, depth)
-    out |= {"rgb": to_bytes(requested.rgb), "depth_m": depth}
+        with timed("depth image"):
+            surface = torch.zeros_like(depth)
+            if requested.plane_z_m is not None:
+                surface = plane_depth(camera, requested.plane_z_m, device).to(depth.dtype)
+            depth = torch.where(first, surface, depth)
+    with timed("8 bits"):
+        out |= {"rgb": to_bytes(requested.rgb), "depth_m": depth}
     out["scene_depth_m"] = requested.scene_depth_m
     out |= {"water": _mask(requested.water), "snow": _mask(requested.snow)}
-    found = {name: image.detach() for name, image in out.items() if image is not None}
+    found = {name: image for name, image in out.items() if image is not None}
     return {n: i.float() if i.dtype == torch.float64 else i for n, i in found.items()}
 
 

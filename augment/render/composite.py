@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import composite_kernels
-from augment.render.buffers import AUTO, CPU, CUDA, REFERENCE, kernels_for
+from augment.render.buffers import AUTO, CPU, kernels_for
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth, vertical_optical_depth
 from augment.render.threads import kernel_threads
 from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
@@ -44,29 +44,20 @@ def composite_sky(
 ) -> Float[Tensor, "H W 3"]:
     """The finished display-encoded image, not clamped.
 
-    fog: with it the sky is seen through the fog up to infinity. backend: with kernels, cube maps
-    (on a GPU, single colours too) in float32 go through them, equal to this definition within float
-    rounding, unless gradients are recorded, which they have none of.
+    fog: with it the sky is seen through the fog up to infinity. backend: on the CPU, cube maps in
+    float32 go through a kernel, equal to this definition within float rounding, unless gradients
+    are recorded, which it has none of.
     """
     sky, fog = sky_behind(sky, fog)
-    kernels = kernels_for(backend, rgb, alpha)
     if isinstance(sky, ConstantSky) and fog is None:  # no direction matters
-        if kernels == CUDA:
-            from augment.render.cuda import images as cuda_images
-
-            return cuda_images.composite_color(rgb, alpha, sky.rgb)
-        return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
+        return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.device, rgb.dtype)
     if camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
             f"direction only; composite a ConstantSky, without layered fog"
         )
-    if isinstance(sky, CubemapSky) and kernels == CPU:
+    if isinstance(sky, CubemapSky) and kernels_for(backend, rgb, alpha) == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
-    if isinstance(sky, CubemapSky) and kernels == CUDA:
-        from augment.render.cuda import images as cuda_images
-
-        return cuda_images.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), fog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
     if fog is not None:
@@ -100,30 +91,29 @@ def map_colors(
 ) -> Float[Tensor, "H W 3"]:
     """M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
 
-    backend: with kernels, float32 without gradients goes through them, equal to this definition
+    backend: on the CPU, float32 without gradients goes through a kernel, equal to this definition
     within float rounding, and `rgb` is overwritten: fresh memory would take as long as the
     arithmetic.
     """
-    kernels = kernels_for(backend, rgb, color_map)
-    if kernels == REFERENCE or not rgb.is_contiguous():
+    if kernels_for(backend, rgb, color_map) != CPU or not rgb.is_contiguous():
         color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
-    if kernels == CUDA:
-        from augment.render.cuda import images as cuda_images
-
-        cuda_images.map_colors(rgb, color_map)
-        return rgb
     with kernel_threads(ROWS):
         composite_kernels.map_colors(rgb.detach().numpy(), color_map.detach().contiguous().numpy())
     return rgb
 
 
+def to_bytes(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+    """Clamped to [0, 1], times 255, rounded to the nearest; where rgb lies."""
+    rgb = rgb.detach()
+    if kernels_for(AUTO, rgb) != CPU:
+        return (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    out, rows = np.empty(tuple(rgb.shape), np.uint8), rgb.contiguous().numpy()
+    with kernel_threads(ROWS):
+        composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
+    return torch.from_numpy(out)
+
+
 def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
-    """uint8 [H, W, 3]: clamped to [0, 1], times 255, rounded to the nearest."""
-    if kernels_for(AUTO, rgb.detach()) == CPU:
-        out = np.empty(tuple(rgb.shape), np.uint8)
-        rows = rgb.detach().contiguous().numpy()
-        with kernel_threads(ROWS):
-            composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
-        return out
-    return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    """`to_bytes` as an array."""
+    return to_bytes(rgb).cpu().numpy()

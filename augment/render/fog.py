@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.buffers import AUTO, CUDA, RenderOutput, kernels_for
+from augment.render.buffers import RenderOutput
 
 MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; fog that dense has t = 0 at any distance
 
@@ -124,19 +124,10 @@ def fog_buffers(
     return t * rgb + (1 - t) * alpha[..., None] * airlight
 
 
-def fog_raster(
-    raster: RenderOutput, camera: Camera, medium: Fog, *, backend: str = AUTO
-) -> Float[Tensor, "H W 3"]:
-    """Deferred fog on a render with colour, alpha and expected depth.
-
-    backend: on a GPU, float32 without gradients goes through a kernel, equal within float rounding.
-    """
+def fog_raster(raster: RenderOutput, camera: Camera, medium: Fog) -> Float[Tensor, "H W 3"]:
+    """Deferred fog on a render with colour, alpha and expected depth."""
     rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
-    if kernels_for(backend, rgb, alpha, depth) == CUDA:
-        from augment.render.cuda import images as cuda_composite
-
-        return cuda_composite.fog(rgb, alpha, depth, camera, medium)
     ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
     eye_z_m = float(camera.centre[2])
     point_z_m = None

@@ -46,14 +46,14 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
     rgb and overlay are divided by alpha, which becomes 1. (1e-4, the default, is less than 8 bits
     show, and gsplat leaves it transparent, too.)
 
-    backend: with kernels, float32 without gradients goes through them, equal within float rounding.
+    backend: on the CPU, float32 without gradients goes through a kernel, equal within float
+    rounding.
     """
     alpha = output.alpha
     assert alpha is not None
     images = {name: getattr(output, name) for name in ("rgb", "overlay")}
     images = {name: image for name, image in images.items() if image is not None}
-    kernels = kernels_for(backend, alpha, *images.values())
-    if kernels == CPU:
+    if kernels_for(backend, alpha, *images.values()) == CPU:
         from augment.render import composite_kernels
         from augment.render.threads import kernel_threads
 
@@ -63,11 +63,6 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
             composite_kernels.renormalise_alpha(
                 alpha.numpy().reshape(-1), rgb, overlay, np.float32(1 - stop)
             )
-        return output
-    if kernels == CUDA:
-        from augment.render.cuda import images as cuda_images
-
-        cuda_images.renormalise_alpha(alpha, images.get("rgb"), images.get("overlay"), stop)
         return output
     finished = alpha >= 1 - stop
     scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))

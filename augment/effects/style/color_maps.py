@@ -23,7 +23,7 @@ from torch import Tensor
 
 from augment.render import composite_kernels
 from augment.render import sh as sh_layout
-from augment.render.buffers import AUTO, CUDA, REFERENCE, kernels_for
+from augment.render.buffers import AUTO, CPU, CUDA, kernels_for
 from augment.render.cuda import runtime
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
@@ -163,7 +163,6 @@ def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
 
 
 BLOCKS = 4  # pieces of work that a thread takes at a time
-_QUADS = 256  # of four colours, a program on a GPU
 
 
 def style_gaussians(
@@ -179,9 +178,9 @@ def style_gaussians(
 
     levels [N]: how much of each is sky (see sky_levels). out: where the SH are written, contiguous
     and of their shape and dtype; may be `gaussians.sh` itself. New memory by default, whose first
-    touch takes as long as the mapping. backend: of what maps float32 without gradients, equal to
-    `map_sh` within float rounding; "cuda" takes SH of either side and gives new ones on the GPU,
-    "auto" goes where the SH lie.
+    touch takes as long as the mapping. backend: "cpu" maps float32 without gradients by a kernel,
+    equal to `map_sh` within float rounding; "cuda" takes SH of either side and gives new ones on
+    the GPU, "auto" goes where the SH lie.
 
     Raises:
         ValueError: maps by class, and a class that has none; or out does not fit.
@@ -192,15 +191,16 @@ def style_gaussians(
     splats, classes = maps.splats, _rows_of(gaussians, len(maps.splats))
     if levels is not None:
         splats, classes = level_maps(maps), map_rows(levels, gaussians.semantic, len(splats))
-    folded = fold_maps(splats)
     if out is None and not bool(_changes(splats).any()):
         return gaussians
     kernels = kernels_for(backend, sh)
-    if kernels == REFERENCE:
-        mapped = map_sh(sh, splats, classes)
-        return dataclasses.replace(gaussians, sh=mapped if out is None else out.copy_(mapped))
-    mapped = (_on_gpu if kernels == CUDA else _on_cpu)(sh, out, classes, folded)
-    return dataclasses.replace(gaussians, sh=mapped)
+    if kernels == CPU:
+        return dataclasses.replace(gaussians, sh=_on_cpu(sh, out, classes, fold_maps(splats)))
+    sh = runtime.resident(sh) if kernels == CUDA else sh
+    if out is not None and out.device != sh.device:
+        raise ValueError(f"out must lie on {sh.device}, as what is mapped; got {out.device}")
+    mapped = map_sh(sh, splats, classes)
+    return dataclasses.replace(gaussians, sh=mapped if out is None else out.copy_(mapped))
 
 
 def _on_cpu(
@@ -221,35 +221,6 @@ def _on_cpu(
             folded.numpy(),
         )
     return target if aligned else target.copy_(written)
-
-
-def _on_gpu(
-    sh: Float[Tensor, "N K 3"],
-    out: Tensor | None,
-    classes: Tensor | None,
-    folded: Float[Tensor, "C 13"],
-) -> Float[Tensor, "N K 3"]:
-    from augment.render.cuda import image_kernels
-
-    source = runtime.resident(sh)
-    target = torch.empty_like(source) if out is None else out
-    if target.device != source.device:
-        raise ValueError(f"out must lie on {source.device}, as what is mapped; got {target.device}")
-    runtime.launch(
-        image_kernels.map_sh,
-        (-(-sh.numel() // (12 * _QUADS)),),
-        source,
-        target.detach(),
-        sh.numel(),
-        None if classes is None else runtime.resident(classes),
-        runtime.upload(folded),
-        float(sh_layout.BLACK),
-        FUNCTIONS=sh.shape[1],
-        BY_CLASS=classes is not None,
-        BLOCK=_QUADS,
-        num_warps=4,
-    )
-    return target
 
 
 def style_actor(actor: Actor, maps: StyleMaps) -> Actor:

@@ -7,9 +7,42 @@ import math
 import triton
 import triton.language as tl
 
-from augment.render import layout, shading
+from augment.render import fog, layout, shading
 from augment.render.cuda import splats
-from augment.render.cuda.image_kernels import mean_density, transmittance
+
+# ---- Triton functions: what is seen through fog (augment.render.fog) -----------------------------
+
+LOG2_E = tl.constexpr(math.log2(math.e))
+MAX_EXPONENT = tl.constexpr(fog.MAX_EXPONENT)
+# exp(-tau) from there on is below the least normal float32.
+MAX_DEPTH = tl.constexpr(126.0)
+
+
+@triton.jit
+def transmittance(tau):
+    """exp(-tau) for tau >= 0, which may be infinite; exactly 1 at 0."""
+    return tl.exp2(tl.maximum(tau * -LOG2_E, -MAX_DEPTH))
+
+
+@triton.jit
+def mean_density(eye_height, up):
+    """Mean density of layered fog from the eye to a point, relative to its base.
+
+    exp(-min(a, b)) (1 - exp(-x)) / x with x = |b - a|. eye_height: a, the eye's height above the
+    base in scale heights. up: b - a, likewise.
+    """
+    x = tl.abs(up)
+    series = tl.fma(x, 1 / 120, -1 / 24)
+    series = tl.fma(x, series, 1 / 6)
+    series = tl.fma(x, series, -1 / 2)
+    series = tl.fma(x, series, 1.0)
+    # Below 0.1 the difference 1 - exp(-x) has lost a digit, and the series' next term is 1e-8.
+    short = x < 0.1
+    mean = tl.where(short, series, (1.0 - transmittance(x)) / tl.where(short, 1.0, x))
+    lowest = eye_height + tl.minimum(up, 0.0)
+    power = tl.minimum(-lowest, MAX_EXPONENT) * LOG2_E
+    return tl.exp2(tl.maximum(power, -MAX_DEPTH)) * mean
+
 
 # ---- Triton functions: where Gaussians stand in the camera, and which ellipses they become -------
 # A view is read through a pointer to its VIEW numbers (see layout); triples are tuples. Sums of
