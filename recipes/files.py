@@ -1,4 +1,4 @@
-"""The files that a recipe's style names: where they may lie, and the digest of what they hold.
+"""The files that a recipe names: where they may lie, and the digest of what they hold.
 
 A recipe file names them from its own folder and none outside: one from elsewhere reads no others.
 """
@@ -13,50 +13,54 @@ from collections.abc import Mapping
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from recipes.effect import EffectModel
 from recipes.errors import RecipeError, nearest_word, short
-from recipes.schema import Recipe
-from recipes.weather import FILES, Style
+from recipes.fields import replaced
+from recipes.schema import SECTIONS, Recipe
 
 MAX_MIB = 512  # of one file
 MAX_NAMES = 1000  # of files in a folder, to guess a misspelt one from
 
 
 def with_digest(recipe: Recipe) -> Recipe:
-    """The recipe with the digest of its style's files; the same object where there is none.
+    """The recipe with the digests of the files that its sections name; the same object where there
+    are none.
 
     Raises:
         RecipeError: a file is missing, unreadable or too large, or is not that of a given digest.
     """
-    style = recipe.style
-    if style is None or not style.files:
-        return recipe
-    try:
-        digest = _checked(style, {name: _hash(name, path) for name, path in style.files.items()})
-    except ValueError as error:
-        raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
-    return recipe.model_copy(update={"style": style.model_copy(update={"digest": digest})})
+    for path, section in recipe.sections().items():
+        if not section.files:
+            continue
+        try:
+            hashes = {name: _hash(section, name) for name in section.files}
+            recipe = replaced(recipe, f"{path}.digest", _checked(section, hashes))
+        except ValueError as error:
+            raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
+    return recipe
 
 
-def read_files(style: Style) -> dict[str, bytes]:
-    """What the style's files hold, by field: that of which it has the digest, where it has one.
+def read_files(section: EffectModel) -> dict[str, bytes]:
+    """What the section's files hold, by field: that of which it has the digest, where it has one.
 
     Raises:
         RecipeError: a file is missing, unreadable or too large, or they have changed.
     """
     contents = {}
     try:
-        for name, path in style.files.items():
-            with _open(name, path) as file:
+        for name in section.files:
+            with _open(section, name) as file:
                 contents[name] = file.read()
-        _checked(style, {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()})
+        hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+        _checked(section, hashes)
     except (ValueError, OSError) as error:
         raise RecipeError(str(error)) from None
     return contents
 
 
 def digest_of(hashes: Mapping[str, str]) -> str:
-    """The SHA-256 of a line `FIELD HASH` for each file, in the order image, mask, checkpoint."""
-    lines = [f"{name} {hashes[name]}\n" for name in FILES if name in hashes]
+    """The SHA-256 of a line `FIELD HASH` for each file, in the order of the section's fields."""
+    lines = [f"{name} {digest}\n" for name, digest in hashes.items()]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -129,31 +133,37 @@ def _open_checked(path: str | Path) -> BufferedReader:
     return file
 
 
-def _open(name: str, path: str) -> BufferedReader:
-    shown = f"style.{name} = {path!r}"
+def _shown(section: EffectModel, name: str) -> str:
+    """A field by its dotted path, and what it says."""
+    path = next(path for path, model in SECTIONS.items() if model is type(section))
+    return f"{path}.{name} = {getattr(section, name)!r}"
+
+
+def _open(section: EffectModel, name: str) -> BufferedReader:
     try:
-        return _open_checked(path)
+        return _open_checked(section.files[name])
     except FileNotFoundError:
-        raise ValueError(f"{shown}: there is no such file") from None
+        raise ValueError(f"{_shown(section, name)}: there is no such file") from None
     except ValueError as error:
-        raise ValueError(f"{shown}: {error}") from None
+        raise ValueError(f"{_shown(section, name)}: {error}") from None
 
 
-def _hash(name: str, path: str) -> str:
-    with _open(name, path) as file:
+def _hash(section: EffectModel, name: str) -> str:
+    with _open(section, name) as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            raise ValueError(f"style.{name} = {path!r}: cannot be read: {error}") from None
+            raise ValueError(f"{_shown(section, name)}: cannot be read: {error}") from None
 
 
-def _checked(style: Style, hashes: Mapping[str, str]) -> str:
+def _checked(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
-    if style.digest not in (None, digest):
-        paths = ", ".join(style.files.values())
+    given: str | None = getattr(section, "digest")
+    if given not in (None, digest):
+        paths = ", ".join(section.files.values())
         which = "the file has" if len(hashes) == 1 else "one of the files has"
         raise ValueError(
-            f"style.digest = '{style.digest}': {which} changed since: {paths} now "
+            f"{_shown(section, 'digest')}: {which} changed since: {paths} now "
             f"gives {digest}; bring back what was there, or remove the digest to take what is"
         )
     return digest

@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from recipes.errors import Problems, RecipeError, did_you_mean, nearest_word, short
+from recipes.fields import Closed, Number, Whole, changed
 from recipes.load import load_recipe, preset_names, read_text
 from recipes.schema import Recipe, parse_frames
 from recipes.template import RecipeTemplate
-from recipes.weather import Closed, Number, Whole, changed
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain, read_tree
 
 MAX_BYTES = 4 << 20

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from recipes.schema import VERSION
-from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind, SectionSpec
+from recipes.template import CHANNEL, RATE, FieldSpec, Kind, SectionSpec, root
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -25,7 +25,7 @@ Schema = dict[str, Any]
 def recipe_json_schema() -> Schema:
     """The schema (draft 2020-12), a fresh dict made of JSON's own types."""
     definitions = {spec.path: _with_ranges(spec, spec.path) for spec in (CHANNEL, RATE)}
-    schema = _section(ROOT, definitions)
+    schema = _section(root(), definitions)
     schema["properties"]["version"] = {"const": VERSION, "description": "Version of this format."}
     return {
         "$schema": DIALECT,

@@ -7,11 +7,11 @@ from pathlib import Path
 import yaml
 
 from recipes.errors import RecipeError, did_you_mean
+from recipes.fields import packaged, packaged_text
 from recipes.files import open_file
 from recipes.parse import parse_recipe
 from recipes.schema import Recipe, free_knobs
 from recipes.template import RecipeTemplate, is_number
-from recipes.weather import packaged, packaged_text
 
 # ---- A recipe in numbers -> the YAML that reads back as the same recipe --------------------------
 

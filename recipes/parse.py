@@ -10,11 +10,10 @@ from typing import Any
 
 from recipes.errors import Problems, nearest_word, short
 from recipes.files import file_below
-from recipes.schema import VERSION
+from recipes.schema import SECTIONS, VERSION
 from recipes.template import (
     ANY_NUMBER,
     RANGE_KINDS,
-    ROOT,
     Channels,
     Choice,
     FieldSpec,
@@ -32,6 +31,7 @@ from recipes.template import (
     broken_rules,
     is_number,
     join,
+    root,
 )
 from recipes.yaml_tree import EMPTY, ListNode, MapNode, Node, ScalarNode, read_tree
 
@@ -263,34 +263,12 @@ class _FieldReader:
 _UNIT = re.compile(
     r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
 )
-# What a key may have been meant to be, where the section has it.
-_MEANT_BY = {
-    "smog": "fog haze mist",
-    "extinction_per_m": "beta density sigma",
-    "color": "airlight",
-    "flood": "water puddle puddles",
-    "level_m": "depth depth_m",
-    "turbidity_ntu": "clarity",
-    "refraction_index": "ior refraction",
-    "waves": "wind ripples",
-    "depth_m": "level level_m height height_m thickness thickness_m",
-    "coverage": "cover",
-    "max_slope_deg": "slope_deg",
-    "sparkle": "glitter",
-    "albedo": "reflectance",
-    "sun_azimuth_deg": "azimuth azimuth_deg",
-    "sun_elevation_deg": "elevation elevation_deg",
-    "drift": "drifts",
-    "style": "mood look",
-    "image": "photo picture file path",
-    "mask": "sky_mask",
-    "method": "algorithm",
-    "strength": "weight amount intensity",
-    "per_region": "regions",
-    "checkpoint": "network weights",
-    "digest": "sha256",
-}
-_SYNONYMS = {word: meant for meant, words in _MEANT_BY.items() for word in words.split()}
+
+
+def _synonyms() -> dict[str, str]:
+    """What a key may have been meant to be, where the section has it."""
+    meant = [pair for model in SECTIONS.values() for pair in model.meant_by.items()]
+    return {word: key for key, words in meant for word in words.split()}
 
 
 def unknown_key(key: str, section: SectionSpec) -> str:
@@ -304,8 +282,8 @@ def unknown_key(key: str, section: SectionSpec) -> str:
         return f"unknown field; did you mean {nearest}{unit}?"
     elsewhere = [
         (other, name)
-        for name in dict.fromkeys((key, _SYNONYMS.get(key, key)))
-        for other in ROOT.walk()
+        for name in dict.fromkeys((key, _synonyms().get(key, key)))
+        for other in root().walk()
         if name in other.known and other is not section
     ]
     below = [place for place in elsewhere if place[0].path.startswith(f"{section.path}.")]
@@ -323,10 +301,11 @@ def _nearest(key: str, section: SectionSpec) -> str | None:
     bases = {_base(name): name for name in known}
     if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
         return bases[_base(low)]
-    for meant in (_SYNONYMS.get(low), _SYNONYMS.get(_base(low))):
+    synonyms = _synonyms()
+    for meant in (synonyms.get(low), synonyms.get(_base(low))):
         if meant in known:
             return meant
-    if any(low in other.known for other in ROOT.walk()):
+    if any(low in other.known for other in root().walk()):
         return None  # spelt well, but in another place
     close = nearest_word(low, known)
     if close is None:
@@ -387,15 +366,15 @@ class _Compiler:
 
     def template(self, tree: MapNode, source: str, file_name: str | None) -> RecipeTemplate:
         """The template of a whole file; raises all that was found wrong."""
-        self._section(tree, ROOT, "", line=1)
+        self._section(tree, root(), "", line=1)
         name = self._take("name", file_name)
-        if "name" not in tree.entries and not ROOT.fields["name"].accepts(name):
-            allowed = ROOT.fields["name"].allowed()
+        if "name" not in tree.entries and not root().fields["name"].accepts(name):
+            allowed = root().fields["name"].allowed()
             text = f"the file's name, {short(str(name))!r}, cannot serve as it; add 'name: ...'"
             self._problems.add(1, f"name: {text}, {allowed}")
         seed, first = int(self._take("seed")), int(self._take("variant"))
         variants = int(self._take("variants"))
-        if not ROOT.fields["variant"].accepts(first + variants - 1):
+        if not root().fields["variant"].accepts(first + variants - 1):
             line = tree.entries["variant"][0]
             self._problems.add(line, f"variant = {first}: too large with variants = {variants}")
         self._problems.raise_if_any()
@@ -420,7 +399,7 @@ class _Compiler:
         value = self._values.pop(key, None)
         if isinstance(value, Fixed):
             return value.value
-        return {**ROOT.fields, **ROOT.extra}[key].default if absent is None else absent
+        return {**root().fields, **root().extra}[key].default if absent is None else absent
 
     def _differs(self) -> bool:
         drawn = any(value.is_range for value in self._values.values())

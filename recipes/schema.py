@@ -6,34 +6,24 @@ names, and numbers are strict.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
-import math
+import operator
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, ClassVar, Literal, TypeVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+from pydantic.fields import FieldInfo
 
-from recipes.weather import (
-    FILES,
-    Closed,
-    Colour,
-    Flag,
-    Flood,
-    Number,
-    Seed,
-    Snow,
-    Style,
-    Whole,
-    changed,
-    found,
-    is_given,
-    one_of,
-    replaced,
-)
+from recipes.effect import Column, EffectModel, Knob, Section, Value
+from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
+from recipes.flood import Flood
+from recipes.smog import Smog
+from recipes.snow import Snow
+from recipes.style import Style
 
 # ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------
 
@@ -86,112 +76,6 @@ class Quality(Closed):
             if getattr(self, name) is not None:
                 return f"{name} {getattr(self, name):g}"
         return self.tier
-
-
-# What each tier sets, by dotted path, of the fields that a recipe does not give; the rest are at
-# reference, the last value of every knob. By the rule of docs/trade.md from docs/trade/*.json.
-TIERS: Mapping[str, Mapping[str, float | str]] = MappingProxyType({
-    "draft": MappingProxyType({
-        "render.scale": 0.75,
-        "render.transmittance_stop": 0.01,
-        "weather.snow.shading": "per_splat",
-    }),
-    "balanced": MappingProxyType({"render.transmittance_stop": 0.01}),
-})  # fmt: skip
-
-
-# ---- The knobs that trade speed for accuracy; `climategs bench trade` measures each value --------
-
-RecipeT = TypeVar("RecipeT", bound=BaseModel)  # Recipe, which is made with this table
-Value = float | int | str | bool | None
-
-
-@dataclass(frozen=True)
-class Knob:
-    """One field. path: dotted. values: from the fastest to the most accurate, which is reference.
-    what: of which error and which time, in a few words. chosen: whether a tier or a target may set
-    it; else it is only measured: it says what is written, or has no value that saves time.
-    """
-
-    path: str
-    values: tuple[Value, ...]
-    what: str
-    chosen: bool = True
-
-    @property
-    def reference(self) -> Value:
-        return self.values[-1]
-
-    @property
-    def effect(self) -> str:
-        """Dotted path of the section without which it has no effect; '' for none."""
-        section, name, *_ = self.path.split(".")
-        return {"weather": f"weather.{name}", "style": "style"}.get(section, "")
-
-
-# Those that save most come first: they have first call on an error that is allowed.
-KNOBS = (
-    Knob("render.scale", (0.25, 0.5, 0.75, 1.0), "resolution, enlarged again for the comparison"),
-    Knob("weather.flood.reflection", ("sky", "screen_space", "mirrored"), "what water reflects"),
-    Knob("weather.snow.cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path"),
-    Knob("weather.snow.shading", ("per_splat", "per_pixel"), "light on the snow"),
-    Knob("render.radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out"),
-    Knob("render.transmittance_stop", (0.05, 0.01, 1e-3, 1e-4), "light behind it is given up"),
-    Knob("render.sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics"),
-    Knob("weather.flood.waves.count", (6, 12, 24), "waves that make up the surface"),
-    Knob("weather.flood.fresnel", ("schlick", "exact"), "share of reflected light"),
-    Knob("style.evaluated", ("sh", "color"), "map folded into the scene or put on each colour"),
-    # Smog on buffers saves nothing here, whatever it costs.
-    Knob("weather.smog.model", ("deferred", "per_gaussian"), "smog on buffers or on splats", False),
-    Knob("output.depth", ("none", "expected", "median", "mode"), "depth estimator", chosen=False),
-    Knob("output.jpeg_quality", (60, 75, 92, 100), "size and error of jpg files", chosen=False),
-)
-BY_PATH = {knob.path: knob for knob in KNOBS}
-
-
-def knobs_of(recipe: BaseModel) -> tuple[Knob, ...]:
-    """The knobs that have an effect on the recipe's pictures or files."""
-    return tuple(knob for knob in KNOBS if _has_effect(knob, recipe))
-
-
-def free_knobs(recipe: BaseModel) -> tuple[Knob, ...]:
-    """Those of them that a tier or a target may set: the recipe does not give their field."""
-    return tuple(k for k in knobs_of(recipe) if k.chosen and not is_given(recipe, k.path))
-
-
-def settings_of(recipe: BaseModel) -> dict[str, Value]:
-    """The values of its knobs, by path."""
-    return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
-
-
-def with_settings(recipe: RecipeT, settings: Mapping[str, Value]) -> RecipeT:
-    """The recipe with some knobs set, which then count as given; ValueError if one is refused."""
-    return changed(recipe, settings)
-
-
-def tier_settings(recipe: BaseModel, tier: str) -> dict[str, Value]:
-    """What a tier sets of this recipe: of its free knobs."""
-    chosen = TIERS.get(tier, {})
-    return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
-
-
-def as_reference(recipe: RecipeT) -> RecipeT:
-    """The recipe with all its knobs that a tier may set at reference, given or not."""
-    return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})
-
-
-def _has_effect(knob: Knob, recipe: BaseModel) -> bool:
-    section: Any = found(recipe, knob.effect) if knob.effect else recipe
-    if section is None:
-        return False
-    if knob.path == "weather.flood.waves.count":
-        waves = found(recipe, "weather.flood.waves")
-        return bool(waves.components is None and waves.preset != "still" and waves.height > 0)
-    if knob.path == "style.evaluated":
-        return bool(found(recipe, "style.applied_to") == "scene")
-    if knob.path == "output.jpeg_quality":
-        return bool(found(recipe, "output.image") == "jpg")
-    return True
 
 
 # ---- Frame numbers as people write them: `all`, `4`, `0,5,9`, `0:20:2`, `::5` --------------------
@@ -256,59 +140,6 @@ def _piece(text: str) -> int | slice:
 # ---- The recipe ---------------------------------------------------------------------------------
 
 VERSION = 1
-KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
-_LATER_FIELDS = (
-    ("render", "exposure"),
-    ("render", "transmittance_stop"),
-    ("render", "radius_clip_px"),
-    ("weather", "flood"),
-    ("weather", "snow"),
-    ("output", "surface"),
-    ("style", "evaluated"),
-    ("", "style"),
-    ("", "quality"),
-)
-MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
-
-
-class Smog(Closed):
-    """Fog, haze or smog: Beer-Lambert extinction towards one airlight colour."""
-
-    model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
-
-    visibility_m: Number | None = Field(default=None, gt=0, le=1e6)
-    """Meteorological visibility at the base height: 3.912 / extinction."""
-    extinction_per_m: Number | None = Field(default=None, ge=0, le=MAX_EXTINCTION_PER_M)
-    """Extinction coefficient at the base height."""
-    color: Colour = (0.76, 0.78, 0.80)
-    """Airlight colour: red, green, blue, display-encoded sRGB."""
-    scale_height_m: Number | None = Field(default=None, ge=0.1, le=1e5)
-    """Height over which the density falls by e; null for uniform smog."""
-    base_height_m: Number = Field(default=0.0, ge=-1e4, le=1e4)
-    """Height above the road where the density is the one given; of no effect on uniform smog."""
-    model: Literal["per_gaussian", "deferred"] = "per_gaussian"
-    """per_gaussian fogs every splat before blending; deferred fogs the finished buffers."""
-
-    @model_validator(mode="after")
-    def _one_density(self) -> Smog:
-        both = "visibility_m and extinction_per_m both give the density: keep one of them"
-        neither = "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
-        if (self.visibility_m is None) == (self.extinction_per_m is None):
-            raise ValueError(neither if self.visibility_m is None else both)
-        if self.sigma_per_m > MAX_EXTINCTION_PER_M:
-            raise ValueError(
-                f"visibility_m = {self.visibility_m:g} means an extinction of "
-                f"{self.sigma_per_m:.3g}/metre; at most {MAX_EXTINCTION_PER_M:g}/metre is allowed"
-            )
-        return self
-
-    @property
-    def sigma_per_m(self) -> float:
-        """Extinction coefficient at the base height, 1/metre."""
-        if self.extinction_per_m is not None:
-            return self.extinction_per_m
-        assert self.visibility_m is not None
-        return KOSCHMIEDER / self.visibility_m
 
 
 class Weather(Closed):
@@ -319,8 +150,28 @@ class Weather(Closed):
     snow: Snow | None = None
 
 
-class Render(Closed):
+class Render(Section):
     """How the scene is drawn."""
+
+    later_fields = ("exposure", "transmittance_stop", "radius_clip_px")
+    knobs = (
+        Knob(
+            "scale",
+            (0.25, 0.5, 0.75, 1.0),
+            "resolution, enlarged again for the comparison",
+            0,
+            tiers={"draft": 0.75},
+        ),
+        Knob("radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out", 4),
+        Knob(
+            "transmittance_stop",
+            (0.05, 0.01, 1e-3, 1e-4),
+            "light behind it is given up",
+            5,
+            tiers={"draft": 0.01, "balanced": 0.01},
+        ),
+        Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
+    )
 
     scale: Number = Field(default=1.0, gt=0, le=4)
     """Resolution relative to the cameras'."""
@@ -344,8 +195,21 @@ class Render(Closed):
     picture, are left out; 0 leaves out none."""
 
 
-class Output(Closed):
+class Output(Section):
     """What is written for each image."""
+
+    later_fields = ("surface",)
+    knobs = (
+        Knob("depth", ("none", "expected", "median", "mode"), "depth estimator", 11, False),
+        Knob(
+            "jpeg_quality",
+            (60, 75, 92, 100),
+            "size and error of jpg files",
+            12,
+            chosen=False,
+            works=lambda output: output.image == "jpg",
+        ),
+    )
 
     image: Literal["png", "jpg"] = "png"
     """Image format."""
@@ -405,18 +269,24 @@ class Recipe(Closed):
         recipes without them meant, so that hashes stay; sweeps that auto passes through are those
         of `lidar: true`. Where files lie is left out: their digest says what they hold.
         """
-        data = self.model_dump(mode="json")
-        for section, name in _LATER_FIELDS:
-            model, holder = (getattr(self, section), data[section]) if section else (self, data)
-            if model is None:
-                continue
-            default = type(model).model_fields[name].default
-            if getattr(model, name) == default:
-                del holder[name]
+        data, present = self.model_dump(mode="json"), self.sections()
+        sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
+        left_out = [] if self.quality != Quality() else ["quality"]
+        left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
+        left_out += [
+            f"{path}.{name}"
+            for path, section in sections.items()
+            for name in section.later_fields
+            if getattr(section, name) == type(section).model_fields[name].default
+        ]
+        left_out += [
+            f"{p}.{name}" for p, section in present.items() for name in section.file_fields
+        ]
+        for path in left_out:
+            *above, name = path.split(".")
+            del functools.reduce(operator.getitem, above, data)[name]
         if self.output.lidar == "auto" and self.lidar == "clean":
             data["output"]["lidar"] = True
-        for name in FILES if self.style is not None else ():
-            del data["style"][name]
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
 
     @property
@@ -452,37 +322,118 @@ class Recipe(Closed):
         return f"{'; '.join(notes)} {settings}" if notes else None
 
     def _surfaces(self) -> dict[str, bool]:
-        """What of the weather a ray can end on, and whether depth images show it."""
-        snow, shown = self.weather.snow, self.output.surface
-        found = {}
-        if snow is not None and snow.lies:
-            found[f"snow {snow.depth_m:.3g} m deep"] = shown != "scene"
-        if self.weather.flood is not None:
-            found["water"] = shown == "first"
-        return found
+        """What of the weather a beam can end on, and whether depth images show it."""
+        shown = [section.surface(self.output.surface) for section in self.sections().values()]
+        return dict(sorted(surface for surface in shown if surface is not None))
 
-    def weather_numbers(self) -> dict[str, float]:
-        """Flat numbers for the manifest: NaN where absent; no smog and no style are 0.
+    def sections(self) -> dict[str, EffectModel]:
+        """Its effects, by dotted path."""
+        every = ((path, found(self, path)) for path in SECTIONS)
+        return {path: section for path, section in every if section is not None}
 
-        flood_turbidity_ntu is NaN where the recipe gives an absorption, flood_wave_height (a factor
-        on a preset's waves) where waves are listed.
-        """
-        smog, flood, snow = self.weather.smog, self.weather.flood, self.weather.snow
-        height_m = None if smog is None else smog.scale_height_m
-        turbidity = None if flood is None else flood.effective_turbidity_ntu
-        waves = None if flood is None or flood.waves.components is not None else flood.waves
+    def columns(self) -> dict[str, float | str | None]:
+        """What its effects say in manifests, by column."""
         return {
-            "smog_extinction_per_m": 0.0 if smog is None else smog.sigma_per_m,
-            "smog_scale_height_m": math.nan if height_m is None else height_m,
-            "flood_level_m": math.nan if flood is None else flood.level_m,
-            "flood_turbidity_ntu": math.nan if turbidity is None else turbidity,
-            "flood_wave_height": math.nan if waves is None else waves.height,
-            "snow_depth_m": math.nan if snow is None else snow.depth_m,
-            "snow_coverage": math.nan if snow is None else snow.coverage,
-            "style_strength": 0.0 if self.style is None else self.style.strength,
+            column.name: column.of(found(self, path))
+            for path, model in SECTIONS.items()
+            for column in model.columns
         }
 
-    def style_words(self) -> dict[str, str | None]:
-        """For the manifest: the name of the style's preset or image, and the method; or null."""
-        style = self.style
-        return {"style": style and style.name, "style_method": style and style.method}
+
+# ---- The effects, and all that follows from their models -----------------------------------------
+
+SECTIONS: dict[str, type[EffectModel]] = {
+    "weather.smog": Smog,
+    "weather.flood": Flood,
+    "weather.snow": Snow,
+    "style": Style,
+}
+# By dotted path, those that save most first.
+KNOBS: dict[str, Knob] = {}
+# What each tier sets, by dotted path, of the fields that a recipe does not give; the rest are at
+# reference, the last value of every knob. By the rule of docs/trade.md from docs/trade/*.json.
+TIERS: dict[str, dict[str, Value]] = {"draft": {}, "balanced": {}}
+
+
+def add_section(path: str, model: type[EffectModel]) -> None:
+    """Another effect in the recipes that are made from now on. path: `weather.dust`, or `dust`."""
+    holder, name = _place(path)
+    holder.model_fields[name] = FieldInfo.from_annotated_attribute(model | None, None)
+    SECTIONS[path] = model
+    _rebuild()
+
+
+def remove_section(path: str) -> None:
+    """Undo add_section."""
+    holder, name = _place(path)
+    del holder.model_fields[name], SECTIONS[path]
+    _rebuild()
+
+
+def _place(path: str) -> tuple[type[Closed], str]:
+    holder, _, name = path.rpartition(".")
+    return {"weather": Weather, "": Recipe}[holder], name
+
+
+def _rebuild() -> None:
+    Weather.model_rebuild(force=True)
+    Recipe.model_fields["weather"].default = Weather()
+    Recipe.model_rebuild(force=True)
+    _collect_knobs()
+
+
+def _collect_knobs() -> None:
+    sections: dict[str, type[Section]] = {"render": Render, "output": Output, **SECTIONS}
+    every = [
+        replace(knob, path=f"{path}.{knob.path}", section=path)
+        for path, model in sections.items()
+        for knob in model.knobs
+    ]
+    KNOBS.clear()
+    KNOBS.update((knob.path, knob) for knob in sorted(every, key=lambda knob: knob.rank))
+    for tier, settings in TIERS.items():
+        settings.clear()
+        settings.update((k.path, k.tiers[tier]) for k in KNOBS.values() if tier in k.tiers)
+
+
+_collect_knobs()
+
+
+def columns_of_effects() -> dict[str, Column]:
+    """The columns of manifests that effects fill, by name."""
+    return {column.name: column for model in SECTIONS.values() for column in model.columns}
+
+
+# ---- Settings of the knobs of a recipe -----------------------------------------------------------
+
+
+def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
+    """The knobs that have an effect on the recipe's pictures or files."""
+    sections = ((knob, found(recipe, knob.section)) for knob in KNOBS.values())
+    return tuple(knob for knob, section in sections if section is not None and knob.works(section))
+
+
+def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
+    """Those of them that a tier or a target may set: the recipe does not give their field."""
+    return tuple(k for k in knobs_of(recipe) if k.chosen and not is_given(recipe, k.path))
+
+
+def settings_of(recipe: Recipe) -> dict[str, Value]:
+    """The values of its knobs, by path."""
+    return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
+
+
+def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
+    """The recipe with some knobs set, which then count as given; ValueError if one is refused."""
+    return changed(recipe, settings)
+
+
+def tier_settings(recipe: Recipe, tier: str) -> dict[str, Value]:
+    """What a tier sets of this recipe: of its free knobs."""
+    chosen = TIERS.get(tier, {})
+    return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
+
+
+def as_reference(recipe: Recipe) -> Recipe:
+    """The recipe with all its knobs that a tier may set at reference, given or not."""
+    return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})

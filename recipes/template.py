@@ -23,22 +23,20 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from recipes.errors import RecipeError
-from recipes.files import file_below, with_digest
-from recipes.schema import VERSION, Recipe
-from recipes.weather import (
-    FILES,
+from recipes.fields import (
     Colour,
     Digest,
     FilePath,
     Flag,
     Number,
+    OneOf,
     PerMetre,
     Rates,
-    StyleName,
     Unit,
     Whole,
-    style_preset_names,
 )
+from recipes.files import file_below, with_digest
+from recipes.schema import SECTIONS, VERSION, Recipe
 
 # ---- The random numbers of a recipe: each a pure function of (seed, variant, name of the field) --
 # No generator hands its state from draw to draw: a new field or variant leaves all others alone.
@@ -264,7 +262,7 @@ def words(value: Plain) -> str:
 
 
 # ---- The fields of a recipe as a table, read off the models of `schema`: nothing is stated twice -
-# The loader, its messages, the JSON Schema and the documentation all walk `ROOT`.
+# The loader, its messages, the JSON Schema and the documentation all walk `root()`.
 
 # the end of a field's name says its unit
 UNITS = {
@@ -297,7 +295,6 @@ class Kind(enum.Enum):
 
 
 _KINDS = (
-    (StyleName, Kind.WORD),
     (FilePath, Kind.PATH),
     (Digest, Kind.DIGEST),
     (Colour, Kind.COLOUR),
@@ -489,11 +486,12 @@ def _kind(annotation: Any) -> tuple[Kind, tuple[str, ...]]:
     """What a field of this type holds, and the words that it may be."""
     for known, kind in _KINDS:
         if annotation == known:
-            return kind, style_preset_names() if annotation == StyleName else ()
+            return kind, ()
     if get_origin(annotation) is Literal:
         return Kind.WORD, tuple(map(str, get_args(annotation)))
     if get_origin(annotation) is Annotated:  # Number and its like
-        return _kind(get_args(annotation)[0])
+        named = [rule.names() for rule in annotation.__metadata__ if isinstance(rule, OneOf)]
+        return (Kind.WORD, named[0]) if named else _kind(get_args(annotation)[0])
     flag, choices = get_args(annotation)  # true, false, or a word
     assert flag == Flag, annotation
     return Kind.FLAG, _kind(choices)[1]
@@ -508,8 +506,19 @@ VARIANTS = _spec(
     Field(default=1, ge=1, le=1_000_000, description="How many recipes are drawn from this file."),
     rangeable=False,
 )
-ROOT = _section("", Recipe)
-ROOT.extra["variants"] = VARIANTS
+
+
+def root() -> SectionSpec:
+    """The fields of recipe files."""
+    return _root(tuple(SECTIONS.items()))
+
+
+@functools.lru_cache(2)
+def _root(sections: tuple[tuple[str, type[BaseModel]], ...]) -> SectionSpec:
+    """sections: those of Recipe at the time."""
+    spec = _section("", Recipe)
+    spec.extra["variants"] = VARIANTS
+    return spec
 
 
 # ---- What a file says, and the recipes that it stands for ----------------------------------------
@@ -549,8 +558,8 @@ class RecipeTemplate:
                 cannot be read or is not the one of which the recipe gives the digest.
         """
         number = self.first_variant + variant
-        if variant < 0 or not ROOT.fields["variant"].accepts(number):
-            allowed = ROOT.fields["variant"].allowed(number)
+        if variant < 0 or not root().fields["variant"].accepts(number):
+            allowed = root().fields["variant"].allowed(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         draws = Draws(self.seed, number)
         data: dict[str, Any] = {"version": VERSION, "name": self.name, "seed": self.seed}
@@ -567,7 +576,7 @@ class RecipeTemplate:
             if not path.startswith(absent):
                 _put(data, path, value.draw(draws, path))
         where = f"{self.source}: variant {number}"
-        self._find_files(data.get("style"), where)
+        self._find_files(data, where)
         try:
             return with_digest(Recipe.model_validate(data))
         except ValidationError as error:
@@ -575,22 +584,27 @@ class RecipeTemplate:
         except RecipeError as error:
             raise RecipeError(f"{self.source}: {error}") from None
 
-    def _find_files(self, style: dict[str, Any] | None, where: str) -> None:
+    def _find_files(self, data: dict[str, Any], where: str) -> None:
         """Replace the names of files by absolute paths."""
-        for name in FILES:
-            written = (style or {}).get(name)
-            if style is None or written is None:
-                continue
-            try:
-                if self.folder is None:
-                    raise ValueError("the recipe is in no folder to look in")
-                style[name] = str(file_below(self.folder, written))
-            except ValueError as error:
-                raise RecipeError(f"{where}: style.{name} = {written!r}: {error}") from None
+        for path, model in SECTIONS.items():
+            section: dict[str, Any] | None = data
+            for key in path.split("."):
+                section = (section or {}).get(key)
+            for name in model.file_fields:
+                written = (section or {}).get(name)
+                if section is None or written is None:
+                    continue
+                try:
+                    if self.folder is None:
+                        raise ValueError("the recipe is in no folder to look in")
+                    section[name] = str(file_below(self.folder, written))
+                except ValueError as error:
+                    text = f"{where}: {path}.{name} = {written!r}: {error}"
+                    raise RecipeError(text) from None
 
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""
-        units = {spec.path: spec.unit for part in ROOT.walk() for spec in part.fields.values()}
+        units = {spec.path: spec.unit for part in root().walk() for spec in part.fields.values()}
         described = {
             path: f"present with probability {probability:g}"
             for path, probability in self.effects

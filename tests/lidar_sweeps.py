@@ -9,8 +9,9 @@ import numpy as np
 
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
+from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Snow
+from recipes.snow import Snow
 from tests.snow_scenes import drive, sheet
 
 WORLD_ORIGIN_M = np.array([448_262.125, 4_421_337.5, 41.5])

@@ -375,7 +375,7 @@ def presets(name: Positional[str | None] = None) -> int:
     Args:
         name: A preset to print.
     """
-    from recipes.weather import style_preset_names, style_preset_text
+    from recipes.style import style_preset_names, style_preset_text
 
     print("\n".join(style_preset_names()) if name is None else style_preset_text(name), end="")
     if name is None:

@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import replaced_file, write_atomic
 from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import OK, read_manifest
-from recipes.schema import KOSCHMIEDER
+from recipes.smog import KOSCHMIEDER
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_PX, GAP_PX = 42, 8

@@ -45,10 +45,10 @@ from augment.render.threads import thread_count
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
 from augment.views import render_view
+from recipes.fields import found
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, parse_frames
-from recipes.weather import found
 from tools.drawing import draw_sheet, draw_video
 from tools.export import mirror_outputs, recipes_for_source
 from tools.output import fill, print_images, print_note

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from markupsafe import Markup
 
 from augment.jobs.manifest import weather_columns
-from recipes.schema import KOSCHMIEDER
+from recipes.smog import KOSCHMIEDER
 
 MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic

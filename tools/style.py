@@ -48,7 +48,7 @@ from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from recipes.weather import Style, no_such_style, style_preset_names
+from recipes.style import STYLES, Style, style_preset_names
 from tools.drawing import captioned, strip, write_rgb
 from tools.options import StyleTrainOptions, uri_text
 from tools.output import check_scene_out, fill, path_beside, print_note
@@ -401,7 +401,7 @@ def _style(
 ) -> Style:
     is_preset = style in style_preset_names()
     if not is_preset and not Path(style).exists() and not Path(style).suffix:
-        raise StyleError(f"{style} is no image file, and {no_such_style(style)}")
+        raise StyleError(f"{style} is no image file, and {STYLES.refusal(style)}")
     try:
         return Style(
             image=None if is_preset else style,

@@ -171,7 +171,7 @@ class SceneDataset(Dataset):
             camera=camera_record(written, origin_m),
             world_from_ego=world_from_ego,
             labels=labels if "boxes" in load else Labels(),
-            weather=recipe.weather_numbers(),
+            weather={n: v for n, v in recipe.columns().items() if isinstance(v, float)},
             paths=dict.fromkeys(PATH_KINDS),
             names={
                 "scene": self.scene.name,

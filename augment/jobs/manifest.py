@@ -25,8 +25,8 @@ from augment.jobs.atomic import write_atomic
 from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
+from recipes.fields import found
 from recipes.schema import Recipe, knobs_of
-from recipes.weather import found
 
 OK, FAILED = "ok", "failed"
 
@@ -530,7 +530,7 @@ def image_row(
         **shown_words(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
-        **recipe.weather_numbers(),
+        **recipe.columns(),
         "seed": recipe.seed,
         "recipe": recipe.name,
         **vars(identity),
@@ -551,7 +551,6 @@ def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
         settings = json.dumps(values, separators=(",", ":"))
     return {
         "surface": recipe.output.surface,
-        **recipe.style_words(),
         "quality": words,
         "render_scale": recipe.render.scale,
         "settings": settings,

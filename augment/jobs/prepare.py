@@ -25,7 +25,8 @@ from augment.effects.style.color_maps import StyleMaps
 from augment.effects.style.style import remember_maps, style_maps
 from augment.scene import Scene
 from recipes.schema import Recipe
-from recipes.weather import Snow, Style
+from recipes.snow import Snow
+from recipes.style import Style
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class StoredSnowSupport:
 def snow_of_recipe(recipe: Recipe) -> Snow | None:
     """The recipe's snow; None where there is none to be laid."""
     snow = recipe.weather.snow
-    return snow if snow is not None and snow.lies else None
+    return snow if snow is not None and snow.changes else None
 
 
 def remember(scene: Scene, snow: Snow, bed: SnowSupport) -> None:

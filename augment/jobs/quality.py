@@ -32,7 +32,7 @@ from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
 from augment.metrics.image import flip
 from augment.scene import Scene
-from recipes.schema import BY_PATH, Recipe, Value, free_knobs, with_settings
+from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 
 # ---- One picture for the sake of its time and its errors, at the size of its reference -----------
 
@@ -702,7 +702,7 @@ def resolve_quality_once(
 
 def _check_values(settings: dict[str, Any]) -> None:
     for path, value in settings.items():
-        knob = BY_PATH.get(path)
+        knob = KNOBS.get(path)
         if knob is None or not any(value == v and type(value) is type(v) for v in knob.values):
             raise ValueError(f"{path} = {value!r} is none of the values to choose from")
 

@@ -99,7 +99,7 @@ from augment.scene import Scene
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
 from recipes.schema import Recipe
-from recipes.weather import Style
+from recipes.style import Style
 
 # ---- What a variant has finished so far, on the disk, until the manifest has it ------------------
 # `.climategs/journal/<scene>/<variant>.jsonl` starts with the variant's identity and gains a line

@@ -19,7 +19,7 @@ from augment.errors import AdapterError, SceneError
 from augment.files.ply import write_ply, write_splat
 from augment.jobs.files import check_frames
 from augment.scene import Gaussians
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 

@@ -26,7 +26,8 @@ from augment.effects.snow import support as beds
 from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.render_job import ProgressLog, RenderJob, run_job
-from recipes.weather import Flood, Snow
+from recipes.flood import Flood
+from recipes.snow import Snow
 
 STRIDE = 71  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")

@@ -27,8 +27,10 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
 from augment.views import SurfaceView
+from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Snow, Style
+from recipes.snow import Snow
+from recipes.style import Style
 
 ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
 LEVEL_Z_M = 0.2

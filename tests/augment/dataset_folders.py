@@ -13,7 +13,7 @@ from batch_scenes import fake_render, make_recipe, open_fake
 
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import StoredFile, StoredFileMissing
-from recipes.weather import Flood
+from recipes.flood import Flood
 
 CLEAR = make_recipe("clear", lidar=True)
 FOGGY = make_recipe(image="jpg", lidar=True)

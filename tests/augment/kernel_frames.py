@@ -22,8 +22,10 @@ from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
 from augment.views import render_view
+from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.weather import Flood, Snow, Style, Waves
+from recipes.snow import Snow
+from recipes.style import Style
 
 WIDTH, HEIGHT = 20, 12
 _DENSE = 20.0  # metres of visibility: there is smog to see even here

@@ -36,8 +36,9 @@ from augment.jobs.files import TABLES, visibility
 from augment.jobs.manifest import LATER, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.labels import Boxes
+from recipes.flood import Flood
 from recipes.schema import Recipe, Smog, Weather
-from recipes.weather import Flood, Snow
+from recipes.snow import Snow
 
 # Snow of no depth is not laid, so no place is looked for; the stand-in draws some all the same.
 SNOW, FLOOD = Snow(depth_m=0), Flood(level_m=0.3)

@@ -28,7 +28,7 @@ from augment.errors import OutputError, SceneError
 from augment.jobs.prepare import store_snow_supports
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
 

@@ -33,7 +33,7 @@ from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from recipes.weather import Style
+from recipes.style import Style
 
 
 class Searches(list):

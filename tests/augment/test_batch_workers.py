@@ -29,7 +29,9 @@ from augment.jobs.processes import available_cores, share_scene, thread_limits
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Actor, Track
 from augment.sky import LatLongSky
-from recipes.weather import Flood, Snow, Style
+from recipes.flood import Flood
+from recipes.snow import Snow
+from recipes.style import Style
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(

@@ -25,7 +25,7 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.views import render_view
 from recipes.schema import Output, Recipe, Render, Weather
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 PARKED = np.array([14.0, 0.0, 0.75])
 SIZE = np.array([4.0, 1.8, 1.5])

@@ -37,7 +37,7 @@ from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky
-from recipes.weather import Waves
+from recipes.flood import Waves
 from tests.augment.flood_programs import few_programs
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import sh_of

@@ -26,7 +26,8 @@ from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredView, begin_view, render_view
 from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.weather import Snow, Style
+from recipes.snow import Snow
+from recipes.style import Style
 from tests import snow_scenes
 from tests.augment import pretend_gpu
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu

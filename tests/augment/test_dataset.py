@@ -38,8 +38,8 @@ from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.jobs.files import TABLES
 from augment.jobs.render_job import RenderJob, run_job
+from recipes.flood import Flood
 from recipes.schema import Recipe
-from recipes.weather import Flood
 
 FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
 RECIPES = [

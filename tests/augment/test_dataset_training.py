@@ -193,7 +193,8 @@ def test_pairs_show_the_same_moment(written: Path) -> None:
 
 
 def test_what_is_clean(written: Path, tmp_path: Path) -> None:
-    from recipes.weather import Flood, Snow
+    from recipes.flood import Flood
+    from recipes.snow import Snow
 
     level = make_recipe("clear", variant=1, flood=Flood(level_m=0.0))
     bare = make_recipe("clear", variant=2, snow=Snow(depth_m=0.0))

@@ -29,7 +29,7 @@ from augment.plan import make_plan
 from augment.rng import rng_for
 from augment.views import render_buffers, render_view
 from recipes.schema import Recipe
-from recipes.weather import Snow
+from recipes.snow import Snow
 from tests.augment.examples import drawing
 from tests.augment.extremes import Place, camera_at, cameras, nothing, places, snow_model, street
 from tests.snow_beds import cells_on_grid

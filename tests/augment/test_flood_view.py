@@ -19,8 +19,8 @@ from augment.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, Sky
 from augment.views import render_buffers, render_view
+from recipes.flood import Flood, Wave, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Wave, Waves
 from tests.scenes import sh_of
 
 ROAD_Z = -1.5

@@ -21,7 +21,8 @@ from augment.effects.lidar.beam import (
     weathered_sweep,
 )
 from augment.render.fog import Fog, optical_depth_of_arrays
-from recipes.schema import KOSCHMIEDER, Smog
+from recipes.schema import Smog
+from recipes.smog import KOSCHMIEDER
 from tests.lidar_sweeps import ranges_of, recipe, some_points, street, sweep_of
 
 MODEL = LidarModel()

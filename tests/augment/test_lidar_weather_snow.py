@@ -16,7 +16,7 @@ from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
 from augment.effects.snow.snow import PlacedSnow, placement_settings, snow_layers_of
 from augment.effects.snow.support import remember_support
-from recipes.weather import Snow
+from recipes.snow import Snow
 from tests.lidar_sweeps import (
     SENSOR_M,
     WORLD_ORIGIN_M,

@@ -21,8 +21,9 @@ from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
 from augment.scene import Scene
 from augment.views import WeatheredView, render_view
+from recipes.flood import Flood
 from recipes.schema import Recipe, Smog, Weather
-from recipes.weather import Flood, Snow
+from recipes.snow import Snow
 from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
 from tests.streets import LABELLED_STREET, open_street
 

@@ -18,7 +18,7 @@ from augment.effects.lidar.beam import (
     water_reflectance,
     weathered_sweep,
 )
-from recipes.weather import Flood, Waves
+from recipes.flood import Flood, Waves
 from tests.lidar_sweeps import beams, ground_points, recipe, some_points, street, sweep_of
 
 CLEAR = Flood(level_m=0.02, reference="absolute", turbidity_ntu=0)

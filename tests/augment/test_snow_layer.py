@@ -21,7 +21,7 @@ from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Track
 from augment.semantics import SemanticClass
-from recipes.weather import Snow
+from recipes.snow import Snow
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
 
 CELL_M = 0.05

@@ -21,7 +21,7 @@ from augment.effects.snow.light import (
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from recipes.weather import Snow, SnowLight
+from recipes.snow import Snow, SnowLight
 
 SH_C0 = 0.28209479177387814
 HEIGHT = 180  # a row a degree

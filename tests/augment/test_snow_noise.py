@@ -20,7 +20,7 @@ from augment.effects.snow.profile import (
     threshold_of,
 )
 from augment.render.threads import limit_threads
-from recipes.weather import Snow
+from recipes.snow import Snow
 from tests.snow_beds import cells_on_grid
 
 SEED = np.uint64(77)

@@ -13,8 +13,9 @@ from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, OVERLAY, SPLAT_ID
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
+from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Snow, Waves
+from recipes.snow import Snow
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))

@@ -8,7 +8,7 @@ import pytest
 from augment.effects.style.statistics import LAND, SKY, WHOLE, closed_maps, statistics_of
 from augment.effects.style.style import SHARES, parse_statistics, preset_statistics, together
 from augment.errors import StyleError
-from recipes.weather import style_preset_names, style_preset_text
+from recipes.style import style_preset_names, style_preset_text
 
 NAMES = style_preset_names()
 GOOD = """

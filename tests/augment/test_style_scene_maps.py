@@ -19,7 +19,7 @@ from augment.effects.style.network import Gscm
 from augment.effects.style.statistics import LAND, SKY
 from augment.effects.style.style import remember_maps, style_maps
 from augment.errors import StyleError
-from recipes.weather import Style
+from recipes.style import Style
 
 
 def colourful() -> object:

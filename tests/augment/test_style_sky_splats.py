@@ -21,7 +21,7 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
 from recipes.schema import Recipe
-from recipes.weather import Style
+from recipes.style import Style
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import drive, sheet
 

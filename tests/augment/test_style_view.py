@@ -19,8 +19,10 @@ from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
+from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Snow, Style, Waves
+from recipes.snow import Snow
+from recipes.style import Style
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 

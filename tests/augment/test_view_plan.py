@@ -17,8 +17,9 @@ from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
 from augment.views import render_buffers, render_view
+from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Weather
-from recipes.weather import Flood, Snow, Waves
+from recipes.snow import Snow
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall
 

@@ -21,7 +21,7 @@ from augment.effects.flood.waves import (
 )
 from augment.geometry import rigid
 from augment.render.threads import limit_threads
-from recipes.weather import Wave, Waves
+from recipes.flood import Wave, Waves
 
 NOW = 1_700_000_000_123_456_789  # a timestamp of today's recordings
 RMS_SLOPES = {"calm": 0.012, "breeze": 0.04, "wind": 0.09}

@@ -10,8 +10,8 @@ import pytest
 from recipes.errors import RecipeError
 from recipes.load import preset_names
 from recipes.parse import parse_recipe
+from recipes.style import style_preset_names
 from recipes.template import ROOT, words
-from recipes.weather import style_preset_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 

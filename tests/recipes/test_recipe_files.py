@@ -14,7 +14,7 @@ from recipes.files import digest_of, read_files, with_digest
 from recipes.load import dump_recipe, load_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import Recipe
-from recipes.weather import Style
+from recipes.style import Style
 
 
 @pytest.fixture

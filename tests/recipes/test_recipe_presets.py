@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from recipes.flood import Flood
 from recipes.load import load_recipe
-from recipes.schema import KOSCHMIEDER, Weather
+from recipes.schema import Weather
+from recipes.smog import KOSCHMIEDER
 from recipes.template import Uniform, as_number
-from recipes.weather import Flood
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 

@@ -7,12 +7,14 @@ from pydantic import ValidationError
 
 from recipes import schema as knobs
 from recipes.errors import RecipeError
+from recipes.fields import changed, found, is_given, replaced
+from recipes.flood import Flood, Wave, Waves
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import TIERS, Quality, Recipe, Render, Weather
+from recipes.style import Style
 from recipes.template import ROOT
-from recipes.weather import Flood, Style, Wave, Waves, changed, found, is_given, replaced
 
 SNOW_AND_FLOOD = "weather: {snow: {depth_m: 0.1}, flood: {level_m: 0.2}}\n"
 

@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from recipes.flood import MAX_WAVES, Flood, Wave, Waves
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import Output, Quality, Recipe, Render, Smog, Weather
+from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.style import Style
 from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind
-from recipes.weather import MAX_WAVES, Flood, Snow, SnowLight, SnowWind, Style, Wave, Waves
 
 FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
 NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]

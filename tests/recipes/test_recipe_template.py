@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recipes.errors import RecipeError
+from recipes.flood import Flood, Wave, Waves
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import Output, Recipe, Render, Smog, Weather
+from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.template import Fixed, RecipeTemplate
-from recipes.weather import Flood, Snow, SnowLight, SnowWind, Wave, Waves
 
 TEXT = """
 name: foggy

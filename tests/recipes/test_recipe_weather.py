@@ -8,9 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
+from recipes.flood import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 from recipes.parse import parse_recipe
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
-from recipes.weather import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 
 
 def problems(text: str) -> tuple[str, ...]:

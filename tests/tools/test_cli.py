@@ -12,7 +12,7 @@ import torch
 from augment.dataset import WeatherDataset
 from augment.files.ply import write_ply
 from augment.scene import Gaussians
-from recipes.weather import style_preset_names
+from recipes.style import style_preset_names
 from tools.cli import main
 from tools.render import resolve_variants
 

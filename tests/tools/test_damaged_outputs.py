@@ -19,7 +19,7 @@ from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import METADATA_KEY
-from recipes.weather import Flood
+from recipes.flood import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tools.drawing import draw_sheet
 from tools.evaluate import evaluate_output

@@ -8,7 +8,8 @@ import pytest
 
 from augment.scene import Scene
 from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Snow, Style
+from recipes.snow import Snow
+from recipes.style import Style
 from tests.snow_scenes import box_car, drive, sheet
 from tools import explain
 from tools.explain import (

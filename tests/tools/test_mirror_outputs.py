@@ -18,7 +18,7 @@ from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import read_lidar
 from augment.labels import LidarSweep
 from augment.scene import Scene
-from recipes.weather import Flood
+from recipes.flood import Flood
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools

@@ -12,7 +12,7 @@ from augment.effects.style.color_maps import style_gaussians, style_sky
 from augment.effects.style.style import style_maps
 from augment.errors import OutputError, StyleError
 from augment.files.scene_file import load_scene_parts, save_scene
-from recipes.weather import Style
+from recipes.style import Style
 from tests.fitted_scenes import fitted_scene
 from tools.style import apply_style, picture_path, style_text
 

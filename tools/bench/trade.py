@@ -56,9 +56,10 @@ from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
 from augment.views import SURFACE_ALPHA, render_buffers
+from recipes.fields import changed
+from recipes.flood import Flood
 from recipes.load import load_recipe
 from recipes.schema import (
-    BY_PATH,
     KNOBS,
     TIERS,
     Knob,
@@ -72,7 +73,8 @@ from recipes.schema import (
     knobs_of,
     with_settings,
 )
-from recipes.weather import Flood, Snow, Style, changed
+from recipes.snow import Snow
+from recipes.style import Style
 from tools.bench.harness import (
     Figures,
     Table,
@@ -514,7 +516,7 @@ def jpeg_rows(pictures: Sequence[np.ndarray]) -> list[Row]:
     loses nothing.
     """
     rows = []
-    for quality in ("png", *BY_PATH[JPEG].values):
+    for quality in ("png", *KNOBS[JPEG].values):
         output = Output() if quality == "png" else Output(image="jpg", jpeg_quality=quality)
         seconds, files = [], []
         for picture in pictures:
@@ -549,7 +551,7 @@ def printable(trade: Mapping[str, Any]) -> Figures:
     """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
     first, and the files.
     """
-    order = {path: number for number, path in enumerate([WHOLE, *(knob.path for knob in KNOBS)])}
+    order = {path: number for number, path in enumerate([WHOLE, *KNOBS])}
     tables = []
     for entry in trade["recipes"]:
         rows = sorted(entry["rows"], key=lambda row: order[row["knob"]])
@@ -611,7 +613,7 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
         Unmeasured: see tiers_from.
     """
     rows = _all_rows(tables)
-    costs = {knob.path: knob_costs(rows, knob) for knob in KNOBS if knob.chosen}
+    costs = {knob.path: knob_costs(rows, knob) for knob in KNOBS.values() if knob.chosen}
     # From the fastest to reference, as within_flip takes them.
     ladders = {path: useful(each)[::-1] for path, each in costs.items()}
     flips = {path: {cost.value: cost.flip for cost in each} for path, each in costs.items()}
@@ -626,7 +628,7 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
         lambda path, value: flips[path][value],
         lambda settings: whole_flip(rows, settings) > bound,
     )
-    return {path: value for path, value in chosen.items() if value != BY_PATH[path].reference}
+    return {path: value for path, value in chosen.items() if value != KNOBS[path].reference}
 
 
 def knob_costs(rows: Sequence[Row], knob: Knob) -> list[Cost]:
@@ -664,7 +666,7 @@ def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
 def _alone(rows: Sequence[Row], settings: Settings) -> list[float]:
     """The error of settings of which one, or none, differs from reference for a recipe."""
     knobs = {row["knob"] for row in rows}
-    moved = {p: v for p, v in settings.items() if p in knobs and v != BY_PATH[p].reference}
+    moved = {p: v for p, v in settings.items() if p in knobs and v != KNOBS[p].reference}
     if not moved:
         return [0.0]
     if len(moved) > 1:
@@ -719,7 +721,7 @@ def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeC
 
 def invisible_evidence(tables: Tables) -> list[float]:
     """Mean FLIP of JPEGs of INVISIBLE_QUALITY against PNG, by scene and recipe."""
-    rows = _of_value(_all_rows(tables), BY_PATH[JPEG], INVISIBLE_QUALITY)
+    rows = _of_value(_all_rows(tables), KNOBS[JPEG], INVISIBLE_QUALITY)
     return [row["flip"] for row in rows]
 
 
@@ -768,7 +770,7 @@ def _views_line(trade: Mapping[str, Any]) -> str:
 
 def _tier_lines() -> list[str]:
     rows = []
-    for knob in (knob for knob in KNOBS if knob.chosen):
+    for knob in (knob for knob in KNOBS.values() if knob.chosen):
         values = [TIERS[name].get(knob.path, knob.reference) for name in BOUNDS]
         rows.append([f"`{knob.path}`", knob.what, *map(_text, [*values, knob.reference])])
     return _lines(["knob", "what it is", *BOUNDS, REFERENCE], rows)
@@ -791,7 +793,7 @@ def _whole_lines(tables: Tables) -> list[str]:
 def _knob_lines(tables: Tables) -> list[str]:
     """Over all recipes that a knob has an effect on: mean ratio of times and the worst errors."""
     each, rows = ("x reference", "worst FLIP", "depth off"), []
-    for knob in (knob for knob in KNOBS if knob.path != JPEG):
+    for knob in (knob for knob in KNOBS.values() if knob.path != JPEG):
         for value in knob.values if knob.path == DEPTH else knob.values[:-1]:
             of = [_of_value(table_of(table), knob, value) for table in tables]
             cells = [cell for own in of for cell in _knob_cells(own)]

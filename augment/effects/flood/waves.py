@@ -27,7 +27,7 @@ from augment.render.buffers import CPU, CUDA, REFERENCE, kernels_for
 from augment.render.cuda.runtime import gpu_device
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
-from recipes.weather import Wave, Waves
+from recipes.flood import Wave, Waves
 
 GRAVITY_MPS2 = 9.80665
 CUSP = 1e-12  # area that is left of a unit of the plane where the surface counts as a point

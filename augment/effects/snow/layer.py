@@ -21,7 +21,7 @@ from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 CELLS = 2048  # that a thread takes at a time
 # A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque

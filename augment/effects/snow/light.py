@@ -21,7 +21,7 @@ from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import Sky
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 FRESH_ALBEDO = 0.85  # `light.brightness` is of this snow; fresh snow has 0.8 to 0.95 (Oke 1987)
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from augment.effects.snow.cells import EDGE_CAP_M, SnowCells
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 # ---- Noise over the plane that snow's depth and patches follow: the numpy definition -------------
 # Gradient noise (Perlin 1985) with the fade curve of Perlin 2002, its gradients drawn by a hash of

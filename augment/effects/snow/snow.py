@@ -22,7 +22,7 @@ from augment.effects.style.style import SceneStyle
 from augment.labels import Boxes
 from augment.render.buffers import AUTO
 from augment.scene import Scene
-from recipes.weather import Snow
+from recipes.snow import Snow
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from augment.render.buffers import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
 from recipes.errors import RecipeError
-from recipes.weather import Style, style_preset_text
+from recipes.style import Style, style_preset_text
 from recipes.yaml_tree import read_plain
 
 if TYPE_CHECKING:

@@ -1,0 +1,139 @@
+"""What recipe models are made of: types of fields, models that refuse unknown keys, and how fields
+are found and changed by dotted paths.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict
+from pydantic.config import JsonDict
+from pydantic_core import CoreSchema, core_schema
+
+from recipes.errors import did_you_mean
+
+MAX_PER_M = 1e6  # a micrometre of it is opaque
+
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
+Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
+Colour = tuple[Unit, Unit, Unit]
+PerMetre = Annotated[float, Strict(), Field(ge=0.0, le=MAX_PER_M)]
+Rates = tuple[PerMetre, PerMetre, PerMetre]
+Angle = Annotated[float, Strict(), Field(ge=-360, le=360)]
+Seed = Annotated[int, Strict(), Field(ge=0, lt=2**63)]
+# In a recipe file a path below its folder; in a recipe in numbers any path.
+FilePath = Annotated[str, Strict(), Field(min_length=1, max_length=4096)]
+Digest = Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """For a text's annotation: it is one of these names. noun: what they are names of."""
+
+    noun: str
+    names: Callable[[], tuple[str, ...]]
+
+    def refusal(self, name: str) -> str:
+        """What to say of a name that is none of them."""
+        names = self.names()
+        guess = did_you_mean(name, names)
+        return f"no such {self.noun}; {guess}{self.noun}s are {', '.join(names)}"
+
+    def check(self, name: str) -> str:
+        if name not in self.names():
+            raise ValueError(self.refusal(name))
+        return name
+
+    def __get_pydantic_core_schema__(self, of: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self.check, handler(of))
+
+
+class Closed(BaseModel):
+    """Frozen, and an unknown key is an error: what every section of a recipe derives from.
+
+    The text below a field is its description.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+# ---- Fields of nested models by dotted path: read, given or not, and changed in a copy -----------
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def found(model: BaseModel, path: str) -> Any:
+    """The value at a dotted path; None where a section on the way is absent."""
+    value: Any = model
+    for name in path.split("."):
+        if value is None:
+            return None
+        value = getattr(value, name)
+    return value
+
+
+def is_given(model: BaseModel, path: str) -> bool:
+    """Whether the field was set when the model was made, and does not just have its default."""
+    value: Any = model
+    for name in path.split("."):
+        if value is None or name not in value.model_fields_set:
+            return False
+        value = getattr(value, name)
+    return True
+
+
+def replaced(model: Model, path: str, value: object) -> Model:
+    """A copy with one field set, unchecked, and given; KeyError where a section is absent."""
+    name, _, rest = path.partition(".")
+    if rest:
+        section = getattr(model, name)
+        if section is None:
+            raise KeyError(f"{name} is absent, so {path} cannot be set")
+        value = replaced(section, rest, value)
+    return model.model_copy(update={name: value})
+
+
+def changed(model: Model, values: Mapping[str, object]) -> Model:
+    """A copy with fields set by their dotted paths; what else is given stays so.
+
+    Raises:
+        ValueError: what comes out breaks a rule of the model.
+        KeyError: a section on the way is absent.
+    """
+    for path, value in values.items():
+        model = replaced(model, path, value)
+    type(model).model_validate(model.model_dump())
+    return model
+
+
+PRESENT: JsonDict = {"not": {"type": "null"}}
+
+
+def one_of(*names: str) -> JsonDict:
+    """In words of JSON Schema: exactly one of the fields is present and not null."""
+    return {"oneOf": [{"required": [name], "properties": {name: PRESENT}} for name in names]}
+
+
+# ---- YAML that comes with the package -------------------------------------------------------------
+
+
+@functools.cache
+def packaged(folder: str) -> tuple[str, ...]:
+    """The stems of the YAML files in a folder of this package, in alphabetical order."""
+    names = (Path(entry.name) for entry in resources.files("recipes").joinpath(folder).iterdir())
+    return tuple(sorted(path.stem for path in names if path.suffix == ".yaml"))
+
+
+def packaged_text(folder: str, name: str) -> str:
+    """One of these files."""
+    file = resources.files("recipes").joinpath(folder, f"{name}.yaml")
+    return file.read_text(encoding="utf-8")

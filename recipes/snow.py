@@ -1,0 +1,111 @@
+"""What a recipe may say of snow that lies on the ground."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from recipes.effect import Column, EffectModel, Knob
+from recipes.fields import Angle, Closed, Number, Unit, Whole
+
+
+class SnowLight(Closed):
+    """The light on the snow; null leaves a field to what the scene's sky and ground show."""
+
+    sun_azimuth_deg: Number | None = Field(default=None, ge=-360, le=360)
+    """Where the sun stands: 0 is world +x, 90 is +y; null for the brightest part of the sky."""
+    sun_elevation_deg: Number | None = Field(default=None, ge=0, le=90)
+    """The sun's height above the horizon; null for the brightest part of the sky."""
+    sun: Number | None = Field(default=None, ge=0, le=1)
+    """How much of the light comes from the sun: 0 overcast, 1 a clear day; null for what the sky's
+    contrast suggests."""
+    brightness: Number | None = Field(default=None, ge=0, le=1)
+    """Display-encoded brightness of snow of albedo 0.85 that faces the light; null for what the
+    scene's ground suggests."""
+
+
+class SnowWind(Closed):
+    """The wind that the snow fell with."""
+
+    direction_deg: Angle = 0.0
+    """Where it blows to: 0 is world +x, 90 is +y."""
+    drift: Unit = 0.3
+    """How uneven the wind left the layer: 0 is level but for its grain, 1 has ridges across the
+    wind and banks before obstacles."""
+
+
+class Snow(EffectModel):
+    """Snow lying on what is open to the sky: ground, roofs, vehicles."""
+
+    meant_by = {
+        "depth_m": "level level_m height height_m thickness thickness_m",
+        "coverage": "cover",
+        "max_slope_deg": "slope_deg",
+        "sparkle": "glitter",
+        "albedo": "reflectance",
+        "sun_azimuth_deg": "azimuth azimuth_deg",
+        "sun_elevation_deg": "elevation elevation_deg",
+        "drift": "drifts",
+    }
+    knobs = (
+        Knob("cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path", 2),
+        Knob(
+            "shading",
+            ("per_splat", "per_pixel"),
+            "light on the snow",
+            3,
+            tiers={"draft": "per_splat"},
+        ),
+    )
+    columns = (
+        Column(
+            "snow_depth_m",
+            lambda snow: snow.depth_m,
+            shows="nonzero",
+            title="Snow depth",
+            unit="cm",
+            factor=100,
+            label="snow",
+            caption="snow {snow_depth_m:.3g} cm",
+        ),
+        Column(
+            "snow_coverage",
+            lambda snow: snow.coverage,
+            shows="nonzero",
+            title="Snow coverage",
+            linear=True,
+        ),
+    )
+
+    depth_m: Number = Field(ge=0, le=10)
+    """Depth of the layer on level ground."""
+    coverage: Unit = 1.0
+    """Share of the open surface that is covered; below 1 in patches."""
+    max_slope_deg: Number = Field(default=50.0, ge=0, le=85)
+    """Snow lies on no surface steeper than this."""
+    albedo: Unit = 0.85
+    """Share of the light that the snow gives back."""
+    grain: Unit = 0.5
+    """Unevenness of the size of the splats: 0 smooth, 1 coarse."""
+    sparkle: Unit = 0.0
+    """How many crystals glint at the sun; 0 is none."""
+    tracks: Literal["auto", "always", "never"] = "auto"
+    """Packed grey wheel tracks where the ego and the scene's vehicles drive; auto up to a depth of
+    0.3 m."""
+    light: SnowLight = SnowLight()
+    wind: SnowWind = SnowWind()
+    shading: Literal["per_splat", "per_pixel"] = "per_splat"
+    """Lit by one normal a splat, or by one a pixel of every splat."""
+    cell_m: Number = Field(default=0.05, ge=0.001, le=10)
+    """Size of the splats near the path; they grow with the distance from it."""
+    seed: Whole | None = Field(default=None, ge=0, lt=2**63)
+    """What drifts, patches and grain are drawn from; null for the recipe's seed."""
+
+    @property
+    def changes(self) -> bool:
+        """Snow without depth or coverage changes nothing."""
+        return self.depth_m > 0 and self.coverage > 0
+
+    def surface(self, shown: str) -> tuple[str, bool] | None:
+        return (f"snow {self.depth_m:.3g} m deep", shown != "scene") if self.changes else None
