@@ -1,5 +1,7 @@
-"""What an effect's recipe model says of itself; all else of recipes, manifests and reports walks the
-models (`recipes.schema.SECTIONS`) and knows no effect by name.
+"""What an effect's recipe model says of itself.
+
+All else of recipes, manifests and reports walks the models (`recipes.schema.SECTIONS`) and knows no
+effect by name.
 """
 
 from __future__ import annotations
@@ -80,16 +82,14 @@ class Column:
         """The manifest's numbers, or an array of them, in `unit`."""
         return self.factor * numbers if self.over is None else self.over / numbers
 
-    def is_present(self, number: float) -> bool:
-        """Whether the number says that the effect is there."""
-        return self.shows is not None and not (
-            math.isnan(number) or (number == 0 and self.shows == "nonzero")
-        )
+    def is_present(self, numbers: Any) -> Any:
+        """Whether the number, or each of an array of them, says that the effect is there."""
+        return (numbers == numbers) & ((numbers != 0) | (self.shows == "all"))
 
 
 class Section(Closed):
-    """A part of a recipe. knobs: of its fields. later_fields: younger than the section; hashes leave
-    them out at their defaults.
+    """A part of a recipe. knobs: of its fields. later_fields: younger than the section; hashes
+    leave them out at their defaults.
     """
 
     knobs: ClassVar[tuple[Knob, ...]] = ()
@@ -100,14 +100,14 @@ class EffectModel(Section):
     """A section that is null where its effect is absent.
 
     in_first_release: hashes of recipes without it say so; of a later one they say nothing.
-    file_fields: those that name files, whose contents go into the field `digest`. meant_by: words
-    that people write for a key, by the key, with spaces between them.
+    file_fields: those that name files, whose contents go into the field `digest`. meant_by: keys,
+    each with the words that people write for it.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
     in_first_release: ClassVar[bool] = False
     file_fields: ClassVar[tuple[str, ...]] = ()
-    meant_by: ClassVar[Mapping[str, str]] = {}
+    meant_by: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @property
     def changes(self) -> bool:

@@ -123,7 +123,7 @@ def one_of(*names: str) -> JsonDict:
     return {"oneOf": [{"required": [name], "properties": {name: PRESENT}} for name in names]}
 
 
-# ---- YAML that comes with the package -------------------------------------------------------------
+# ---- YAML that comes with the package ------------------------------------------------------------
 
 
 @functools.cache

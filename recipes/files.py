@@ -158,7 +158,7 @@ def _hash(section: EffectModel, name: str) -> str:
 
 def _checked(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
-    given: str | None = getattr(section, "digest")
+    given: str | None = section.digest
     if given not in (None, digest):
         paths = ", ".join(section.files.values())
         which = "the file has" if len(hashes) == 1 else "one of the files has"

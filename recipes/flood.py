@@ -90,13 +90,13 @@ class Flood(EffectModel):
     """Standing water with a horizontal surface: waves, reflection, refraction, absorption."""
 
     model_config = ConfigDict(json_schema_extra=_ONE_CLARITY)
-    meant_by = {
-        "flood": "water puddle puddles",
-        "level_m": "depth depth_m",
-        "turbidity_ntu": "clarity",
-        "refraction_index": "ior refraction",
-        "waves": "wind ripples",
-    }
+    meant_by = (
+        ("flood", "water puddle puddles"),
+        ("level_m", "depth depth_m"),
+        ("turbidity_ntu", "clarity"),
+        ("refraction_index", "ior refraction"),
+        ("waves", "wind ripples"),
+    )
     knobs = (
         Knob("reflection", ("sky", "screen_space", "mirrored"), "what water reflects", 1),
         Knob(

@@ -267,7 +267,7 @@ _UNIT = re.compile(
 
 def _synonyms() -> dict[str, str]:
     """What a key may have been meant to be, where the section has it."""
-    meant = [pair for model in SECTIONS.values() for pair in model.meant_by.items()]
+    meant = (pair for model in SECTIONS.values() for pair in model.meant_by)
     return {word: key for key, words in meant for word in words.split()}
 
 

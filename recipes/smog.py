@@ -18,11 +18,11 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
-    meant_by = {
-        "smog": "fog haze mist",
-        "extinction_per_m": "beta density sigma",
-        "color": "airlight",
-    }
+    meant_by = (
+        ("smog", "fog haze mist"),
+        ("extinction_per_m", "beta density sigma"),
+        ("color", "airlight"),
+    )
     # Smog on buffers saves nothing here, whatever it costs.
     knobs = (
         Knob("model", ("deferred", "per_gaussian"), "smog on buffers or on splats", 10, False),

@@ -38,16 +38,16 @@ class SnowWind(Closed):
 class Snow(EffectModel):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
-    meant_by = {
-        "depth_m": "level level_m height height_m thickness thickness_m",
-        "coverage": "cover",
-        "max_slope_deg": "slope_deg",
-        "sparkle": "glitter",
-        "albedo": "reflectance",
-        "sun_azimuth_deg": "azimuth azimuth_deg",
-        "sun_elevation_deg": "elevation elevation_deg",
-        "drift": "drifts",
-    }
+    meant_by = (
+        ("depth_m", "level level_m height height_m thickness thickness_m"),
+        ("coverage", "cover"),
+        ("max_slope_deg", "slope_deg"),
+        ("sparkle", "glitter"),
+        ("albedo", "reflectance"),
+        ("sun_azimuth_deg", "azimuth azimuth_deg"),
+        ("sun_elevation_deg", "elevation elevation_deg"),
+        ("drift", "drifts"),
+    )
     knobs = (
         Knob("cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path", 2),
         Knob(

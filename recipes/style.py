@@ -41,16 +41,16 @@ class Style(EffectModel):
     model_config = ConfigDict(json_schema_extra=one_of("image", "preset"))
     later_fields = ("evaluated",)
     file_fields = ("image", "mask", "checkpoint")
-    meant_by = {
-        "style": "mood look",
-        "image": "photo picture file path",
-        "mask": "sky_mask",
-        "method": "algorithm",
-        "strength": "weight amount intensity",
-        "per_region": "regions",
-        "checkpoint": "network weights",
-        "digest": "sha256",
-    }
+    meant_by = (
+        ("style", "mood look"),
+        ("image", "photo picture file path"),
+        ("mask", "sky_mask"),
+        ("method", "algorithm"),
+        ("strength", "weight amount intensity"),
+        ("per_region", "regions"),
+        ("checkpoint", "network weights"),
+        ("digest", "sha256"),
+    )
     knobs = (
         Knob(
             "evaluated",

@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import replaced_file, write_atomic
 from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import OK, read_manifest
-from recipes.smog import KOSCHMIEDER
+from recipes.schema import columns_of_effects
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_PX, GAP_PX = 42, 8
@@ -183,28 +183,21 @@ def shown_groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     return groups[:: -(-len(groups) // MAX_SHOWN)]
 
 
-def _numbers(row: dict[str, Any]) -> tuple[float, float, float]:
-    """Smog per metre (0 without), water level (m, -infinity without) and snow depth (m, 0 without).
-    Old folders lack some of the columns.
-    """
-    absent = {"smog_extinction_per_m": 0.0, "flood_level_m": -math.inf, "snow_depth_m": 0.0}
-    found = ((row.get(name, math.nan), none) for name, none in absent.items())
-    smog, water, snow = (none if math.isnan(value) else value for value, none in found)
-    return smog, water, snow
+def _numbers(row: dict[str, Any]) -> list[float]:
+    """What captions tell in numbers; old folders lack some of the columns."""
+    told = (c for c in columns_of_effects().values() if c.caption and c.is_number)
+    absent = {"all": -math.inf, "nonzero": 0.0}
+    numbers = ((row.get(column.name, math.nan), column.shows) for column in told)
+    return [absent[shows or "all"] if math.isnan(n) else n for n, shows in numbers]
 
 
 def _weather(row: dict[str, Any]) -> str:
     """The variant's name and what its weather means to a person."""
-    extinction_per_m, water_m, snow_m = _numbers(row)
-    texts = []
-    if style := row.get("style"):
-        texts.append(f"{style} x {row.get('style_strength', math.nan):.2g}")
-    if extinction_per_m > 0:
-        texts.append(f"visibility {KOSCHMIEDER / extinction_per_m:.0f} m")
-    if math.isfinite(water_m):
-        texts.append(f"water at {water_m:.2f} m")
-    if snow_m > 0:
-        texts.append(f"snow {100 * snow_m:.3g} cm")
+    columns = sorted(columns_of_effects().values(), key=lambda column: column.is_number)
+    values = {column.name: row.get(column.name, column.of(None)) for column in columns}
+    there = [c for c in columns if (c.is_present if c.is_number else bool)(values[c.name])]
+    shown = values | {c.name: c.shown(values[c.name]) for c in there if c.is_number}
+    texts = [column.caption.format_map(shown) for column in there if column.caption]
     return f"{row['variant']} ({', '.join(texts) or 'no weather'})"
 
 

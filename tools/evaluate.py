@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from tqdm import tqdm
 
 from augment.cameras import Camera
-from augment.dataset.clips_pairs import clean_mask
+from augment.dataset.clips_pairs import masks_of
 from augment.dataset.weather_dataset import Companions, RowReader, Rows, StoredFiles
 from augment.errors import OutputError
 from augment.geometry import invert_rigid
@@ -178,11 +178,11 @@ class Views:
     def drives(self) -> list[Drive]:
         """In the manifest's order."""
         found: dict[tuple[str, str], Drive] = {}
-        clean = clean_mask(self.rows)
+        masks = masks_of(self.rows)
         for row in range(len(self.rows)):
             scene, variant = self.rows["scene"][row], self.rows["variant"][row]
             if (scene, variant) not in found:
-                effects = "clean" if clean[row] else _effects(self.rows, row)
+                effects = " + ".join(name for name, there in masks.items() if there[row]) or "clean"
                 recipe = self.rows["recipe"][row]
                 found[scene, variant] = Drive(scene, variant, recipe, effects, {})
             item = self.rows["frame"][row], self.rows["camera"][row]
@@ -270,22 +270,6 @@ def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
     return [
         (a, b) for a, b in itertools.combinations(rows, 2) if float(axes[a] @ axes[b]) >= min_cosine
     ]
-
-
-def _effects(rows: Rows, row: int) -> str:
-    """Which effects the manifest's numbers name: `smog + snow`."""
-
-    def number(name: str) -> float:
-        value = rows[name][row] if name in rows.weather else None
-        return math.nan if value is None else value
-
-    present = {
-        "smog": number("smog_extinction_per_m") > 0,
-        "flood": not math.isnan(number("flood_level_m")),
-        "snow": number("snow_depth_m") > 0,
-        "style": rows["style"][row] is not None,
-    }
-    return " + ".join(name for name, there in present.items() if there) or "other"
 
 
 class Compared(NamedTuple):

@@ -12,8 +12,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from markupsafe import Markup
 
-from augment.jobs.manifest import weather_columns
-from recipes.smog import KOSCHMIEDER
+from augment.jobs.manifest import effect_masks, weather_columns
+from recipes.effect import Column
+from recipes.schema import columns_of_effects
 
 MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic
@@ -30,67 +31,28 @@ _UNITS = {
     "_deg": "°",
     "_m": "m",
 }
-# What a caption says of an image's weather.
-_MAIN = {"smog_extinction_per_m": "visibility", "flood_level_m": "water at", "snow_depth_m": "snow"}
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A weather number as the page shows it.
-
-    column: of the manifest. zero_is_absent: 0 says that the effect is not there, as NaN does
-    elsewhere. inverted: shown as KOSCHMIEDER over the number. factor: of the number shown.
-    linear: its axis is not logarithmic, however far it is spread.
-    """
-
-    column: str
-    title: str
-    unit: str
-    zero_is_absent: bool = False
-    inverted: bool = False
-    factor: float = 1.0
-    linear: bool = False
-
-    @property
-    def formula(self) -> str:
-        return f"{KOSCHMIEDER} / {self.column}" if self.inverted else self.column
-
-    def shown(self, values: np.ndarray) -> np.ndarray:
-        """The manifest's numbers in the quantity's unit."""
-        return KOSCHMIEDER / values if self.inverted else self.factor * values
-
-    def is_there(self, numbers: np.ndarray) -> np.ndarray:
-        """bool [n]: which of the manifest's numbers say that the effect is there."""
-        there = np.abs(numbers) < _MAX_NUMBER  # false for NaN
-        if self.zero_is_absent:
-            there &= numbers != 0
-        if self.inverted:  # a visibility of infinity or below 0 is none
-            there &= numbers > 1 / _MAX_NUMBER
-        return there
-
-
-_KNOWN = {
-    q.column: q
-    for q in (
-        Quantity("smog_extinction_per_m", "Visibility in smog", "m", True, inverted=True),
-        Quantity("smog_scale_height_m", "Scale height of smog", "m"),
-        Quantity("flood_level_m", "Water level", "m", linear=True),
-        Quantity("flood_turbidity_ntu", "Turbidity of water", "NTU"),
-        Quantity("flood_wave_height", "Wave height, × preset", ""),
-        Quantity("snow_depth_m", "Snow depth", "cm", factor=100),
-        Quantity("snow_coverage", "Snow coverage", "", linear=True),
-        Quantity("style_strength", "Strength of style", "", True, linear=True),
-    )
-}
-
-
-def quantity_of(column: str) -> Quantity:
-    """What a weather column of the manifest means; one not known here by its name's ending."""
-    if column in _KNOWN:
-        return _KNOWN[column]
+def quantity_of(column: str) -> Column:
+    """What a number of an effect in the manifest means; one not known by its name's ending."""
+    known = columns_of_effects().get(column)
+    if known is not None:
+        return known
     ending = next((e for e in _UNITS if column.endswith(e)), "")
     name = column.removesuffix(ending).replace("_", " ").strip()
-    return Quantity(column, name[:1].upper() + name[1:], _UNITS.get(ending, ""))
+    title, unit = name[:1].upper() + name[1:], _UNITS.get(ending, "")
+    return Column(column, lambda section: None, title=title, unit=unit)
+
+
+def _is_there(quantity: Column, numbers: np.ndarray) -> np.ndarray:
+    """bool [n]: which of the manifest's numbers say that the effect is there, of those at which it
+    is not absent."""
+    there = np.abs(numbers) < _MAX_NUMBER  # false for NaN
+    if quantity.absent == 0:
+        there &= numbers != 0
+    if quantity.over is not None:  # a visibility of infinity or below 0 is none
+        there &= numbers > 1 / _MAX_NUMBER
+    return there
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +83,7 @@ class Spread:
     each of them has. absent_images: those without the effect.
     """
 
-    quantity: Quantity
+    quantity: Column
     values: np.ndarray
     images: np.ndarray
     absent_images: int
@@ -155,7 +117,7 @@ def spreads(table: pa.Table, draws: Draws) -> list[Spread]:
     found = []
     for column in _number_columns(table):
         quantity, numbers = quantity_of(column), _as_floats(rows, column)
-        there = quantity.is_there(numbers)
+        there = _is_there(quantity, numbers)
         if there.any():
             values, images = quantity.shown(numbers[there]), draws.images[there]
             found.append(Spread(quantity, values, images, int(draws.images[~there].sum())))
@@ -166,16 +128,19 @@ def weather_of_recipes(table: pa.Table, draws: Draws, names: Collection[str]) ->
     """What the variants of each of these recipes drew, in words; "" without weather."""
     rows = table.take(pa.array(draws.first))
     recipes = np.array(rows["recipe"].to_pylist(), object)
-    styles = rows["style"].to_pylist()
+    words = [c for c in columns_of_effects().values() if not c.is_number and c.title]
+    named = [(column.title, rows[column.name].to_pylist()) for column in words]
     numbers = [(quantity_of(name), _as_floats(rows, name)) for name in _number_columns(table)]
-    numbers = [(q, q.shown(np.where(q.is_there(v), v, np.nan))) for q, v in numbers]
+    numbers = [(q, q.shown(np.where(_is_there(q, v), v, np.nan))) for q, v in numbers]
     found = {}
     for recipe in names:
         own = np.flatnonzero(recipes == recipe)
         if not len(own):
             continue
-        named = sorted({s for k in own if (s := styles[k]) is not None})
-        texts = [f"Style: {', '.join(named[:4])}"] if named else []
+        texts = []
+        for title, values in named:
+            if names := sorted({v for k in own if (v := values[k]) is not None}):
+                texts.append(f"{title}: {', '.join(names[:4])}")
         known = [(q, there) for q, v in numbers if len(there := v[own][~np.isnan(v[own])])]
         for quantity, there in known[:10]:
             low, high = float(there.min()), float(there.max())
@@ -187,18 +152,21 @@ def weather_of_recipes(table: pa.Table, draws: Draws, names: Collection[str]) ->
 
 def weather_text(row: Mapping[str, Any]) -> str:
     """A row's weather in a few words."""
-    texts = [f"style {style}"] if (style := row.get("style")) is not None else []
-    for column, label in _MAIN.items():
-        quantity, number = quantity_of(column), row.get(column)
-        if number is not None and quantity.is_there(np.array([number], float))[0]:
-            shown = float(quantity.shown(np.array([number], float))[0])
-            texts.append(f"{label} {with_unit(shown, quantity.unit)}")
+    texts = []
+    for column in sorted(columns_of_effects().values(), key=lambda column: column.is_number):
+        value = row.get(column.name)
+        if not column.label or value is None:
+            continue
+        if not column.is_number:
+            texts.append(f"{column.label} {value}")
+        elif _is_there(column, np.array([value], float))[0]:
+            texts.append(f"{column.label} {with_unit(column.shown(float(value)), column.unit)}")
     return ", ".join(texts) or "no weather"
 
 
 def _number_columns(table: pa.Table) -> list[str]:
     """The weather's columns that hold numbers, those known here first."""
-    order = {column: number for number, column in enumerate(_KNOWN)}
+    order = {column: number for number, column in enumerate(columns_of_effects())}
     columns = [
         c for c in weather_columns(table) if pa.types.is_floating(table.schema.field(c).type)
     ]
@@ -211,21 +179,9 @@ def _as_floats(table: pa.Table, column: str) -> np.ndarray:
 
 
 def _is_clear(rows: pa.Table) -> np.ndarray:
-    """bool [rows]. Snow of no depth is none, whatever its coverage; water at level 0 is water."""
-    clear = np.array([style is None for style in rows["style"].to_pylist()], bool)
-    no_snow = np.zeros(rows.num_rows, bool)
-    for column in ("snow_depth_m", "snow_coverage"):
-        if column in rows.column_names:
-            no_snow |= _as_floats(rows, column) == 0
-    for column in _number_columns(rows):
-        numbers = _as_floats(rows, column)
-        none = np.isnan(numbers)
-        if column != "flood_level_m":
-            none |= numbers == 0
-        if column.startswith("snow_"):
-            none |= no_snow
-        clear &= none
-    return clear
+    """bool [rows]: without weather and style."""
+    numbers = {column: _as_floats(rows, column) for column in _number_columns(rows)}
+    return ~np.logical_or.reduce(list(effect_masks(numbers, rows.num_rows).values()))
 
 
 def histogram(

@@ -13,8 +13,9 @@ import torch
 from torch import distributed
 from torch.utils.data import Dataset, Sampler
 
-from augment.dataset.samples import IMAGES
+from augment.dataset.samples import buffer_names
 from augment.dataset.weather_dataset import Rows, WeatherDataset
+from augment.jobs.manifest import effect_masks
 
 # ---- Who trains on which sample: dealt to all processes, the same again after an interruption ----
 
@@ -193,19 +194,10 @@ def _place(scene: str, seed: int) -> float:
 
 # ---- Clean and weathered images of the same moment: side by side, or mixed into one dataset ------
 
-# What says that an effect is there; its other numbers may be given without it. Water at a level of
-# 0 is water.
-_PRESENCE = {
-    "smog": ("smog_extinction_per_m", False),
-    "flood": ("flood_level_m", True),
-    "snow": ("snow_depth_m", False),
-    "style": ("style_strength", False),
-}
-
 
 def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
     """The images without weather and style, or those of one variant. Without a variant's name:
-    those whose manifest says no smog, flood, snow or style, and whose other weather numbers are all
+    those whose manifest says that no effect is there, and whose other numbers of weather are all
     zero or absent. Raises ValueError: there is no such variant.
     """
     rows = dataset.rows
@@ -219,14 +211,12 @@ def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> Weather
 
 def clean_mask(rows: Rows) -> np.ndarray:
     """bool [N]: rows without weather and style."""
-    clean = np.ones(len(rows), bool)
-    for name in rows.weather:
-        leading, zero_is_present = _PRESENCE.get(name.partition("_")[0], (name, False))
-        if name != leading:
-            continue
-        numbers = rows.numbers(name).astype(np.float64)
-        clean &= np.isnan(numbers) | ((numbers == 0) & (not zero_is_present))
-    return clean
+    return ~np.logical_or.reduce(list(masks_of(rows).values()))
+
+
+def masks_of(rows: Rows) -> dict[str, np.ndarray]:
+    """bool [N] by the effects' names: rows that have them."""
+    return effect_masks({name: rows.numbers(name) for name in rows.weather}, len(rows))
 
 
 class PairedDataset(Dataset):
@@ -467,7 +457,7 @@ def join_clip(frames: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Samples [T][C] as one clip."""
     first = frames[0][0]
     clip = {**first}
-    for key in IMAGES:
+    for key in ("image", *buffer_names()):
         clip[key] = _joined([[sample[key] for sample in frame] for frame in frames])
     clip["boxes"] = None if first["boxes"] is None else [_boxes(frame) for frame in frames]
     clip["lidar"] = [frame[0]["lidar"] for frame in frames]

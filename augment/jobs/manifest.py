@@ -22,36 +22,15 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
+from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, variant_name
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
-from recipes.fields import found
-from recipes.schema import Recipe, knobs_of
+from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
 
 OK, FAILED = "ok", "failed"
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 
-# In the order of the file; the weather numbers of the recipes stand between the two groups.
-LEADING = {
-    "scene": pa.string(),
-    "source": pa.string(),
-    "variant": pa.string(),
-    "frame": pa.int64(),
-    "camera": pa.string(),
-    "timestamp_ns": pa.int64(),
-    **{f"{kind}_path": pa.string() for kind in PATH_KINDS},
-    "width": pa.int64(),
-    "height": pa.int64(),
-    "surface": pa.string(),
-    "lidar": pa.string(),
-    "lidar_note": pa.string(),
-    "style": pa.string(),
-    "style_method": pa.string(),
-    "quality": pa.string(),
-    "render_scale": pa.float64(),
-    "settings": pa.string(),
-}
 TRAILING = {
     "seed": pa.int64(),
     "recipe": pa.string(),
@@ -63,27 +42,12 @@ TRAILING = {
     "status": pa.string(),
     "message": pa.string(),
 }
-# Columns younger than the first release, and what a row without them means.
-# Without water and snow all surfaces are the same; new rows of such a variant say the default.
-# What old rows were rendered with is in their recipes, and not known here.
-LATER: dict[str, str | None] = {
-    "water_path": None,
-    "snow_path": None,
-    "box_2d_path": None,
-    "box_water_path": None,
-    "box_snow_path": None,
-    "box_smog_path": None,
-    "surface": "solid",
-    "lidar": None,
-    "lidar_note": None,
-    "style": None,
-    "style_method": None,
-    "quality": None,
-    "render_scale": None,
-    "settings": None,
+# Columns of the first release; a row without one of the others has none.
+_FIRST = {
+    *("scene", "source", "variant", "frame", "camera", "timestamp_ns", "width", "height"),
+    *("image_path", "depth_path", "semantic_path", "instance_path", "lidar_path", "labels_path"),
+    "calibration_path",
 }
-# What a row without them means by weather numbers that others have; NaN for all else.
-LATER_NUMBERS = {"style_strength": 0.0}
 KEY = ("scene", "variant", "frame", "camera")
 MAX_SIDE_PX = 1 << 16  # of an image; no camera has as many
 _RANK = "rank"
@@ -93,20 +57,79 @@ _STRAYS = r"^$|^/|(^|/)\.{1,2}(/|$)|\\|\x00"
 Row = Mapping[str, Any]
 
 
+def leading_columns() -> dict[str, pa.DataType]:
+    """In the order of the file; the numbers of the effects follow, then TRAILING."""
+    words = [name for name, column in columns_of_effects().items() if not column.is_number]
+    return {
+        "scene": pa.string(),
+        "source": pa.string(),
+        "variant": pa.string(),
+        "frame": pa.int64(),
+        "camera": pa.string(),
+        "timestamp_ns": pa.int64(),
+        **{f"{kind}_path": pa.string() for kind in path_kinds()},
+        "width": pa.int64(),
+        "height": pa.int64(),
+        "surface": pa.string(),
+        "lidar": pa.string(),
+        "lidar_note": pa.string(),
+        **dict.fromkeys(words, pa.string()),
+        "quality": pa.string(),
+        "render_scale": pa.float64(),
+        "settings": pa.string(),
+    }
+
+
+def later_columns() -> dict[str, str | None]:
+    """Leading columns younger than the first release, and what a row without them means.
+
+    Without water and snow all surfaces are the same; new rows of such a variant say the default.
+    What old rows were rendered with is in their recipes, and not known here.
+    """
+    later = dict.fromkeys(name for name in leading_columns() if name not in _FIRST)
+    return {**later, "surface": "solid"}
+
+
 def weather_columns(table: pa.Table) -> list[str]:
-    """Names of the columns that hold weather numbers."""
-    return [n for n in table.column_names if n not in LEADING and n not in TRAILING]
+    """Names of the columns that hold numbers of effects."""
+    others = leading_columns().keys() | TRAILING.keys()
+    return [name for name in table.column_names if name not in others]
+
+
+def _absent(name: str) -> float | None:
+    """What a row means that lacks a number which others have."""
+    column = columns_of_effects().get(name)
+    return math.nan if column is None else column.absent
+
+
+def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.ndarray]:
+    """bool [rows] by the effects' names: where their numbers say that they are there, and none of
+    them that they are not. `other`: of numbers that belong to no effect. numbers: [rows] by column.
+    """
+    masks = {}
+    for path, model in SECTIONS.items():
+        there, refuted = np.zeros((2, rows), bool)
+        for column in model.columns:
+            if column.shows is not None and column.name in numbers:
+                values = numbers[column.name].astype(np.float64)
+                present = column.is_present(values)
+                there |= present
+                refuted |= ~present & ~np.isnan(values)
+        masks[path.rpartition(".")[2]] = there & ~refuted
+    other = np.zeros(rows, bool)
+    for name, values in numbers.items():
+        if name.partition("_")[0] not in masks:
+            other |= ~np.isnan(values) & (values != 0)
+    return {**masks, "other": other}
 
 
 def rows_to_table(rows: Iterable[Row]) -> pa.Table:
-    """Rows as a sorted table; a weather number that a row lacks is what LATER_NUMBERS says."""
-    rows = list(rows)
+    """Rows as a sorted table."""
+    rows, leading = list(rows), leading_columns()
     names = {name for row in rows for name in row}
-    weather = sorted(names - LEADING.keys() - TRAILING.keys())
-    columns = {name: pa.array([row[name] for row in rows], kind) for name, kind in LEADING.items()}
-    for name in weather:
-        absent = LATER_NUMBERS.get(name, math.nan)
-        columns[name] = pa.array([row.get(name, absent) for row in rows], pa.float64())
+    columns = {name: pa.array([row[name] for row in rows], kind) for name, kind in leading.items()}
+    for name in sorted(names - leading.keys() - TRAILING.keys()):
+        columns[name] = pa.array([row.get(name, _absent(name)) for row in rows], pa.float64())
     columns |= {
         name: pa.array([row[name] for row in rows], kind) for name, kind in TRAILING.items()
     }
@@ -141,7 +164,8 @@ def parse_manifest(data: bytes, where: str) -> pa.Table:
 
 
 def _check_types(table: pa.Table, where: str) -> None:
-    requested = {**LEADING, **dict.fromkeys(weather_columns(table), pa.float64()), **TRAILING}
+    numbers = dict.fromkeys(weather_columns(table), pa.float64())
+    requested = {**leading_columns(), **numbers, **TRAILING}
     advice = "It was written by another program or version: write to another output folder"
     missing = sorted(requested.keys() - set(table.column_names))
     if missing:
@@ -156,9 +180,10 @@ def _check_types(table: pa.Table, where: str) -> None:
 
 def _check_values(table: pa.Table, where: str) -> None:
     """Raise OutputError at the first value that no job writes."""
+    later, paths = later_columns(), {f"{kind}_path" for kind in path_kinds()}
     for name, column in zip(table.column_names, table.columns, strict=True):
-        is_path = name.removesuffix("_path") in PATH_KINDS
-        if column.null_count and not is_path and LATER.get(name, "") is not None:
+        is_path = name in paths
+        if column.null_count and not is_path and later.get(name, "") is not None:
             _refuse(table, name, pc.is_null(column), "a value", where)
         if column.null_count == table.num_rows:
             continue
@@ -258,7 +283,7 @@ def manifest_bytes(table: pa.Table) -> bytes:
 def concat_rows(tables: Sequence[pa.Table]) -> pa.Table:
     """Tables below each other, with the weather numbers of all; unsorted."""
     weather = sorted({name for table in tables for name in weather_columns(table)})
-    order = [*LEADING, *weather, *TRAILING]
+    order = [*leading_columns(), *weather, *TRAILING]
     return pa.concat_tables([_with_columns(table, weather).select(order) for table in tables])
 
 
@@ -274,17 +299,17 @@ def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
 def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
     for name in weather:
         if name not in table.column_names:
-            meaning = LATER_NUMBERS.get(name, math.nan)
-            absent = pa.array([meaning] * table.num_rows, pa.float64())
+            absent = pa.array([_absent(name)] * table.num_rows, pa.float64())
             table = table.append_column(name, absent)
     return table
 
 
 def _with_later_columns(table: pa.Table) -> pa.Table:
-    for name, meaning in LATER.items():
+    leading = leading_columns()
+    for name, meaning in later_columns().items():
         if name not in table.column_names:
-            column = pa.array([meaning] * table.num_rows, LEADING[name])
-            place = [n for n in LEADING if n in table.column_names or n == name].index(name)
+            column = pa.array([meaning] * table.num_rows, leading[name])
+            place = [n for n in leading if n in table.column_names or n == name].index(name)
             table = table.add_column(place, name, column)
     return table
 
@@ -530,7 +555,6 @@ def image_row(
         **shown_words(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
-        **recipe.columns(),
         "seed": recipe.seed,
         "recipe": recipe.name,
         **vars(identity),
@@ -541,16 +565,17 @@ def image_row(
 
 
 def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
-    """What a recipe says of its images beside the weather's numbers, by columns. settings: JSON of
-    the values of the knobs that a quality may set (recipes.schema) and that have an effect, by
-    dotted path; None where the recipe has no quality.
+    """What a recipe says of its images, by columns. settings: JSON of the values of the knobs that
+    a quality may set (recipes.schema) and that have an effect, by dotted path; None where the
+    recipe has no quality.
     """
     words, settings = recipe.quality.words, None
     if words is not None:
-        values = {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe) if knob.chosen}
-        settings = json.dumps(values, separators=(",", ":"))
+        chosen = {path: v for path, v in settings_of(recipe).items() if KNOBS[path].chosen}
+        settings = json.dumps(chosen, separators=(",", ":"))
     return {
         "surface": recipe.output.surface,
+        **recipe.columns(),
         "quality": words,
         "render_scale": recipe.render.scale,
         "settings": settings,

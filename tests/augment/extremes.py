@@ -29,7 +29,7 @@ from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view
 from recipes.schema import Recipe
-from recipes.template import ROOT, FieldSpec, Kind, SectionSpec
+from recipes.template import FieldSpec, Kind, SectionSpec, root
 from tests.augment.examples import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
 
@@ -334,7 +334,7 @@ def _ends(field: FieldSpec) -> tuple[float, float]:
     return low, high
 
 
-def number_fields(section: SectionSpec = ROOT) -> list[FieldSpec]:
+def number_fields(section: SectionSpec = root()) -> list[FieldSpec]:
     """Every field of a recipe that holds numbers, colours' and rates' channels among them."""
     fields = []
     for spec in section.walk():
@@ -411,8 +411,8 @@ def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> Recipe:
     """A valid recipe of extreme numbers, with the given effects, or some of them."""
     if effects is None:
         effects = draw(st.frozensets(st.sampled_from(EFFECTS)))
-    data = draw(sections(ROOT, effects))
-    for name, spec in ROOT.sections["weather"].sections.items():
+    data = draw(sections(root(), effects))
+    for name, spec in root().sections["weather"].sections.items():
         for pair in _ALTERNATIVES:
             if spec.path in pair[0] and name in data["weather"]:
                 _give_one(data["weather"][name], pair)

@@ -33,7 +33,7 @@ from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import snow_pixels
 from augment.jobs.files import TABLES, visibility
-from augment.jobs.manifest import LATER, read_manifest
+from augment.jobs.manifest import later_columns, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.labels import Boxes
 from recipes.flood import Flood
@@ -345,10 +345,10 @@ def test_outputs_of_the_first_version_are_gone_on_with(tmp_path: Path, kept: str
         numbers = [
             n
             for n in table.column_names
-            if n.startswith(("flood_", "snow_", "style_")) and n not in LATER
+            if n.startswith(("flood_", "snow_", "style_")) and n not in later_columns()
         ]
         assert len(numbers) == 6
-        pq.write_table(table.drop_columns([*numbers, *LATER]), manifest)
+        pq.write_table(table.drop_columns([*numbers, *later_columns()]), manifest)
         assert read_manifest(old).column_names == [
             name for name in table.column_names if name not in numbers
         ]
@@ -361,7 +361,7 @@ def test_outputs_of_the_first_version_are_gone_on_with(tmp_path: Path, kept: str
         manifest.unlink()
         identity = ("source", "recipe_hash", "trajectory", "version", "backend")
         lines = [{name: rows[0][name] for name in identity}]
-        lines += [{name: row[name] for name in row if name not in LATER} for row in rows]
+        lines += [{name: row[name] for name in row if name not in later_columns()} for row in rows]
         log = old / ".climategs" / "journal" / "street" / "clear-000.jsonl"
         log.parent.mkdir(parents=True)
         log.write_text("".join(json.dumps(line) + "\n" for line in lines))

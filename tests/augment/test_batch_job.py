@@ -127,8 +127,8 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         for name in row
         if name.startswith(("smog_", "flood_", "snow_d", "snow_c", "style_s"))
     }
-    assert numbers.keys() == recipe.weather_numbers().keys()
-    assert numbers["smog_extinction_per_m"] == recipe.weather_numbers()["smog_extinction_per_m"]
+    assert numbers.keys() == recipe.columns().keys()
+    assert numbers["smog_extinction_per_m"] == recipe.columns()["smog_extinction_per_m"]
     assert rows[1]["lidar_path"] is None  # the dataset has no sweep there
     files = [row[name] for name in row if name.endswith("_path") and row[name] is not None]
     assert len(files) == 9 and all((tmp_path / file).is_file() for file in files)

@@ -13,7 +13,13 @@ import pytest
 from batch_scenes import fake_render, make_recipe, open_fake
 
 from augment.errors import OutputError
-from augment.jobs.manifest import LATER, MAX_SIDE_PX, manifest_bytes, parse_manifest, read_manifest
+from augment.jobs.manifest import (
+    MAX_SIDE_PX,
+    later_columns,
+    manifest_bytes,
+    parse_manifest,
+    read_manifest,
+)
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import read_table
 
@@ -121,7 +127,7 @@ def test_what_jobs_and_careful_programs_write_is_read(manifest: pa.Table) -> Non
     # pandas writes NaN as null.
     empty = put_column("snow_depth_m", lambda c: pa.nulls(len(c), pa.float64()))(manifest)
     assert all(math.isnan(depth) for depth in parsed(empty)["snow_depth_m"].to_pylist())
-    old = parsed(manifest.drop_columns(list(LATER)))
+    old = parsed(manifest.drop_columns(list(later_columns())))
     assert old.column_names == manifest.column_names
     assert set(old["surface"].to_pylist()) == {"solid"} and old["quality"].null_count == 8
     assert parsed(manifest.slice(0, 0)).num_rows == 0

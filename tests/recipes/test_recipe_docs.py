@@ -11,7 +11,7 @@ from recipes.errors import RecipeError
 from recipes.load import preset_names
 from recipes.parse import parse_recipe
 from recipes.style import style_preset_names
-from recipes.template import ROOT, words
+from recipes.template import root, words
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
@@ -19,7 +19,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="u
 def field_table() -> str:
     """A row for every key of a recipe file, sections in their order."""
     rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
-    for section in ROOT.walk():
+    for section in root().walk():
         if section.max_items is not None:
             path = section.path.removesuffix("[]")
             allowed = f"a list of up to {section.max_items} mappings, or null"

@@ -188,7 +188,7 @@ def test_recipes_made_in_python_get_their_digest(folder: Path) -> None:
     bare = Recipe(style=Style(image=image, method="gscm", checkpoint=net))
     full = with_digest(bare)
     assert full.style is not None and bare.style is not None
-    expected = digest_of({"checkpoint": sha(b"a network"), "image": sha(b"an image")})
+    expected = digest_of({"image": sha(b"an image"), "checkpoint": sha(b"a network")})
     assert full.style.digest == expected and full.style.image == image
     assert full.hash != bare.hash and with_digest(full) == full
     assert read_files(full.style) == {"image": b"an image", "checkpoint": b"a network"}

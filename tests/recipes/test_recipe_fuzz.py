@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from recipes.errors import RecipeError
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.template import ROOT, RecipeTemplate
+from recipes.template import RecipeTemplate, root
 
 KEYS = sorted(
-    {key for section in ROOT.walk() for key in section.known}
+    {key for section in root().walk() for key in section.known}
     | {"uniform", "log_uniform", "normal", "choice", "weights", "mean", "std", "min", "max"}
     | {"<<", "visibility_km", "on"}
 )
@@ -42,7 +42,7 @@ FLOW = st.recursive(
     max_leaves=12,
 )
 TOP = st.dictionaries(st.sampled_from(KEYS), FLOW, max_size=5).map(block)
-EFFECTS = ROOT.sections["weather"].sections
+EFFECTS = root().sections["weather"].sections
 WAVE_KEYS = EFFECTS["flood"].sections["waves"].sections["components"].known
 WAVES = st.lists(st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(flow), max_size=3).map(
     lambda items: "{components: [" + ", ".join(items) + "]}"

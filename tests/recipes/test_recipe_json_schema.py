@@ -13,7 +13,7 @@ from recipes.errors import RecipeError
 from recipes.json_schema import DIALECT, recipe_json_schema, write_schema
 from recipes.load import dump_recipe, load_recipe, preset_names
 from recipes.parse import parse_recipe
-from recipes.template import ROOT
+from recipes.template import root
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def validator() -> Any:
 def test_every_field_is_in_the_schema_with_its_description() -> None:
     schema = recipe_json_schema()
     assert schema["$schema"] == DIALECT
-    for section in ROOT.walk():
+    for section in root().walk():
         node = schema
         for name in filter(None, section.path.split(".")):
             node = node["properties"][name.removesuffix("[]")]["oneOf"][0]

@@ -17,9 +17,9 @@ from recipes.parse import parse_recipe
 from recipes.schema import Output, Quality, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.style import Style
-from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind
+from recipes.template import CHANNEL, RATE, FieldSpec, Kind, root
 
-FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
+FIELDS = [spec for section in root().walk() for spec in section.fields.values()]
 NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
 
 
@@ -214,16 +214,16 @@ def test_every_field_changes_the_hash() -> None:
 
 
 def test_numbers_for_the_manifest() -> None:
-    clear = Recipe().weather_numbers()
+    clear = Recipe().columns()
     assert clear["smog_extinction_per_m"] == 0 and math.isnan(clear["smog_scale_height_m"])
-    thick = smoggy(extinction_per_m=0.02, scale_height_m=50).weather_numbers()
+    thick = smoggy(extinction_per_m=0.02, scale_height_m=50).columns()
     assert (thick["smog_extinction_per_m"], thick["smog_scale_height_m"]) == (0.02, 50.0)
-    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2))).weather_numbers()
+    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2))).columns()
     assert clear.keys() == thick.keys() == flooded.keys()
     names = ("flood_level_m", "flood_turbidity_ntu", "flood_wave_height")
     assert all(math.isnan(clear[name]) and math.isnan(thick[name]) for name in names)
     assert [flooded[name] for name in names] == [0.2, 50.0, 1.0]
-    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.7))).weather_numbers()
+    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.7))).columns()
     assert snowy.keys() == clear.keys() and all(math.isnan(snowy[name]) for name in names)
     assert (snowy["snow_depth_m"], snowy["snow_coverage"]) == (0.1, 0.7)
     absent = [
@@ -233,13 +233,14 @@ def test_numbers_for_the_manifest() -> None:
 
 
 def test_a_style_for_the_manifest() -> None:
-    assert Recipe().weather_numbers()["style_strength"] == 0
-    assert Recipe().style_words() == {"style": None, "style_method": None}
+    assert Recipe().columns()["style_strength"] == 0
+    names = ("style", "style_method")
+    assert [Recipe().columns()[name] for name in names] == [None, None]
     dusk = Recipe(style=Style(preset="dusk", strength=0.5))
-    assert dusk.weather_numbers()["style_strength"] == 0.5
-    assert dusk.style_words() == {"style": "dusk", "style_method": "mkl"}
+    assert dusk.columns()["style_strength"] == 0.5
+    assert [dusk.columns()[name] for name in names] == ["dusk", "mkl"]
     photo = Recipe(style=Style(image="/photos/sunset 3.jpg", method="reinhard"))
-    assert photo.style_words() == {"style": "sunset 3.jpg", "style_method": "reinhard"}
+    assert [photo.columns()[name] for name in names] == ["sunset 3.jpg", "reinhard"]
 
 
 def test_every_field_is_described() -> None:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from augment.jobs.layout import MANIFEST
-from augment.jobs.manifest import LATER, rows_to_table, write_manifest
+from augment.jobs.manifest import later_columns, rows_to_table, write_manifest
 from tests.tools.report_outputs import make_row
 from tools import drawing as sheet
 
@@ -63,7 +63,9 @@ def test_a_row_says_its_weather_and_the_driest_comes_first(folder, monkeypatch) 
 
 def test_a_folder_older_than_floods_is_drawn(folder, monkeypatch) -> None:
     table = pq.read_table(folder / MANIFEST)
-    pq.write_table(table.drop_columns([*LATER, "flood_level_m", "snow_depth_m"]), folder / MANIFEST)
+    pq.write_table(
+        table.drop_columns([*later_columns(), "flood_level_m", "snow_depth_m"]), folder / MANIFEST
+    )
     weather = [title.rpartition(" (")[2] for title in titles(folder, monkeypatch)]
     assert weather == [*["no weather)"] * 4, "visibility 40 m)"]
 

@@ -93,7 +93,7 @@ def test_spreads_leave_out_what_is_absent() -> None:
     rows += [make_row(recipe="fog", frame=i, smog_extinction_per_m=0.03912) for i in range(3)]
     rows += [make_row(recipe="odd", smog_extinction_per_m=math.inf, flood_level_m=0.0)]
     table = as_table(rows)
-    found = {s.quantity.column: s for s in spreads(table, find_draws(table))}
+    found = {s.quantity.name: s for s in spreads(table, find_draws(table))}
     assert list(found) == ["smog_extinction_per_m", "flood_level_m"]
     smog = found["smog_extinction_per_m"]
     assert smog.values == pytest.approx([100]) and smog.images.tolist() == [3]
@@ -109,7 +109,7 @@ def test_what_counts_as_without_weather() -> None:
         ({"snow_depth_m": 0.2, "snow_coverage": 0.5}, False),
         ({"flood_level_m": 0.0}, False),
         ({"smog_extinction_per_m": 1e-4}, False),
-        ({"style": "dusk", "style_strength": 0.0}, False),
+        ({"style": "dusk", "style_strength": 0.0}, True),
         ({"rain_mm_per_h": 0.0}, True),
         ({"rain_mm_per_h": 2.0}, False),
     ):

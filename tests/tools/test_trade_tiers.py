@@ -2,7 +2,7 @@
 
 import pytest
 
-from recipes.schema import BY_PATH, TIERS
+from recipes.schema import KNOBS, TIERS
 from tools.bench.trade import (
     DOCS,
     INVISIBLE_FLIP,
@@ -91,7 +91,7 @@ def test_times_of_values_that_change_nothing_are_noise():
 def test_what_has_not_been_rendered_together_is_asked_for():
     with pytest.raises(Unmeasured) as asked:
         tier_from([table(clean=SINGLE)], 0.02)
-    assert {k: v for k, v in asked.value.settings.items() if v != BY_PATH[k].reference} == {
+    assert {k: v for k, v in asked.value.settings.items() if v != KNOBS[k].reference} == {
         STOP: 0.01,
         CLIP: 1.0,
     }
