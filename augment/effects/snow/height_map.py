@@ -342,15 +342,11 @@ _VIEW_ROWS = 256  # points a thread takes at a time
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Cameras with the depth that they see. See surface_kernels.find_seen.
-
-    on_gpu: depths lie there, and that is where points are looked at.
-    """
+    """Cameras with the depth that they see. See surface_kernels.find_seen."""
 
     views: np.ndarray
     sizes: np.ndarray
-    depths: Tensor
-    on_gpu: bool = False
+    depths: np.ndarray
 
     @property
     def lowest_m(self) -> float:
@@ -373,18 +369,13 @@ class Views:
         points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
         lifts = np.array(LIFTS_M)
         tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
-        if self.on_gpu:
-            from augment.effects.snow import cuda
-
-            given = (self.views, self.sizes, self.depths, lifts, tolerances)
-            return on_device(lambda: cuda.find_seen(points, normals, is_sure, *given), CUDA)
         seen = np.empty(len(points), bool)
         with kernel_threads(_VIEW_ROWS):
             surface_kernels.find_seen(
                 np.ascontiguousarray(points),
                 np.ascontiguousarray(normals),
                 np.ascontiguousarray(is_sure),
-                *(self.views, self.sizes, self.depths.numpy(), lifts, tolerances, seen),
+                *(self.views, self.sizes, self.depths, lifts, tolerances, seen),
             )
         return seen
 
@@ -411,8 +402,7 @@ def draw_views(
     return Views(
         np.array(views, np.float64).reshape(-1, 17),
         np.array(sizes, np.int64).reshape(-1, 3),
-        torch.cat(depths) if depths else torch.zeros(0),
-        on_gpu=backend == CUDA and len(depths) > 0,
+        (torch.cat(depths) if depths else torch.zeros(0)).cpu().numpy(),
     )
 
 

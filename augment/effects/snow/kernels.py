@@ -8,6 +8,7 @@ can lean, over the cell's border, upright discs close the wall below it.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -204,6 +205,43 @@ def _turn(nx, ny, nz, s, quats):
     quats[s, 3] = half_sin * tilt_cos
 
 
+# Kernels read the records' fields one by one: numba 0.6x takes an unpacked record for a shape.
+
+
+class Cells(NamedTuple):
+    """The arrays of SnowCells that snow is made from."""
+
+    centers: np.ndarray
+    normals: np.ndarray
+    sizes: np.ndarray
+    edges: np.ndarray
+    neighbours: np.ndarray
+    light: np.ndarray
+    tracks: np.ndarray
+    banks: np.ndarray
+
+
+class Depths(NamedTuple):
+    """Of the snow on C cells: its depth in metres, 0 where there is none; noise that its colour
+    follows; uint64 to draw grain from.
+    """
+
+    heights: np.ndarray
+    mottle: np.ndarray
+    draws: np.ndarray
+
+
+class Splats(NamedTuple):
+    """The arrays of S Gaussians. normals, slopes: [S, 3], or empty where they are not asked for."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    sh: np.ndarray
+    normals: np.ndarray
+    slopes: np.ndarray
+
+
 @inner()
 def _shade(s, normal, tints, packed, seen, lights, colors, sh, normals, slopes):
     """Colour of Gaussian s: by its normal, or what the light's share is added to.
@@ -236,15 +274,16 @@ def _rough(normal, amount, draw, number):
 
 
 @kernel
-def fill(
-    centers, ground_normals, sizes, neighbours, tracks, light, heights, mottle, draws, tops, firsts,
-    lights, colors, means, quats, scales, sh, normals, slopes,
-):  # fmt: skip
+def fill(cells, depths, tops, firsts, lights, colors, splats):
     """The Gaussians of every covered cell, from index firsts[i] on.
 
-    lights [3, 3]: direction of the sun, colours of lit and of shaded snow. normals, slopes: [S, 3],
-    or empty where they are not asked for.
+    lights [3, 3]: direction of the sun, colours of lit and of shaded snow. splats: written.
     """
+    centers, ground_normals, sizes = cells.centers, cells.normals, cells.sizes
+    neighbours, tracks, light = cells.neighbours, cells.tracks, cells.light
+    heights, mottle, draws = depths.heights, depths.mottle, depths.draws
+    means, quats, scales = splats.means, splats.quats, splats.scales
+    sh, normals, slopes = splats.sh, splats.normals, splats.slopes
     for i in prange(len(heights)):
         if heights[i] == 0:
             continue
@@ -371,18 +410,45 @@ def _grain(x, y, z, shift, noise):
     return CRUMB * crumb + CLOD * clod
 
 
-@kernel
-def split(
-    chosen, splits, firsts, eye, sun, shift, noise, relief, mottle, finest,
-    means, quats, scales, sh, slopes, fine_means, fine_quats, fine_scales, fine_sh, fine_slopes,
-):  # fmt: skip
-    """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on.
-
-    eye: the camera's centre; sun: its level direction times half a step in metres, in the part's
-    frame. shift, noise: see `_grain`. relief: brightness per fall of the noise towards the sun;
-    mottle: per noise. finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays
-    are a part's Gaussians, sh [S, 1, 3].
+class CloseView(NamedTuple):
+    """What near discs are split by; float64 arrays, or tensors. eye: the camera's centre; sun: its
+    level direction times half a step in metres, in the part's frame. shift: see `_grain`. relief:
+    brightness per fall of the noise towards the sun; mottle: per noise. finest: as for
+    count_splits.
     """
+
+    eye: Any
+    sun: Any
+    shift: Any
+    relief: float
+    mottle: float
+    finest: float
+
+
+class Discs(NamedTuple):
+    """A part's Gaussians, sh [S, 1, 3]; slopes: [S, 3] or empty."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    sh: np.ndarray
+    slopes: np.ndarray
+
+
+@kernel
+def split(chosen, splits, firsts, view, noise, discs, fine):
+    """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on."""
+    eye, sun, shift = view.eye, view.sun, view.shift
+    relief, mottle, finest = view.relief, view.mottle, view.finest
+    means, quats, scales, sh, slopes = (
+        discs.means,
+        discs.quats,
+        discs.scales,
+        discs.sh,
+        discs.slopes,
+    )
+    fine_means, fine_quats, fine_scales = fine.means, fine.quats, fine.scales
+    fine_sh, fine_slopes = fine.sh, fine.slopes
     for c in prange(len(chosen)):
         i, n = chosen[c], np.int64(splits[c])
         w, x = np.float64(quats[i, 0]), np.float64(quats[i, 1])
@@ -479,16 +545,16 @@ def _pillow(t):
 
 
 @kernel
-def lay(
-    centers, sizes, edges, tracks, banks, numbers, drifts, patches, mottling, seed, heights, mottle,
-    draws,
-):  # fmt: skip
+def lay(cells, numbers, drifts, patches, mottling, seed, depths):
     """Depth of the snow, what mottles its colour, and random bits, all [C], of every cell.
 
     drifts, patches, mottling: octaves as (turns, amplitudes, lengths, seeds). draws: uint64 that
     hang on the cell's place and the seed. Where nothing of the layer is patchy, the patches' noise
     is not worked out.
     """
+    centers, sizes, edges = cells.centers, cells.sizes, cells.edges
+    tracks, banks = cells.tracks, cells.banks
+    heights, mottle, draws = depths.heights, depths.mottle, depths.draws
     everywhere = numbers.threshold <= -1e9
     for i in prange(len(sizes)):
         x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from augment.effects.snow import kernels
 from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.kernels import Cells, Depths, Splats
 from augment.effects.snow.light import Illumination
 from augment.effects.snow.near_camera import Grain, Layer, SnowLayers, crystals_of
 from augment.effects.snow.profile import Octaves, Profile, profile_of
@@ -128,29 +129,34 @@ def _lay(
     )
 
 
-class Depths(NamedTuple):
-    """Of the snow on C cells: its depth in metres, 0 where there is none; noise that its colour
-    follows; uint64 to draw grain from.
-    """
-
-    heights: np.ndarray
-    mottle: np.ndarray
-    draws: np.ndarray
+def arrays_of(cells: SnowCells) -> Cells:
+    c = cells
+    columns = (
+        c.centers_m,
+        c.normals,
+        c.sizes_m,
+        c.edge_m,
+        c.neighbours,
+        c.light,
+        c.tracks,
+        c.banks,
+    )
+    return Cells(*_arrays(*columns))
 
 
 def find_depths(cells: SnowCells, profile: Profile, seed: np.uint64) -> Depths:
     """Depth of the snow on every cell, as `profile.heights_of` defines it."""
     count = len(cells)
     heights, mottle = np.empty((2, count), np.float32)
-    draws = np.empty(count, np.uint64)
+    depths = Depths(heights, mottle, np.empty(count, np.uint64))
     with kernel_threads(CELLS):
         kernels.lay(
-            *_arrays(cells.centers_m, cells.sizes_m, cells.edge_m, cells.tracks, cells.banks),
+            arrays_of(cells),
             profile.numbers,
             *(_columns(octaves) for octaves in (profile.drifts, profile.patches, profile.mottle)),
-            *(seed, heights, mottle, draws),
+            *(seed, depths),
         )
-    return Depths(heights, mottle, draws)
+    return depths
 
 
 def _splats(
@@ -164,14 +170,11 @@ def _splats(
     keep_slopes: bool,
 ) -> tuple[Gaussians, Tensor | None, Tensor | None]:
     """The Gaussians of the snow, with their normals and slopes where asked for."""
-    centers, ground_normals, sizes, neighbours, tracks = _arrays(
-        cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours, cells.tracks
-    )
     heights = depths.heights
-    light = _softened_light(cells, heights, depth_m)
+    arrays = arrays_of(cells)._replace(light=_softened_light(cells, heights, depth_m))
     tops, counts = surface_heights(cells, heights), np.empty(len(cells), np.int64)
     with kernel_threads(CELLS):
-        kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
+        kernels.count_splats(arrays.neighbours, arrays.sizes, arrays.centers, heights, tops, counts)
         lasts = np.cumsum(counts)
         total = int(lasts[-1]) if len(cells) else 0
         means, scales, quats, sh = (
@@ -180,11 +183,8 @@ def _splats(
         normals, slopes = (
             torch.empty(total if keep else 0, 3) for keep in (keep_normals, keep_slopes)
         )
-        kernels.fill(
-            *(centers, ground_normals, sizes, neighbours, tracks, light),
-            *(heights, depths.mottle, depths.draws, tops, lasts - counts, lights, colors),
-            *(t.numpy() for t in (means, quats, scales, sh, normals, slopes)),
-        )
+        splats = Splats(*(t.numpy() for t in (means, quats, scales, sh, normals, slopes)))
+        kernels.fill(arrays, depths, tops, lasts - counts, lights, colors, splats)
     opacities = torch.full((total,), OPACITY)
     classes = torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16)
     gaussians = Gaussians(means, quats, scales, opacities, sh, semantic=classes)

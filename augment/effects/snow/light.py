@@ -10,13 +10,13 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
 
 from augment.geometry import rotmat_from_quat
+from augment.memo import memo_of
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
@@ -138,9 +138,6 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     return Illumination(sun, lit_rgb, shadow_rgb, wrap)
 
 
-_LIGHTS: WeakKeyDictionary[Scene, SceneLight] = WeakKeyDictionary()
-
-
 def linear_from_display(rgb: np.ndarray) -> np.ndarray:
     """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
     return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
@@ -171,8 +168,10 @@ def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
 
 def light_of(scene: Scene) -> SceneLight:
     """What the scene shows of its light; worked out once per scene object."""
-    if scene in _LIGHTS:
-        return _LIGHTS[scene]
+    return memo_of(scene).get(("snow light",), lambda: _find_light(scene))
+
+
+def _find_light(scene: Scene) -> SceneLight:
     (azimuth_deg, elevation_deg), contrast, sky_rgb = _look_at_sky(scene.sky)
     red, _, blue = _triple(sky_rgb)
     is_blue = _ramp(blue / red, _GREY_BLUENESS, _CLEAR_BLUENESS) if red > 1e-6 else 0.0
@@ -183,7 +182,7 @@ def light_of(scene: Scene) -> SceneLight:
     clear = _ramp(contrast, overcast_at, clear_at)
     clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
     rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
-    found = _LIGHTS[scene] = SceneLight(
+    return SceneLight(
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
         sun_share=_mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear),
@@ -193,7 +192,6 @@ def light_of(scene: Scene) -> SceneLight:
         ground_rgb_linear=_triple(rgb),
         ground_is_grey=is_grey,
     )
-    return found
 
 
 def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:

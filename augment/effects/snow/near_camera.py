@@ -12,18 +12,32 @@ import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 from scipy import ndimage
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.snow import kernels as close_kernels
-from augment.effects.snow.kernels import MARGIN, TEXEL_M
+from augment.effects.snow.kernels import (
+    CLOD,
+    COARSER,
+    CRUMB,
+    MARGIN,
+    REACH,
+    SPREAD,
+    TEXEL_M,
+    CloseView,
+    Discs,
+)
+from augment.geometry import rotmat_from_quat
+from augment.memo import memo_of
 from augment.render.buffers import AUTO, CUDA
+from augment.render.cuda import runtime as gpu
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
@@ -66,18 +80,56 @@ def split_near(
     camera: Camera,
     sun: Float[Tensor, "3"],
     grain: Grain,
+    *,
+    backend: str = AUTO,
 ) -> CloseSnow | None:
     """The snow as the camera sees it; None where no disc is near enough.
 
-    gaussians: of the world. sun: unit, towards it.
+    gaussians: of the world. sun: unit, towards it. backend: with "cuda", `split_discs` splits them
+    on the GPU, where they lie afterwards.
     """
-    finest = finest_split(camera)
-    splits = _count_splits(gaussians, camera, finest)
+    finest, nearby = finest_split(camera), None
+    means, scales = gaussians.means.numpy(), gaussians.scales.numpy()
+    if backend == CUDA:
+        squares = memo_of(gaussians).get(("snow in squares",), lambda: Squares.of(means))
+        nearby = squares.near(camera.centre.numpy(), close_kernels.FARTHEST_M)
+        means, scales = means[nearby], scales[nearby]
+    splits = np.empty(len(means), np.uint8)
+    pose = np.ascontiguousarray(camera.camera_from_world.numpy()[:3])
+    with kernel_threads(ROWS):
+        close_kernels.count_splits(means, scales, pose, view_limits(camera), finest, splits)
     chosen = np.flatnonzero(splits)
     if len(chosen) == 0:
         return None
-    splits = splits[chosen]
-    lasts = np.cumsum(splits.astype(np.int64) ** 2)
+    splits = splits[chosen].astype(np.int64)
+    view = CloseView(
+        *(camera.centre.numpy(), sun_step(sun.numpy()), shift_m(grain.seed)),
+        *(grain.amount * grain.contrast * RELIEF, grain.amount * MOTTLE, finest),
+    )
+    if nearby is None:
+        return _split_on_cpu(gaussians, slopes, chosen, splits, view)
+    picked, numbers = np.stack([nearby[chosen], splits]), np.concatenate(view[:3])
+    picked, numbers = gpu.upload(picked), gpu.upload(numbers)
+    g, there = gaussians, gpu.resident
+    on_gpu = Gaussians(
+        *(there(g.means), there(g.quats), there(g.scales), there(g.opacities), there(g.sh)),
+        semantic=None if g.semantic is None else there(g.semantic),
+    )
+    slopes = None if slopes is None else there(slopes)
+    view = view._replace(eye=numbers[:3], sun=numbers[3:6], shift=numbers[6:])
+    total = int((splits * splits).sum())
+    return split_discs(on_gpu, slopes, picked[0], picked[1], total, view)
+
+
+def _split_on_cpu(
+    gaussians: Gaussians,
+    slopes: Tensor | None,
+    chosen: np.ndarray,
+    splits: np.ndarray,
+    view: CloseView,
+) -> CloseSnow:
+    """`split_discs` by the kernel."""
+    lasts = np.cumsum(splits * splits)
     total = int(lasts[-1])
     fine = Gaussians(
         means=torch.empty(total, 3),
@@ -87,22 +139,77 @@ def split_near(
         sh=torch.empty(total, 1, 3),
         semantic=None if gaussians.semantic is None else gaussians.semantic[:1].expand(total),
     )
-    fine_slopes = torch.empty(0 if slopes is None else total, 3)
+    fine_slopes = None if slopes is None else torch.empty(total, 3)
     with kernel_threads(ROWS):
         close_kernels.split(
-            *(chosen, splits, lasts - splits.astype(np.int64) ** 2, camera.centre.numpy()),
-            *(sun_step(sun.numpy()), shift_m(grain.seed), noise_table()),
-            *(grain.amount * grain.contrast * RELIEF, grain.amount * MOTTLE, finest),
-            *_arrays(gaussians, slopes),
-            *_arrays(fine, fine_slopes),
+            *(chosen, splits, lasts - splits * splits, view, noise_table()),
+            *(_discs(gaussians, slopes), _discs(fine, fine_slopes)),
         )
     opacities = gaussians.opacities.numpy().copy()  # numpy: torch would wake threads for so little
     opacities[chosen] = 0
-    return CloseSnow(
-        dataclasses.replace(gaussians, opacities=torch.from_numpy(opacities)),
-        fine,
-        None if slopes is None else fine_slopes,
+    whole = dataclasses.replace(gaussians, opacities=torch.from_numpy(opacities))
+    return CloseSnow(whole, fine, fine_slopes)
+
+
+def split_discs(
+    gaussians: Gaussians,
+    slopes: Float[Tensor, "S 3"] | None,
+    chosen: Int64[Tensor, "C"],
+    splits: Int64[Tensor, "C"],
+    total: int,
+    view: CloseView,
+) -> CloseSnow:
+    """The chosen discs split, each into splits^2, `total` in all: on the tensors' own device, which
+    nobody waits for. The definition of what `kernels.split` computes. view: its arrays as tensors.
+    """
+    g, device = gaussians, gaussians.means.device
+    counts = splits * splits
+
+    def per_disc(values: Tensor) -> Tensor:
+        return torch.repeat_interleave(values, counts, dim=0, output_size=total)
+
+    disc, n = per_disc(chosen), per_disc(splits)
+    piece = torch.arange(total, device=device) - per_disc(counts.cumsum(0) - counts)
+    quats, scales, colors = g.quats[disc], g.scales[disc], g.sh[disc].double() * SH_C0 + 0.5
+    axes = rotmat_from_quat(quats.double())
+    sides = REACH * scales[:, :2].double()
+    spot = torch.stack([piece // n, piece % n], 1)
+    spot = ((spot + 0.5) / n[:, None] - 0.5) * (sides / SPREAD)
+    middles = g.means[disc].double()
+    places = middles + (axes[:, :, :2] * spot[:, None]).sum(2)
+
+    far = (middles - view.eye).norm(dim=1)
+    fade = (2 * (1 - far / close_kernels.FARTHEST_M)).clamp(0, 1)
+    # 0 where discs grow whole again
+    fade = fade * (2 * sides.amax(1) / (view.finest * far) - 3).clamp(0, 1)
+    noise = _noise() if device.type == "cpu" else gpu.resident(_noise())
+    behind, sunward = (
+        _grain_at(places + step, view.shift, noise) for step in (-view.sun, view.sun)
     )
+    bright = view.relief * (behind - sunward) + 0.5 * view.mottle * (behind + sunward)
+    factor = (1 + fade * bright)[:, None]
+    fine = Gaussians(
+        means=places.float(),
+        quats=quats,
+        scales=torch.cat([(sides / n[:, None]).float(), scales[:, 2:]], 1),
+        opacities=g.opacities[disc],
+        sh=((factor[..., None] * colors - 0.5) / SH_C0).float(),
+        semantic=None if g.semantic is None else g.semantic[disc],
+    )
+    whole = dataclasses.replace(g, opacities=g.opacities.index_fill(0, chosen, 0.0))
+    return CloseSnow(whole, fine, None if slopes is None else (factor * slopes[disc]).float())
+
+
+def _grain_at(places: Tensor, shift: Tensor, noise: Tensor) -> Tensor:
+    """The noise that the grain follows, [F], at places [F, 3]: two scales of one table."""
+    level = places[:, :2] + 0.7 * places[:, 2:] + shift
+    u, v = level.unbind(1)
+    turned = torch.stack([0.8 * u - 0.6 * v, 0.6 * u + 0.8 * v], 1) * COARSER
+    crumb, clod = (
+        noise[tuple(((at * (1 / TEXEL_M)).floor().long() & (TABLE - 1)).unbind(1))]
+        for at in (level, turned)
+    )
+    return CRUMB * crumb.double() + CLOD * clod.double()
 
 
 def finest_split(camera: Camera) -> float:
@@ -138,19 +245,59 @@ def shift_m(seed: int) -> np.ndarray:
     return np.random.Generator(np.random.PCG64(seed)).uniform(0, TABLE * TEXEL_M, 2)
 
 
-def _count_splits(gaussians: Gaussians, camera: Camera, finest: float) -> np.ndarray:
-    splits = np.empty(len(gaussians), np.uint8)
-    pose = np.ascontiguousarray(camera.camera_from_world.numpy()[:3])
-    means, scales = gaussians.means.numpy(), gaussians.scales.numpy()
-    with kernel_threads(ROWS):
-        close_kernels.count_splits(means, scales, pose, view_limits(camera), finest, splits)
-    return splits
+@functools.cache
+def _noise() -> Tensor:
+    return torch.from_numpy(noise_table())
 
 
-def _arrays(gaussians: Gaussians, slopes: Tensor | None) -> tuple[np.ndarray, ...]:
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
+def _discs(gaussians: Gaussians, slopes: Tensor | None) -> Discs:
     slopes = torch.empty(0, 3) if slopes is None else slopes
-    return tuple(t.contiguous().numpy() for t in (*tensors, slopes))
+    columns = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, slopes)
+    return Discs(*(t.contiguous().numpy() for t in columns))
+
+
+_SQUARE_M = 4.0
+
+
+class Squares(NamedTuple):
+    """P points in squares of the ground, so that those near an eye are found by the square.
+
+    order int64 [P]: of the points, square by square, row by row. starts: where each square begins
+    in it. low_m: least x and y. columns, rows: of squares.
+    """
+
+    order: np.ndarray
+    starts: np.ndarray
+    low_m: np.ndarray
+    columns: int
+    rows: int
+
+    @staticmethod
+    def of(points: np.ndarray) -> Squares:
+        if not len(points):
+            return Squares(np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(2), 0, 0)
+        low_m = points[:, :2].min(0).astype(np.float64)
+        squares = np.floor((points[:, :2] - low_m) / _SQUARE_M).astype(np.int64)
+        columns, rows = (int(count) for count in squares.max(0) + 1)
+        numbers = squares[:, 1] * columns + squares[:, 0]
+        order = np.argsort(numbers, kind="stable")
+        starts = np.searchsorted(numbers[order], np.arange(rows * columns + 1))
+        return Squares(order, starts, low_m, columns, rows)
+
+    def runs(self, eye_m: np.ndarray, reach_m: float) -> list[slice]:
+        """Stretches of the order that hold all points within reach of the eye, and others."""
+        size = (self.columns, self.rows)
+        first = np.floor((eye_m[:2] - reach_m - self.low_m) / _SQUARE_M).clip(0, size).astype(int)
+        end = np.floor((eye_m[:2] + reach_m - self.low_m) / _SQUARE_M + 1).clip(0, size).astype(int)
+        rows = range(first[1], end[1]) if first[0] < end[0] else ()
+        bounds = ((row * self.columns + first[0], row * self.columns + end[0]) for row in rows)
+        runs = (slice(int(self.starts[a]), int(self.starts[b])) for a, b in bounds)
+        return [run for run in runs if run.start < run.stop]
+
+    def near(self, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
+        """int64: numbers of those points."""
+        runs = self.runs(eye_m, reach_m)
+        return np.concatenate([np.zeros(0, np.int64), *(self.order[run] for run in runs)])
 
 
 # ---- Crystals on snow that throw the sun at a camera: glints, which come and go as it moves ------
@@ -158,6 +305,9 @@ def _arrays(gaussians: Gaussians, slopes: Tensor | None) -> tuple[np.ndarray, ..
 FARTHEST_M = 15.0  # from the camera: glints fade until there
 LOBE_DEG = 9.0  # how far a mirror may be off what throws the sun at the camera
 MIN_OPACITY = 0.02  # opacity below which a glint is none
+# Mirrors face every direction alike, so that one crystal in 80 throws the sun at an eye. On a GPU,
+# which does not count them, there is room for five times as many.
+GLINT_OF = 16
 SIZE_M = 0.002  # standard deviation of a glint
 LIFTED = 4.0  # height over a disc's middle, in its thickness
 PER_DISC = 2  # crystals at most
@@ -177,34 +327,69 @@ class Crystals:
     mirrors: Float32[Tensor, "G 3"]
     strength: float
 
-    def glints(self, sun: Float[Tensor, "3"], eye_m: Float[Tensor, "3"]) -> Gaussians | None:
+    def glints(
+        self, sun: Float[Tensor, "3"], eye_m: Float[Tensor, "3"], *, backend: str = AUTO
+    ) -> Gaussians | None:
         """Small bright Gaussians where a mirror throws the sun into the eye; None without any.
 
-        sun: unit, towards it. eye_m: the camera's centre. Both in the part's frame.
+        sun: unit, towards it. eye_m: the camera's centre. Both in the part's frame. backend: with
+        "cuda" they lie on the GPU, where nobody counts them: some have opacity 0.
         """
-        # numpy, since starting threads would take longer than the arithmetic on one part's crystals
         eye, towards_sun = eye_m.numpy().astype(np.float32), sun.numpy().astype(np.float32)
+        if backend == CUDA:
+            return self._glints_on_gpu(towards_sun, eye)
+        # numpy, since starting threads would take longer than the arithmetic on one part's crystals
         places = self.places_m.numpy()
         near = np.flatnonzero(np.abs(places[:, 0] - eye[0]) < FARTHEST_M)
-        views = eye - places[near]
-        distances = np.maximum(np.sqrt((views * views).sum(1)), np.float32(1e-6))
-        halves = views / distances[:, None] + towards_sun
-        lengths = np.maximum(np.sqrt((halves * halves).sum(1)), np.float32(1e-6))
-        aligned = (halves * self.mirrors.numpy()[near]).sum(1) / lengths
-        off = (1 - aligned) / (1 - math.cos(math.radians(LOBE_DEG)))  # 1 at the lobe's rim
-        power = self.strength * np.sqrt(np.maximum(1 - off, 0)) * (1 - distances / FARTHEST_M)
+        mirrors = self.mirrors.numpy()[near]
+        power = glint_power(places[near], mirrors, self.strength, towards_sun, eye)
         shown = power > MIN_OPACITY
-        count = int(shown.sum())
-        if count == 0:
+        if not shown.any():
             return None
-        return Gaussians(
-            means=torch.from_numpy(places[near[shown]]),
-            quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-            scales=torch.full((count, 3), SIZE_M),
-            opacities=torch.from_numpy(np.minimum(power[shown], 1).astype(np.float32)),
-            sh=torch.full((count, 1, 3), 0.5 / SH_C0),  # white
-            semantic=torch.full((count,), int(SemanticClass.SNOW), dtype=torch.int16),
-        )
+        opacities = np.minimum(power[shown], 1).astype(np.float32)
+        return _glints_at(torch.from_numpy(places[near[shown]]), torch.from_numpy(opacities))
+
+    def _glints_on_gpu(self, sun: np.ndarray, eye: np.ndarray) -> Gaussians | None:
+        def in_squares() -> tuple[Squares, Tensor, Tensor]:
+            squares = Squares.of(self.places_m.numpy())
+            order = torch.from_numpy(squares.order)
+            return squares, self.places_m[order], self.mirrors[order]
+
+        squares, *tensors = memo_of(self).get(("in squares",), in_squares)
+        runs = squares.runs(eye, FARTHEST_M)
+        if not runs:
+            return None
+        places, mirrors = (torch.cat([gpu.resident(t)[run] for run in runs]) for t in tensors)
+        view = gpu.upload(np.stack([sun, eye]))
+        power = glint_power(places, mirrors, self.strength, view[0], view[1])
+        power, index = power.topk(min(len(power), 64 + len(power) // GLINT_OF), sorted=False)
+        opacities = torch.where(power > MIN_OPACITY, power.clip(max=1), 0.0)
+        return _glints_at(places[index], opacities)
+
+
+def glint_power(places: Any, mirrors: Any, strength: float, sun: Any, eye: Any) -> Any:
+    """Opacities [G] of crystals' glints, below MIN_OPACITY where there is none; float32 arrays or
+    tensors. places, mirrors [G, 3]; sun: unit, towards it; eye: all in the part's frame.
+    """
+    views = eye - places
+    distances = ((views * views).sum(1) ** 0.5).clip(1e-6)
+    halves = views / distances[:, None] + sun
+    lengths = ((halves * halves).sum(1) ** 0.5).clip(1e-6)
+    aligned = (halves * mirrors).sum(1) / lengths
+    off = (1 - aligned) / (1 - math.cos(math.radians(LOBE_DEG)))  # 1 at the lobe's rim
+    return strength * (1 - off).clip(0) ** 0.5 * (1 - distances / FARTHEST_M)
+
+
+def _glints_at(places: Tensor, opacities: Tensor) -> Gaussians:
+    count, device = len(places), places.device
+    return Gaussians(
+        means=places,
+        quats=torch.eye(4, device=device)[:1].repeat(count, 1),
+        scales=torch.full((count, 3), SIZE_M, device=device),
+        opacities=opacities,
+        sh=torch.full((count, 1, 3), 0.5 / SH_C0, device=device),  # white
+        semantic=torch.full((count,), int(SemanticClass.SNOW), dtype=torch.int16, device=device),
+    )
 
 
 def crystals_of(
@@ -303,74 +488,61 @@ class SnowLayers:
             parts.append(dataclasses.replace(part, gaussians=left))
             if len(layer.gaussians):
                 covered.append((layer, part))
-        if backend == CUDA:
-            from augment.effects.snow.cuda import pose_layers
-
-            return (*parts, *pose_layers(self, covered, camera))
         for layer, part in covered:
-            parts.extend(self._posed(layer, part, camera))
+            parts.extend(self._posed(layer, part, camera, backend))
         return tuple(parts)
 
-    def _posed(self, layer: Layer, part: PosedGaussians, camera: Camera) -> list[PosedGaussians]:
+    def _posed(
+        self, layer: Layer, part: PosedGaussians, camera: Camera, backend: str
+    ) -> list[PosedGaussians]:
         """The layer where its part stands, the ground's finer where it is near, and its glints."""
         pose, eye_m = part.world_from_part, camera.centre
         sun = torch.tensor(self.sun, dtype=torch.float64)
         if pose is not None:
             sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
-        gaussians, slopes = layer.gaussians, layer.slopes
+        gaussians, slopes, near = layer.gaussians, layer.slopes, None
         if layer.normals is not None:
             assert slopes is not None
-            gaussians = _lit(gaussians, slopes, layer.normals, sun, self.wrap)
+            towards = sun.tolist()
+            gaussians = _lit(gaussians, slopes, layer.normals, towards, self.wrap, backend)
             slopes = None
-        drawn, near = [(gaussians, slopes)], None
-        if layer is self.ground:
-            near = split_near(gaussians, slopes, camera, sun, self.grain)
+        elif layer is self.ground:
+            near = split_near(gaussians, slopes, camera, sun, self.grain, backend=backend)
+        drawn = [(gaussians, slopes)]
         if near is not None:
             drawn = [(near.whole, slopes), (near.fine, near.fine_slopes)]
-        glints = None if layer.crystals is None else layer.crystals.glints(sun, eye_m)
-        if glints is not None:
-            drawn.append((glints, None))
-        return self.posed(drawn, part, tuple(sun.tolist()))
-
-    def posed(
-        self,
-        drawn: Sequence[tuple[Gaussians, Tensor | None]],
-        part: PosedGaussians,
-        sun: tuple[float, float, float],
-    ) -> list[PosedGaussians]:
-        """Splats with their slopes where a part stands. sun: unit, in the part's frame."""
-        lights = (None if s is None else SplatShading(s, sun, self.wrap) for _, s in drawn)
-        pose = (part.world_from_part, part.instance_id)
+        if layer.crystals is not None:
+            glints = layer.crystals.glints(sun, eye_m, backend=backend)
+            drawn += [] if glints is None else [(glints, None)]
+        towards_sun, instance = tuple(sun.tolist()), part.instance_id
+        lights = (None if s is None else SplatShading(s, towards_sun, self.wrap) for _, s in drawn)
         return [
-            PosedGaussians(splats, *pose, is_overlay=True, shading=light)
+            PosedGaussians(splats, pose, instance, is_overlay=True, shading=light)
             for (splats, _), light in zip(drawn, lights, strict=True)
         ]
-
-
-_left: WeakKeyDictionary[Layer, tuple[Gaussians, Gaussians]] = WeakKeyDictionary()
 
 
 def _left_visible(layer: Layer, own: Gaussians) -> Gaussians:
     """A part's Gaussians less those that the snow buries: one object for as long as the part's own
     is one, so that what a GPU knows of it is not asked for anew every frame.
     """
-    known = _left.get(layer)
-    if known is None or known[0] is not own:
-        known = _left[layer] = (own, dataclasses.replace(own, opacities=layer.opacities))
-    return known[1]
+    of_layers = memo_of(own).get(("left visible by snow",), WeakKeyDictionary[Layer, Gaussians])
+    if layer not in of_layers:
+        of_layers[layer] = dataclasses.replace(own, opacities=layer.opacities)
+    return of_layers[layer]
 
 
 def _lit(
-    gaussians: Gaussians,
-    slopes: Float[Tensor, "S 3"],
-    normals: Float[Tensor, "S 3"],
-    sun: Float[Tensor, "3"],
-    wrap: float,
+    gaussians: Gaussians, slopes: Tensor, normals: Tensor, sun: list[float], wrap: float, on: str
 ) -> Gaussians:
-    """The Gaussians in the light that their own normals catch. sun: unit, in the part's frame."""
+    """The Gaussians in the light that their own normals catch. sun: unit, in the part's frame. on:
+    the backend.
+    """
     # numpy, since starting threads would take longer than the arithmetic on one part's snow
-    n, light = normals.numpy(), sun.numpy().astype(np.float32)
-    facing = n[:, 0] * light[0] + n[:, 1] * light[1] + n[:, 2] * light[2]
-    share = np.clip((facing + wrap) / (1 + wrap), 0, 1) / SH_C0
-    lit = gaussians.sh.numpy() + (slopes.numpy() * share[:, None])[:, None, :]
-    return dataclasses.replace(gaussians, sh=torch.from_numpy(lit.astype(np.float32)))
+    sh, rises, n = (
+        gpu.resident(t) if on == CUDA else t.numpy() for t in (gaussians.sh, slopes, normals)
+    )
+    facing = n[:, 0] * sun[0] + n[:, 1] * sun[1] + n[:, 2] * sun[2]
+    share = ((facing + wrap) / (1 + wrap)).clip(0, 1) / SH_C0
+    lit = sh + (rises * share[:, None])[:, None, :]
+    return dataclasses.replace(gaussians, sh=torch.as_tensor(lit))
