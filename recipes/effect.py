@@ -55,10 +55,10 @@ class Column:
 
     name: str
     value: Callable[[Any], Value]
-    absent: float | None = math.nan
-    shows: Literal["all", "nonzero", None] = None
     title: str = ""
     unit: str = ""
+    absent: float | None = math.nan
+    shows: Literal["all", "nonzero", None] = None
     factor: float = 1.0
     over: float | None = None
     linear: bool = False

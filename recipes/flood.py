@@ -104,17 +104,17 @@ class Flood(EffectModel):
             (6, 12, 24),
             "waves that make up the surface",
             7,
-            works=lambda flood: flood.waves.is_drawn,
+            works=lambda it: it.waves.is_drawn,
         ),
         Knob("fresnel", ("schlick", "exact"), "share of reflected light", 8),
     )
     columns = (
         Column(
             "flood_level_m",
-            lambda flood: flood.level_m,
+            lambda it: it.level_m,
+            "Water level",
+            "m",
             shows="all",  # at a level of 0 too
-            title="Water level",
-            unit="m",
             linear=True,
             label="water at",
             caption="water at {flood_level_m:.2f} m",
@@ -122,15 +122,15 @@ class Flood(EffectModel):
         # NaN where the recipe gives an absorption.
         Column(
             "flood_turbidity_ntu",
-            lambda flood: flood.effective_turbidity_ntu,
-            title="Turbidity of water",
-            unit="NTU",
+            lambda it: it.effective_turbidity_ntu,
+            "Turbidity of water",
+            "NTU",
         ),
         # A factor on a preset's waves, NaN where waves are listed.
         Column(
             "flood_wave_height",
-            lambda flood: flood.waves.height if flood.waves.components is None else None,
-            title="Wave height, × preset",
+            lambda it: it.waves.height if it.waves.components is None else None,
+            "Wave height, × preset",
         ),
     )
 

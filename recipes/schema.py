@@ -207,7 +207,7 @@ class Output(Section):
             "size and error of jpg files",
             12,
             chosen=False,
-            works=lambda output: output.image == "jpg",
+            works=lambda it: it.image == "jpg",
         ),
     )
 

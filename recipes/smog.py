@@ -30,21 +30,16 @@ class Smog(EffectModel):
     columns = (
         Column(
             "smog_extinction_per_m",
-            lambda smog: smog.sigma_per_m,
+            lambda it: it.sigma_per_m,
+            "Visibility in smog",
+            "m",
             absent=0.0,
             shows="nonzero",
-            title="Visibility in smog",
-            unit="m",
             over=KOSCHMIEDER,
             label="visibility",
             caption="visibility {smog_extinction_per_m:.0f} m",
         ),
-        Column(
-            "smog_scale_height_m",
-            lambda smog: smog.scale_height_m,
-            title="Scale height of smog",
-            unit="m",
-        ),
+        Column("smog_scale_height_m", lambda it: it.scale_height_m, "Scale height of smog", "m"),
     )
 
     visibility_m: Number | None = Field(default=None, gt=0, le=1e6)

@@ -61,20 +61,16 @@ class Snow(EffectModel):
     columns = (
         Column(
             "snow_depth_m",
-            lambda snow: snow.depth_m,
+            lambda it: it.depth_m,
+            "Snow depth",
+            "cm",
             shows="nonzero",
-            title="Snow depth",
-            unit="cm",
             factor=100,
             label="snow",
             caption="snow {snow_depth_m:.3g} cm",
         ),
         Column(
-            "snow_coverage",
-            lambda snow: snow.coverage,
-            shows="nonzero",
-            title="Snow coverage",
-            linear=True,
+            "snow_coverage", lambda it: it.coverage, "Snow coverage", shows="nonzero", linear=True
         ),
     )
 

@@ -57,25 +57,25 @@ class Style(EffectModel):
             ("sh", "color"),
             "map folded into the scene or put on each colour",
             9,
-            works=lambda style: style.applied_to == "scene",
+            works=lambda it: it.applied_to == "scene",
         ),
     )
     columns = (
         Column(
             "style",
-            lambda style: style.name,
+            lambda it: it.name,
+            "Style",
             absent=None,
-            title="Style",
             label="style",
             caption="{style} x {style_strength:.2g}",
         ),
-        Column("style_method", lambda style: style.method, absent=None),
+        Column("style_method", lambda it: it.method, absent=None),
         Column(
             "style_strength",
-            lambda style: style.strength,
+            lambda it: it.strength,
+            "Strength of style",
             absent=0.0,
             shows="nonzero",
-            title="Strength of style",
             linear=True,
         ),
     )

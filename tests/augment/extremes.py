@@ -334,10 +334,10 @@ def _ends(field: FieldSpec) -> tuple[float, float]:
     return low, high
 
 
-def number_fields(section: SectionSpec = root()) -> list[FieldSpec]:
+def number_fields(section: SectionSpec | None = None) -> list[FieldSpec]:
     """Every field of a recipe that holds numbers, colours' and rates' channels among them."""
     fields = []
-    for spec in section.walk():
+    for spec in (section or root()).walk():
         for field in spec.fields.values():
             if field.kind in (Kind.NUMBER, Kind.WHOLE) or field.channel is not None:
                 fields.append(field)
