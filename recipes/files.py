@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from recipes.effect import EffectModel
 from recipes.errors import RecipeError, nearest_word, short
-from recipes.fields import replaced
+from recipes.fields import found, replaced
 from recipes.schema import SECTIONS, Recipe
 
 MAX_MIB = 512  # of one file
@@ -158,7 +158,7 @@ def _hash(section: EffectModel, name: str) -> str:
 
 def _checked(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
-    given: str | None = section.digest
+    given: str | None = found(section, "digest")
     if given not in (None, digest):
         paths = ", ".join(section.files.values())
         which = "the file has" if len(hashes) == 1 else "one of the files has"

@@ -13,7 +13,7 @@ import operator
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
@@ -358,7 +358,8 @@ TIERS: dict[str, dict[str, Value]] = {"draft": {}, "balanced": {}}
 def add_section(path: str, model: type[EffectModel]) -> None:
     """Another effect in the recipes that are made from now on. path: `weather.dust`, or `dust`."""
     holder, name = _place(path)
-    holder.model_fields[name] = FieldInfo.from_annotated_attribute(model | None, None)
+    annotation: Any = model | None
+    holder.model_fields[name] = FieldInfo.from_annotated_attribute(annotation, None)
     SECTIONS[path] = model
     _rebuild()
 
