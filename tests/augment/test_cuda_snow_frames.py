@@ -18,8 +18,8 @@ from augment.effects.snow.near_camera import (
     Grain,
     Layer,
     SnowLayers,
-    Squares,
     finest_split,
+    near_rows,
     shift_m,
     split_discs,
     split_near,
@@ -159,15 +159,17 @@ def test_the_kernel_splits_discs_as_its_definition_does(lit, shift):
 def test_no_point_near_the_eye_is_left_out_and_few_others_are_looked_at():
     rng = np.random.default_rng(0)
     points = rng.uniform((-30, 5, -1), (30, 40, 2), (5000, 3)).astype(np.float32)
-    squares = Squares.of(points)
+    points = points[np.argsort(np.floor(points[:, 1] / 5) * 100 + points[:, 0])]  # in strips
+    owner = discs(1, 0)
     for eye in ((3.0, 10.0, 1.0), (90.0, 0.0, 1.0), (-31.0, 41.0, 0.0)):
-        gaps = np.abs(points[:, :2].astype(np.float64) - eye[:2]).max(1)
+        gaps = np.linalg.norm(points.astype(np.float64) - eye, axis=1)
         for reach in (1.0, 12.0, 200.0):
-            near = squares.near(np.array(eye), reach)
-            assert len(set(near.tolist())) == len(near)
+            near = near_rows(owner, points, np.array(eye), reach)
+            assert (np.diff(near) > 0).all()
             assert set(np.flatnonzero(gaps < reach)) <= set(near.tolist())
-            assert (gaps[near] < reach + 4).all()
-    assert len(Squares.of(points[:0]).near(np.zeros(3), 9.0)) == 0
+        assert len(near) == 5000
+    assert len(near_rows(owner, points, np.array([3.0, 10.0, 1.0]), 5.0)) < 2000
+    assert len(near_rows(owner, points[:0], np.zeros(3), 9.0)) == 0
 
 
 def yawed(angle: float, x: float, y: float) -> torch.Tensor:

@@ -12,7 +12,7 @@ import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -88,27 +88,26 @@ def split_near(
     gaussians: of the world. sun: unit, towards it. backend: with "cuda", `split_discs` splits them
     on the GPU, where they lie afterwards.
     """
-    finest, nearby = finest_split(camera), None
-    means, scales = gaussians.means.numpy(), gaussians.scales.numpy()
-    if backend == CUDA:
-        squares = memo_of(gaussians).get(("snow in squares",), lambda: Squares.of(means))
-        nearby = squares.near(camera.centre.numpy(), close_kernels.FARTHEST_M)
-        means, scales = means[nearby], scales[nearby]
-    splits = np.empty(len(means), np.uint8)
+    finest, means = finest_split(camera), gaussians.means.numpy()
+    near = near_rows(gaussians, means, camera.centre.numpy(), close_kernels.FARTHEST_M)
+    splits = np.empty(len(near), np.uint8)
     pose = np.ascontiguousarray(camera.camera_from_world.numpy()[:3])
     with kernel_threads(ROWS):
-        close_kernels.count_splits(means, scales, pose, view_limits(camera), finest, splits)
+        close_kernels.count_splits(
+            *(means[near], gaussians.scales.numpy()[near], pose, view_limits(camera)),
+            *(finest, splits),
+        )
     chosen = np.flatnonzero(splits)
     if len(chosen) == 0:
         return None
-    splits = splits[chosen].astype(np.int64)
+    chosen, splits = near[chosen], splits[chosen].astype(np.int64)
     view = CloseView(
         *(camera.centre.numpy(), sun_step(sun.numpy()), shift_m(grain.seed)),
         *(grain.amount * grain.contrast * RELIEF, grain.amount * MOTTLE, finest),
     )
-    if nearby is None:
+    if backend != CUDA:
         return _split_on_cpu(gaussians, slopes, chosen, splits, view)
-    picked, numbers = np.stack([nearby[chosen], splits]), np.concatenate(view[:3])
+    picked, numbers = np.stack([chosen, splits]), np.concatenate(view[:3])
     picked, numbers = gpu.upload(picked), gpu.upload(numbers)
     g, there = gaussians, gpu.resident
     on_gpu = Gaussians(
@@ -256,48 +255,25 @@ def _discs(gaussians: Gaussians, slopes: Tensor | None) -> Discs:
     return Discs(*(t.contiguous().numpy() for t in columns))
 
 
-_SQUARE_M = 4.0
+_BLOCK = 256  # neighbouring points
 
 
-class Squares(NamedTuple):
-    """P points in squares of the ground, so that those near an eye are found by the square.
-
-    order int64 [P]: of the points, square by square, row by row. starts: where each square begins
-    in it. low_m: least x and y. columns, rows: of squares.
+def near_rows(owner: Any, points: np.ndarray, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """int64: rows of the owner's points [P, 3] that hold all within reach of the eye, and some
+    others: of blocks whose boxes are near.
     """
 
-    order: np.ndarray
-    starts: np.ndarray
-    low_m: np.ndarray
-    columns: int
-    rows: int
+    def corners() -> tuple[np.ndarray, np.ndarray]:
+        starts = np.arange(0, len(points), _BLOCK)
+        return np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
 
-    @staticmethod
-    def of(points: np.ndarray) -> Squares:
-        if not len(points):
-            return Squares(np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(2), 0, 0)
-        low_m = points[:, :2].min(0).astype(np.float64)
-        squares = np.floor((points[:, :2] - low_m) / _SQUARE_M).astype(np.int64)
-        columns, rows = (int(count) for count in squares.max(0) + 1)
-        numbers = squares[:, 1] * columns + squares[:, 0]
-        order = np.argsort(numbers, kind="stable")
-        starts = np.searchsorted(numbers[order], np.arange(rows * columns + 1))
-        return Squares(order, starts, low_m, columns, rows)
-
-    def runs(self, eye_m: np.ndarray, reach_m: float) -> list[slice]:
-        """Stretches of the order that hold all points within reach of the eye, and others."""
-        size = (self.columns, self.rows)
-        first = np.floor((eye_m[:2] - reach_m - self.low_m) / _SQUARE_M).clip(0, size).astype(int)
-        end = np.floor((eye_m[:2] + reach_m - self.low_m) / _SQUARE_M + 1).clip(0, size).astype(int)
-        rows = range(first[1], end[1]) if first[0] < end[0] else ()
-        bounds = ((row * self.columns + first[0], row * self.columns + end[0]) for row in rows)
-        runs = (slice(int(self.starts[a]), int(self.starts[b])) for a, b in bounds)
-        return [run for run in runs if run.start < run.stop]
-
-    def near(self, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
-        """int64: numbers of those points."""
-        runs = self.runs(eye_m, reach_m)
-        return np.concatenate([np.zeros(0, np.int64), *(self.order[run] for run in runs)])
+    if not len(points):
+        return np.zeros(0, np.int64)
+    lows, highs = memo_of(owner).get(("corners of blocks",), corners)
+    gaps = np.maximum(np.maximum(lows - eye_m, eye_m - highs), 0.0)
+    blocks = np.flatnonzero((gaps * gaps).sum(1) <= (1.001 * reach_m) ** 2)
+    rows = (blocks[:, None] * _BLOCK + np.arange(_BLOCK)).reshape(-1)
+    return rows[: np.searchsorted(rows, len(points))]
 
 
 # ---- Crystals on snow that throw the sun at a camera: glints, which come and go as it moves ------
@@ -336,35 +312,22 @@ class Crystals:
         "cuda" they lie on the GPU, where nobody counts them: some have opacity 0.
         """
         eye, towards_sun = eye_m.numpy().astype(np.float32), sun.numpy().astype(np.float32)
-        if backend == CUDA:
-            return self._glints_on_gpu(towards_sun, eye)
+        near = near_rows(self, self.places_m.numpy(), eye, FARTHEST_M)
+        if backend == CUDA and len(near):
+            rows, view = gpu.upload(near), gpu.upload(np.stack([towards_sun, eye]))
+            places, mirrors = (gpu.resident(t)[rows] for t in (self.places_m, self.mirrors))
+            power = glint_power(places, mirrors, self.strength, view[0], view[1])
+            power, index = power.topk(min(len(near), 64 + len(near) // GLINT_OF), sorted=False)
+            opacities = torch.where(power > MIN_OPACITY, power.clip(max=1), 0.0)
+            return _glints_at(places[index], opacities)
         # numpy, since starting threads would take longer than the arithmetic on one part's crystals
-        places = self.places_m.numpy()
-        near = np.flatnonzero(np.abs(places[:, 0] - eye[0]) < FARTHEST_M)
-        mirrors = self.mirrors.numpy()[near]
-        power = glint_power(places[near], mirrors, self.strength, towards_sun, eye)
+        places, mirrors = self.places_m.numpy()[near], self.mirrors.numpy()[near]
+        power = glint_power(places, mirrors, self.strength, towards_sun, eye)
         shown = power > MIN_OPACITY
         if not shown.any():
             return None
         opacities = np.minimum(power[shown], 1).astype(np.float32)
-        return _glints_at(torch.from_numpy(places[near[shown]]), torch.from_numpy(opacities))
-
-    def _glints_on_gpu(self, sun: np.ndarray, eye: np.ndarray) -> Gaussians | None:
-        def in_squares() -> tuple[Squares, Tensor, Tensor]:
-            squares = Squares.of(self.places_m.numpy())
-            order = torch.from_numpy(squares.order)
-            return squares, self.places_m[order], self.mirrors[order]
-
-        squares, *tensors = memo_of(self).get(("in squares",), in_squares)
-        runs = squares.runs(eye, FARTHEST_M)
-        if not runs:
-            return None
-        places, mirrors = (torch.cat([gpu.resident(t)[run] for run in runs]) for t in tensors)
-        view = gpu.upload(np.stack([sun, eye]))
-        power = glint_power(places, mirrors, self.strength, view[0], view[1])
-        power, index = power.topk(min(len(power), 64 + len(power) // GLINT_OF), sorted=False)
-        opacities = torch.where(power > MIN_OPACITY, power.clip(max=1), 0.0)
-        return _glints_at(places[index], opacities)
+        return _glints_at(torch.from_numpy(places[shown]), torch.from_numpy(opacities))
 
 
 def glint_power(places: Any, mirrors: Any, strength: float, sun: Any, eye: Any) -> Any:
