@@ -25,7 +25,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _sequence(dumper: _Dumper, data: tuple[object, ...]) -> yaml.Node:
     flat = all(map(is_number, data))
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flat)
 
 
 _Dumper.add_representer(tuple, _sequence)

@@ -95,31 +95,247 @@ def _text_hint(text: str, spec: FieldSpec) -> str:
     return ""
 
 
-# ---- One field of a file: a literal or a range, checked against the field's limits where it stands
-
 NORMAL_KEYS = ("mean", "std", "min", "max")
 MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
 
 
-class _FieldReader:
-    """Turns the node of a field into its Value; None where something is wrong, added to problems.
+# ---- Guesses what a misspelt key was meant to be -------------------------------------------------
 
-    folder: where the files that the recipe names lie; None for a text that comes from no file.
+_UNIT = re.compile(
+    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
+)
+
+
+def _synonyms() -> dict[str, str]:
+    """What a key may have been meant to be, where the section has it."""
+    meant = (pair for model in SECTIONS.values() for pair in model.meant_by)
+    return {word: key for key, words in meant for word in words.split()}
+
+
+def unknown_key(key: str, section: SectionSpec) -> str:
+    """Why `key` is refused and which known one is nearest."""
+    if key in RANGE_KINDS:
+        return "a range stands for one field, not for a whole section"
+    nearest = _nearest(key, section)
+    if nearest is not None:
+        spec = {**section.fields, **section.extra}.get(nearest)
+        unit = f" ({spec.unit})" if spec and spec.unit else ""
+        return f"unknown field; did you mean {nearest}{unit}?"
+    elsewhere = [
+        (other, name)
+        for name in dict.fromkeys((key, _synonyms().get(key, key)))
+        for other in root().walk()
+        if name in other.known and other is not section
+    ]
+    below = [place for place in elsewhere if place[0].path.startswith(f"{section.path}.")]
+    elsewhere = below or elsewhere
+    if elsewhere:
+        places = [join(o.path, name) if o.path else f"{name} at the top" for o, name in elsewhere]
+        return f"unknown field here; did you mean {' or '.join(places)}?"
+    return f"unknown field; known here: {', '.join(section.known)}"
+
+
+def _nearest(key: str, section: SectionSpec) -> str | None:
+    known, low = section.known, key.lower().replace("-", "_")
+    if low in known:
+        return low
+    bases = {_base(name): name for name in known}
+    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
+        return bases[_base(low)]
+    synonyms = _synonyms()
+    for meant in (synonyms.get(low), synonyms.get(_base(low))):
+        if meant in known:
+            return meant
+    if any(low in other.known for other in root().walk()):
+        return None  # spelt well, but in another place
+    close = nearest_word(low, known)
+    if close is None:
+        base = nearest_word(_base(low), tuple(bases))
+        close = bases[base] if base else None
+    return close
+
+
+def _base(name: str) -> str:
+    """The name without its unit."""
+    return _UNIT.sub("", name) or name
+
+
+# ---- The whole file ------------------------------------------------------------------------------
+
+_LOG = logging.getLogger(__name__)
+
+
+def parse_recipe(
+    text: str, *, source: str, name: str | None = None, folder: Path | None = None
+) -> RecipeTemplate:
+    """The template in YAML `text`.
+
+    source: stands before the line number in messages. name: the recipe's, where the text gives
+    none. folder: where the files that the text names lie; without it, it can name none.
+
+    Raises:
+        RecipeError: anything is wrong with the text; one line for each problem.
     """
+    problems = Problems(source)
+    tree = read_tree(text, problems)
+    if isinstance(tree, ScalarNode) and tree.value is None:
+        raise problems.fail(1, EMPTY)
+    if not isinstance(tree, MapNode):
+        raise problems.fail(tree.line, f"a recipe is a mapping of fields; got {show(tree)}")
+    _check_version(tree, problems)
+    return _Reader(problems, folder).template(tree, source, name)
+
+
+def _check_version(tree: MapNode, problems: Problems) -> None:
+    """A later format may well rename fields, so nothing else is said about such a file."""
+    if "version" not in tree.entries:
+        return
+    line, node = tree.entries["version"]
+    value = node.value if isinstance(node, ScalarNode) else None
+    if type(value) is not int or value != VERSION:
+        text = f"version = {show(node)}: this package reads version {VERSION} of the format"
+        raise problems.fail(line, text)
+
+
+class _Reader:
+    """folder: where the files that the recipe names lie; None for a text that is in no file."""
 
     def __init__(self, problems: Problems, folder: Path | None) -> None:
         self._problems, self._folder = problems, folder
+        self._values: dict[str, Value] = {}
+        self._effects: dict[str, float] = {}
+        self._lists: dict[str, int] = {}
 
-    def parse(self, node: Node, spec: FieldSpec, path: str) -> Value | None:
-        """The value of a field that may have a range."""
+    def template(self, tree: MapNode, source: str, file_name: str | None) -> RecipeTemplate:
+        """The template of a whole file; raises all that was found wrong."""
+        self._section(tree, root(), "", line=1)
+        name = self._take("name", file_name)
+        if "name" not in tree.entries and not root().fields["name"].accepts(name):
+            allowed = root().fields["name"].allowed()
+            text = f"the file's name, {short(str(name))!r}, cannot serve as it; add 'name: ...'"
+            self._problems.add(1, f"name: {text}, {allowed}")
+        seed, first = int(self._take("seed")), int(self._take("variant"))
+        variants = int(self._take("variants"))
+        if not root().fields["variant"].accepts(first + variants - 1):
+            line = tree.entries["variant"][0]
+            self._problems.add(line, f"variant = {first}: too large with variants = {variants}")
+        self._problems.raise_if_any()
+        self._values.pop("version", None)
+        if variants > 1 and not self._differs():
+            text = "%s: variants = %d, but no field has a range: all have the same numbers"
+            _LOG.warning(text, source, variants)
+        return RecipeTemplate(
+            name=str(name),
+            source=source,
+            seed=seed,
+            variants=variants,
+            first_variant=first,
+            values=tuple(self._values.items()),
+            effects=tuple(self._effects.items()),
+            lists=tuple(self._lists.items()),
+            folder=self._folder,
+        )
+
+    def _take(self, key: str, absent: str | None = None) -> Any:
+        """The value of a top field, which is no part of what is drawn."""
+        value = self._values.pop(key, None)
+        if isinstance(value, Fixed):
+            return value.value
+        return {**root().fields, **root().extra}[key].default if absent is None else absent
+
+    def _differs(self) -> bool:
+        drawn = any(value.is_range for value in self._values.values())
+        return drawn or any(0 < probability < 1 for probability in self._effects.values())
+
+    def _section(
+        self, node: Node, spec: SectionSpec, path: str, line: int
+    ) -> dict[str, Value | Items]:
+        """Read a mapping; its fields' values, for the rules of the section that holds it.
+
+        path: the section's, with numbers in place of the [] of lists. line: the one of its key.
+        """
+        given: dict[str, Value | Items] = {}
+        if isinstance(node, ScalarNode) and node.value is None and spec.max_items is None:
+            return given  # 'weather:' with nothing below it: it is empty, an effect absent
+        if isinstance(node, ScalarNode) and spec.shorthand is not None:
+            value = self._literal(node, spec.fields[spec.shorthand].without_null, path)
+            if value is not None:
+                given[spec.shorthand] = self._values[join(path, spec.shorthand)] = value
+            return given
+        if not isinstance(node, MapNode):
+            text = f"{path} = {show(node)}: must be a mapping, with {', '.join(spec.known)}"
+            self._problems.add(node.line, text)
+            return given
+        found_before = len(self._problems)
+        if spec.effect:
+            self._effects[path] = 1.0
+        for key, (key_line, child) in node.entries.items():
+            value = self._entry(child, spec, key, join(path, key), key_line)
+            if value is not None:
+                given[key] = value
+        for name, field in spec.fields.items():
+            if field.required and name not in node.entries:
+                self._problems.add(line, f"{join(path, name)}: must be given, {field.allowed()}")
+        if path and len(self._problems) == found_before:
+            for text in broken_rules(spec, given):
+                self._problems.add(line, f"{path}: {text}")
+        return given
+
+    def _entry(
+        self, node: Node, spec: SectionSpec, key: str, path: str, line: int
+    ) -> Value | Items | None:
+        """Read what stands under a key; None where the section's rules do not ask for it."""
+        below = spec.sections.get(key)
+        if below is not None and below.max_items is not None:
+            return self._list(node, below, below.max_items, path)
+        if below is not None:
+            self._section(node, below, path, line)
+        elif key in spec.fields:
+            field = spec.fields[key]
+            read = self._field if field.rangeable else self._literal
+            if (value := read(node, field, path)) is not None:
+                self._values[path] = value
+            return value
+        elif key in spec.extra:
+            self._extra(node, spec, key, path)
+        else:
+            shown = path.removesuffix(key) + short(key)
+            self._problems.add(line, f"{shown}: {unknown_key(key, spec)}")
+        return None
+
+    def _list(self, node: Node, spec: SectionSpec, most: int, path: str) -> Items | None:
+        if isinstance(node, ScalarNode) and node.value is None:
+            return None
+        if not isinstance(node, ListNode) or len(node.items) > most:
+            allowed = f"up to {most} mappings, each with {', '.join(spec.known)}; or null"
+            self._problems.add(node.line, f"{path} = {show(node)}: must be a list of {allowed}")
+            return None
+        self._lists[path] = len(node.items)
+        mappings = [
+            self._section(item, spec, f"{path}[{index}]", item.line)
+            for index, item in enumerate(node.items)
+        ]
+        return Items(tuple(mappings))
+
+    def _extra(self, node: Node, spec: SectionSpec, key: str, path: str) -> None:
+        value = self._literal(node, spec.extra[key], path)
+        if value is not None and spec.effect and key == "probability":
+            self._effects[spec.path] = as_number(value.value)
+        elif value is not None:
+            self._values[path] = value
+
+    # ---- One field: a literal or a range, checked against the field's limits where it stands;
+    # None where something is wrong
+
+    def _field(self, node: Node, spec: FieldSpec, path: str) -> Value | None:
         if isinstance(node, MapNode):
             return self._range(node, spec, path)
         if isinstance(node, ListNode) and spec.channel is not None and len(node.items) == 3:
             return self._triple(node, spec.channel, path)
-        return self.literal(node, spec, path)
+        return self._literal(node, spec, path)
 
-    def literal(self, node: Node, spec: FieldSpec, path: str) -> Fixed | None:
-        """The value of a field that must be written out."""
+    def _literal(self, node: Node, spec: FieldSpec, path: str) -> Fixed | None:
+        """Of a field that must be written out."""
         if isinstance(node, MapNode) and not spec.rangeable:
             return self._bad(node, path, f"must be {spec.allowed()}; it cannot be a range")
         if not isinstance(node, ScalarNode):
@@ -150,11 +366,11 @@ class _FieldReader:
         self._problems.add(node.line, f"{path} = {show(node)}: {text}")
 
     def _number(self, node: Node, spec: FieldSpec, path: str) -> float | None:
-        fixed = self.literal(node, spec.without_null, path)
+        fixed = self._literal(node, spec.without_null, path)
         return None if fixed is None else as_number(fixed.value)
 
     def _each(self, node: ListNode, spec: FieldSpec, path: str) -> list[Value | None]:
-        return [self.parse(item, spec, f"{path}[{i}]") for i, item in enumerate(node.items)]
+        return [self._field(item, spec, f"{path}[{i}]") for i, item in enumerate(node.items)]
 
     def _numbers(self, node: ListNode, spec: FieldSpec, path: str) -> list[float | None]:
         return [self._number(item, spec, f"{path}[{i}]") for i, item in enumerate(node.items)]
@@ -256,228 +472,3 @@ class _FieldReader:
             return self._bad(body, path, f"the two {ends} must be written out, without ranges")
         assert isinstance(start.value, tuple) and isinstance(end.value, tuple)
         return TripleLine(start.value, end.value)
-
-
-# ---- Guesses what a misspelt key was meant to be -------------------------------------------------
-
-_UNIT = re.compile(
-    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
-)
-
-
-def _synonyms() -> dict[str, str]:
-    """What a key may have been meant to be, where the section has it."""
-    meant = (pair for model in SECTIONS.values() for pair in model.meant_by)
-    return {word: key for key, words in meant for word in words.split()}
-
-
-def unknown_key(key: str, section: SectionSpec) -> str:
-    """Why `key` is refused and which known one is nearest."""
-    if key in RANGE_KINDS:
-        return "a range stands for one field, not for a whole section"
-    nearest = _nearest(key, section)
-    if nearest is not None:
-        spec = {**section.fields, **section.extra}.get(nearest)
-        unit = f" ({spec.unit})" if spec and spec.unit else ""
-        return f"unknown field; did you mean {nearest}{unit}?"
-    elsewhere = [
-        (other, name)
-        for name in dict.fromkeys((key, _synonyms().get(key, key)))
-        for other in root().walk()
-        if name in other.known and other is not section
-    ]
-    below = [place for place in elsewhere if place[0].path.startswith(f"{section.path}.")]
-    elsewhere = below or elsewhere
-    if elsewhere:
-        places = [join(o.path, name) if o.path else f"{name} at the top" for o, name in elsewhere]
-        return f"unknown field here; did you mean {' or '.join(places)}?"
-    return f"unknown field; known here: {', '.join(section.known)}"
-
-
-def _nearest(key: str, section: SectionSpec) -> str | None:
-    known, low = section.known, key.lower().replace("-", "_")
-    if low in known:
-        return low
-    bases = {_base(name): name for name in known}
-    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
-        return bases[_base(low)]
-    synonyms = _synonyms()
-    for meant in (synonyms.get(low), synonyms.get(_base(low))):
-        if meant in known:
-            return meant
-    if any(low in other.known for other in root().walk()):
-        return None  # spelt well, but in another place
-    close = nearest_word(low, known)
-    if close is None:
-        base = nearest_word(_base(low), tuple(bases))
-        close = bases[base] if base else None
-    return close
-
-
-def _base(name: str) -> str:
-    """The name without its unit."""
-    return _UNIT.sub("", name) or name
-
-
-# ---- The whole file ------------------------------------------------------------------------------
-
-_LOG = logging.getLogger(__name__)
-
-
-def parse_recipe(
-    text: str, *, source: str, name: str | None = None, folder: Path | None = None
-) -> RecipeTemplate:
-    """The template in YAML `text`.
-
-    source: stands before the line number in messages. name: the recipe's, where the text gives
-    none. folder: where the files that the text names lie; without it, it can name none.
-
-    Raises:
-        RecipeError: anything is wrong with the text; one line for each problem.
-    """
-    problems = Problems(source)
-    tree = read_tree(text, problems)
-    if isinstance(tree, ScalarNode) and tree.value is None:
-        raise problems.fail(1, EMPTY)
-    if not isinstance(tree, MapNode):
-        raise problems.fail(tree.line, f"a recipe is a mapping of fields; got {show(tree)}")
-    _check_version(tree, problems)
-    return _Compiler(problems, folder).template(tree, source, name)
-
-
-def _check_version(tree: MapNode, problems: Problems) -> None:
-    """A later format may well rename fields, so nothing else is said about such a file."""
-    if "version" not in tree.entries:
-        return
-    line, node = tree.entries["version"]
-    value = node.value if isinstance(node, ScalarNode) else None
-    if type(value) is not int or value != VERSION:
-        text = f"version = {show(node)}: this package reads version {VERSION} of the format"
-        raise problems.fail(line, text)
-
-
-class _Compiler:
-    def __init__(self, problems: Problems, folder: Path | None) -> None:
-        self._problems, self._folder = problems, folder
-        self._fields = _FieldReader(problems, folder)
-        self._values: dict[str, Value] = {}
-        self._effects: dict[str, float] = {}
-        self._lists: dict[str, int] = {}
-
-    def template(self, tree: MapNode, source: str, file_name: str | None) -> RecipeTemplate:
-        """The template of a whole file; raises all that was found wrong."""
-        self._section(tree, root(), "", line=1)
-        name = self._take("name", file_name)
-        if "name" not in tree.entries and not root().fields["name"].accepts(name):
-            allowed = root().fields["name"].allowed()
-            text = f"the file's name, {short(str(name))!r}, cannot serve as it; add 'name: ...'"
-            self._problems.add(1, f"name: {text}, {allowed}")
-        seed, first = int(self._take("seed")), int(self._take("variant"))
-        variants = int(self._take("variants"))
-        if not root().fields["variant"].accepts(first + variants - 1):
-            line = tree.entries["variant"][0]
-            self._problems.add(line, f"variant = {first}: too large with variants = {variants}")
-        self._problems.raise_if_any()
-        self._values.pop("version", None)
-        if variants > 1 and not self._differs():
-            text = "%s: variants = %d, but no field has a range: all have the same numbers"
-            _LOG.warning(text, source, variants)
-        return RecipeTemplate(
-            name=str(name),
-            source=source,
-            seed=seed,
-            variants=variants,
-            first_variant=first,
-            values=tuple(self._values.items()),
-            effects=tuple(self._effects.items()),
-            lists=tuple(self._lists.items()),
-            folder=self._folder,
-        )
-
-    def _take(self, key: str, absent: str | None = None) -> Any:
-        """The value of a top field, which is no part of what is drawn."""
-        value = self._values.pop(key, None)
-        if isinstance(value, Fixed):
-            return value.value
-        return {**root().fields, **root().extra}[key].default if absent is None else absent
-
-    def _differs(self) -> bool:
-        drawn = any(value.is_range for value in self._values.values())
-        return drawn or any(0 < probability < 1 for probability in self._effects.values())
-
-    def _section(
-        self, node: Node, spec: SectionSpec, path: str, line: int
-    ) -> dict[str, Value | Items]:
-        """Read a mapping; its fields' values, for the rules of the section that holds it.
-
-        path: the section's, with numbers in place of the [] of lists. line: the one of its key.
-        """
-        given: dict[str, Value | Items] = {}
-        if isinstance(node, ScalarNode) and node.value is None and spec.max_items is None:
-            return given  # 'weather:' with nothing below it: it is empty, an effect absent
-        if isinstance(node, ScalarNode) and spec.shorthand is not None:
-            value = self._fields.literal(node, spec.fields[spec.shorthand].without_null, path)
-            if value is not None:
-                given[spec.shorthand] = self._values[join(path, spec.shorthand)] = value
-            return given
-        if not isinstance(node, MapNode):
-            text = f"{path} = {show(node)}: must be a mapping, with {', '.join(spec.known)}"
-            self._problems.add(node.line, text)
-            return given
-        found_before = len(self._problems)
-        if spec.effect:
-            self._effects[path] = 1.0
-        for key, (key_line, child) in node.entries.items():
-            value = self._entry(child, spec, key, join(path, key), key_line)
-            if value is not None:
-                given[key] = value
-        for name, field in spec.fields.items():
-            if field.required and name not in node.entries:
-                self._problems.add(line, f"{join(path, name)}: must be given, {field.allowed()}")
-        if path and len(self._problems) == found_before:
-            for text in broken_rules(spec, given):
-                self._problems.add(line, f"{path}: {text}")
-        return given
-
-    def _entry(
-        self, node: Node, spec: SectionSpec, key: str, path: str, line: int
-    ) -> Value | Items | None:
-        """Read what stands under a key; None where the section's rules do not ask for it."""
-        below = spec.sections.get(key)
-        if below is not None and below.max_items is not None:
-            return self._list(node, below, below.max_items, path)
-        if below is not None:
-            self._section(node, below, path, line)
-        elif key in spec.fields:
-            field = spec.fields[key]
-            read = self._fields.parse if field.rangeable else self._fields.literal
-            if (value := read(node, field, path)) is not None:
-                self._values[path] = value
-            return value
-        elif key in spec.extra:
-            self._extra(node, spec, key, path)
-        else:
-            shown = path.removesuffix(key) + short(key)
-            self._problems.add(line, f"{shown}: {unknown_key(key, spec)}")
-        return None
-
-    def _list(self, node: Node, spec: SectionSpec, most: int, path: str) -> Items | None:
-        if isinstance(node, ScalarNode) and node.value is None:
-            return None
-        if not isinstance(node, ListNode) or len(node.items) > most:
-            allowed = f"up to {most} mappings, each with {', '.join(spec.known)}; or null"
-            self._problems.add(node.line, f"{path} = {show(node)}: must be a list of {allowed}")
-            return None
-        self._lists[path] = len(node.items)
-        mappings = [
-            self._section(item, spec, f"{path}[{index}]", item.line)
-            for index, item in enumerate(node.items)
-        ]
-        return Items(tuple(mappings))
-
-    def _extra(self, node: Node, spec: SectionSpec, key: str, path: str) -> None:
-        value = self._fields.literal(node, spec.extra[key], path)
-        if value is not None and spec.effect and key == "probability":
-            self._effects[spec.path] = as_number(value.value)
-        elif value is not None:
-            self._values[path] = value

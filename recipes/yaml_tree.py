@@ -157,7 +157,7 @@ class _Builder:
             text = f"the tag {short(str(event.tag))!r}: tags are not allowed"
             raise self._problems.fail(line, text)
         if isinstance(event, yaml.ScalarEvent):
-            value = plain_value(event.value) if event.style is None else event.value
+            value = plain_value(event.value) if event.implicit[0] else event.value
             node = ScalarNode(line, event.value, value)
             if event.anchor is not None:
                 self._anchors[event.anchor] = node

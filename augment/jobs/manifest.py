@@ -33,14 +33,8 @@ pc: Any = pyarrow.compute  # type checkers do not see the functions that it make
 
 TRAILING = {
     "seed": pa.int64(),
-    "recipe": pa.string(),
-    "recipe_hash": pa.string(),
-    "trajectory": pa.string(),
-    "version": pa.string(),
-    "backend": pa.string(),
-    "checksum": pa.string(),
-    "status": pa.string(),
-    "message": pa.string(),
+    **dict.fromkeys(("recipe", "recipe_hash", "trajectory", "version", "backend"), pa.string()),
+    **dict.fromkeys(("checksum", "status", "message"), pa.string()),
 }
 # Columns of the first release; a row without one of the others has none.
 _FIRST = {
@@ -60,23 +54,14 @@ Row = Mapping[str, Any]
 def leading_columns() -> dict[str, pa.DataType]:
     """In the order of the file; the numbers of the effects follow, then TRAILING."""
     words = [name for name, column in columns_of_effects().items() if not column.is_number]
+    text, whole = pa.string(), pa.int64()
     return {
-        "scene": pa.string(),
-        "source": pa.string(),
-        "variant": pa.string(),
-        "frame": pa.int64(),
-        "camera": pa.string(),
-        "timestamp_ns": pa.int64(),
-        **{f"{kind}_path": pa.string() for kind in path_kinds()},
-        "width": pa.int64(),
-        "height": pa.int64(),
-        "surface": pa.string(),
-        "lidar": pa.string(),
-        "lidar_note": pa.string(),
-        **dict.fromkeys(words, pa.string()),
-        "quality": pa.string(),
-        "render_scale": pa.float64(),
-        "settings": pa.string(),
+        **dict.fromkeys(("scene", "source", "variant"), text),
+        **{"frame": whole, "camera": text, "timestamp_ns": whole},
+        **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
+        **{"width": whole, "height": whole},
+        **dict.fromkeys(("surface", "lidar", "lidar_note", *words, "quality"), text),
+        **{"render_scale": pa.float64(), "settings": text},
     }
 
 
@@ -125,15 +110,18 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
 
 def rows_to_table(rows: Iterable[Row]) -> pa.Table:
     """Rows as a sorted table."""
-    rows, leading = list(rows), leading_columns()
-    names = {name for row in rows for name in row}
-    columns = {name: pa.array([row[name] for row in rows], kind) for name, kind in leading.items()}
-    for name in sorted(names - leading.keys() - TRAILING.keys()):
-        columns[name] = pa.array([row.get(name, _absent(name)) for row in rows], pa.float64())
-    columns |= {
-        name: pa.array([row[name] for row in rows], kind) for name, kind in TRAILING.items()
+    rows, others = list(rows), leading_columns().keys() | TRAILING.keys()
+    absent = {name: _absent(name) for name in sorted({n for row in rows for n in row} - others)}
+    columns = {
+        name: pa.array([row[name] if name in row else absent[name] for row in rows], kind)
+        for name, kind in _kinds(absent).items()
     }
     return _sorted(pa.table(columns))
+
+
+def _kinds(numbers: Iterable[str]) -> dict[str, pa.DataType]:
+    """All columns in their order. numbers: of effects."""
+    return {**leading_columns(), **dict.fromkeys(numbers, pa.float64()), **TRAILING}
 
 
 def read_manifest(out_dir: Path) -> pa.Table:
@@ -164,8 +152,7 @@ def parse_manifest(data: bytes, where: str) -> pa.Table:
 
 
 def _check_types(table: pa.Table, where: str) -> None:
-    numbers = dict.fromkeys(weather_columns(table), pa.float64())
-    requested = {**leading_columns(), **numbers, **TRAILING}
+    requested = _kinds(weather_columns(table))
     advice = "It was written by another program or version: write to another output folder"
     missing = sorted(requested.keys() - set(table.column_names))
     if missing:
@@ -283,8 +270,13 @@ def manifest_bytes(table: pa.Table) -> bytes:
 def concat_rows(tables: Sequence[pa.Table]) -> pa.Table:
     """Tables below each other, with the weather numbers of all; unsorted."""
     weather = sorted({name for table in tables for name in weather_columns(table)})
-    order = [*leading_columns(), *weather, *TRAILING]
-    return pa.concat_tables([_with_columns(table, weather).select(order) for table in tables])
+    whole = []
+    for table in tables:
+        for name in set(weather) - set(table.column_names):
+            absent = pa.array([_absent(name)] * table.num_rows, pa.float64())
+            table = table.append_column(name, absent)
+        whole.append(table.select([*_kinds(weather)]))
+    return pa.concat_tables(whole)
 
 
 def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
@@ -294,14 +286,6 @@ def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
     for scene, variant in variants:
         mask |= (scenes == scene) & (names == variant)
     return mask
-
-
-def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
-    for name in weather:
-        if name not in table.column_names:
-            absent = pa.array([_absent(name)] * table.num_rows, pa.float64())
-            table = table.append_column(name, absent)
-    return table
 
 
 def _with_later_columns(table: pa.Table) -> pa.Table:
