@@ -7,7 +7,6 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat
 from augment.kernels import count_occlusion
 from augment.labels import Boxes, LabelSource
+from augment.memo import memo_of
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 
@@ -462,17 +462,11 @@ class Instances:
         return np.where(numbers > MAX_INSTANCE, 0, numbers).astype(np.uint16)
 
 
-_remembered: WeakKeyDictionary[Scene, Instances] = WeakKeyDictionary()
-
-
 def instances_of(scene: Scene) -> Instances:
     """The numbers of the scene's objects, remembered as long as the scene lives."""
-    found = _remembered.get(scene)
-    if found is None:
-        actors = tuple(actor.track_id for actor in scene.actors)
-        frames = tuple(sorted(frame.index for frame in scene.frames))
-        found = _remembered[scene] = Instances(actors, frames, scene.labels)
-    return found
+    actors = tuple(actor.track_id for actor in scene.actors)
+    frames = tuple(sorted(frame.index for frame in scene.frames))
+    return memo_of(scene).get(("instances",), lambda: Instances(actors, frames, scene.labels))
 
 
 def with_boxes(

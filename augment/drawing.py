@@ -16,6 +16,7 @@ from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
 from augment.sky import Sky
+from augment.timing import timed
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,4 +58,5 @@ class LayerRenderer:
         )
         if later is None:
             return raster
-        return replace(raster, rgb=fog_raster(raster, camera, later))
+        with timed("smog on buffers"):
+            return replace(raster, rgb=fog_raster(raster, camera, later))

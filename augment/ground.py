@@ -19,13 +19,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from augment.errors import BackendUnavailable, SceneError
 from augment.labels import ClassifiesLidar
+from augment.memo import memo_of
 from augment.render.threads import select_thread_pool
 from augment.scene import Gaussians, Ground, GroundSource, Scene
 from augment.semantics import SemanticClass
@@ -299,13 +299,11 @@ _SWEEP_EVERY_M, _MIN_SWEEPS, _MAX_SWEEPS = 20.0, 3, 24
 _SOLID_OPACITY = 0.3  # fainter Gaussians are haze and leftovers of training
 _MAX_POINTS = 600_000
 
-_measured: WeakKeyDictionary[Scene, Ground] = WeakKeyDictionary()
-
 
 def ground_of(scene: Scene) -> Ground:
     """The road's heights under the scene's path: the same numbers every time.
 
-    A measurement is remembered for as long as the scene object lives. Sweeps are read from disk;
+    A measurement is kept in the scene's memo. Sweeps are read from disk;
     a drive of 100 m takes a second or two.
 
     Raises:
@@ -315,11 +313,13 @@ def ground_of(scene: Scene) -> Ground:
     check_metric_and_level(scene)
     if scene.ground is not None:
         return scene.ground
-    ground = _measured.get(scene)
-    if ground is None:
-        ground = _measured[scene] = _measure(scene)
+
+    def find() -> Ground:
+        ground = _measure(scene)
         logger.info("%s: %s", scene.name, ground_sentence(ground))
-    return ground
+        return ground
+
+    return memo_of(scene).get(("ground",), find)
 
 
 def check_metric_and_level(scene: Scene) -> None:

@@ -43,7 +43,9 @@ class SceneMemo:
         """The key's value; made, and kept, where it is not known. It must not refer to its owner,
         which it would keep alive.
         """
-        with self._making[key]:
+        with self._lock:
+            making = self._making[key]
+        with making:
             with self._lock:
                 if key in self._values:
                     self._values.move_to_end(key)

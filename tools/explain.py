@@ -16,21 +16,22 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
+from augment import effects
 from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.ground import ground_of, ground_sentence
 from augment.jobs.quality import resolve_quality, resolved_recipe
-from augment.plan import Plan, make_plan, plan_view, snow_layers_for
+from augment.plan import Plan, make_plan, plan_view
 from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.timing import stopwatch
 from augment.views import render_view
+from recipes.fields import replaced
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
 from tools.output import fill
 
-DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # stages that run the rasteriser
 FRAME = "frame"  # the whole view
 ROUNDS = 3  # of all views; the fastest of each counts
 VIEWS = 3
@@ -198,20 +199,26 @@ def explain_recipe(
     }
     if times and any(frame.cameras for frame in scene.frames):
         facts["times"] = dataclasses.asdict(measure_passes(resolved, scene))
-    return facts | {"views": _view_facts(plan, scene, resolved.render.scale, with_snow=times)}
+    return facts | {"views": _view_facts(plan, scene, resolved.render.scale, all_of_it=times)}
 
 
-def _view_facts(plan: Plan, scene: Scene, scale: float, *, with_snow: bool) -> dict[str, Any]:
-    """In how many of the scene's views water, snow and actors can be seen. with_snow: else the snow
-    is not laid, which takes long, and `snow` is None.
+def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> dict[str, Any]:
+    """In how many of the scene's views actors and what effects have masks of (water, snow) can be
+    seen; None of an effect that is absent, or that takes long to prepare, unless all_of_it.
     """
-    asked = plan if with_snow else dataclasses.replace(plan, snow=None)
+    slow = [] if all_of_it else [e.name for e in effects.EFFECTS if e.shares_files]
+    asked = plan.without(slow)
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     views = [plan_view(asked, scene, camera.scaled(scale)) for camera in cameras]
     return {
         "count": len(views),
-        "water": sum(view.water for view in views) if plan.flood is not None else None,
-        "snow": sum(view.snow for view in views) if asked.snow is not None else None,
+        **{
+            effect.mask: None
+            if asked.placed[effect.name].data is None
+            else sum(effect.name in view.names for view in views)
+            for effect in effects.EFFECTS
+            if effect.mask is not None
+        },
         "actors": sum(bool(view.actors) for view in views) if scene.actors else None,
         "mean_actors": sum(len(view.actors) for view in views) / len(views) if views else None,
         "scene_actors": len(scene.actors),
@@ -241,23 +248,26 @@ def measure_passes(recipe: Recipe, scene: Scene, views: int = VIEWS) -> PassTime
     """Renders a few views with a stopwatch. The recipe's scale and outputs count; files do not."""
     cameras = sample_views(scene, views)
     once_s = {}
-    if recipe.weather.snow is not None and (plan := make_plan(recipe, scene)).snow is not None:
-        start = time.perf_counter()
-        snow_layers_for(plan, scene)
-        once_s["snow: placement and layer"] = time.perf_counter() - start
+    plan = make_plan(recipe, scene)
+    for own in plan.active(scene):
+        if own.effect.shares_files:
+            start = time.perf_counter()
+            _ = own.prepared
+            once_s[plan.placed[own.effect.name].steps[0].name] = time.perf_counter() - start
     variants = {"": recipe} | without_folded(recipe, scene)
     runs = {name: _runs(scene, cameras, variant) for name, variant in variants.items()}
     times = {name: [_fastest(view) for view in views] for name, views in runs.items()}
     total = _sum(times[""], FRAME)
+    drawing_passes = ("rasterise", *(name for e in effects.EFFECTS for name in e.draws))
     passes = dict.fromkeys(name for best in times[""] for name in best if name != FRAME)
     share = {name: _sum(times[""], name) / total for name in passes}
     share["everything else"] = max(0.0, 1 - sum(share.values()))
     folded = {
-        name: (_sum(times[""], *DRAWING) - _sum(times[name], *DRAWING)) / total
+        name: (_sum(times[""], *drawing_passes) - _sum(times[name], *drawing_passes)) / total
         for name in variants
         if name
     }
-    drawing = [[_sum([run], *DRAWING) for run in view] for view in runs[""]]
+    drawing = [[_sum([run], *drawing_passes) for run in view] for view in runs[""]]
     return PassTimes(
         views=len(cameras),
         rounds=ROUNDS,
@@ -287,21 +297,8 @@ def sample_views(scene: Scene, count: int) -> list[Camera]:
 def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
     """The recipe without each of the passes that run inside the rasteriser, by the pass's name."""
     runs = {step.name for step in make_plan(recipe, scene).steps if step.runs}
-    weather, found = recipe.weather, dict[str, Recipe]()
-    if "style on the scene" in runs:
-        found["style on the scene"] = recipe.model_copy(update={"style": None})
-    if "smog per Gaussian" in runs:
-        found["smog per Gaussian"] = _with_weather(recipe, smog=None)
-    if "snow: placement and layer" in runs and weather.snow is not None:
-        found["snow: placement and layer"] = _with_weather(recipe, snow=None)
-        if "snow: light per pixel" in runs:
-            plain = weather.snow.model_copy(update={"shading": "per_splat"})
-            found["snow: light per pixel"] = _with_weather(recipe, snow=plain)
-    return found
-
-
-def _with_weather(recipe: Recipe, **changes: Any) -> Recipe:
-    return recipe.model_copy(update={"weather": recipe.weather.model_copy(update=changes)})
+    folded = {name: f for effect in effects.EFFECTS for name, f in effect.folded.items()}
+    return {name: replaced(recipe, *change) for name, change in folded.items() if name in runs}
 
 
 def _runs(scene: Scene, cameras: Sequence[Camera], recipe: Recipe) -> list[list[dict[str, float]]]:
@@ -332,12 +329,13 @@ def _sum(times: Sequence[Mapping[str, float]], *names: str) -> float:
 
 def explanation_text(facts: dict[str, Any]) -> str:
     """The facts of `explain_recipe` as a page of text."""
-    effects = {"style": facts["recipe"]["style"], **facts["recipe"]["weather"]}
+    sections = {"style": facts["recipe"]["style"], **facts["recipe"]["weather"]}
     return fill(
         "explain.txt",
         **facts,
-        numbers=[item for name, n in effects.items() if n for item in _flat(name, n)],
+        numbers=[item for name, n in sections.items() if n for item in _flat(name, n)],
         passes=_pass_lines(facts["plan"]["steps"], facts["times"]),
+        seen=[*(e.mask for e in reversed(effects.EFFECTS) if e.mask), "actors"],
         absent=[name for name, count in facts["views"].items() if count is None],
     )
 

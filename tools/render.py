@@ -10,7 +10,6 @@ import signal
 import time
 import uuid
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,12 +18,12 @@ import torch
 
 from adapters.base import open_scene, scenes_of
 from adapters.camera_files.paths import frames_from_path_file
+from augment import effects
 from augment.boxes import PlacedBoxes, find_occlusion
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.beam import weathered_sweep
+from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import ClimateGSError
 from augment.geometry import rigid
-from augment.ground import ground_of
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.blocks import JobStatus, read_status, shard_of
 from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
@@ -118,20 +117,21 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
         nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
         find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
-        flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
-        style = recipe.style if recipe.style and recipe.style.changes else None
-        is_clear = flood is None and snow is None and style is None
+        output = recipe.output
+        present = ((effect, effect.of(recipe)) for effect in effects.EFFECTS)
+        chosen = tuple(
+            e.kernels(section) if section is not None else None for e, section in present
+        )
+        is_clear = not any(chosen)
         for_boxes = uses_boxes(recipe) and output.depth == "none"
         if is_clear and not for_boxes and backend == CPU:  # `cpu.warm_up` has drawn one
             continue
         ids = output.semantic or output.instance
-        water, light = flood and flood.reflection, snow and snow.shading
-        style_parts = style and (style.applied_to, style.method)
-        shown = (output.depth, ids, output.surface, for_boxes)
-        kernels = (water, light, *shown, style_parts, recipe.lidar)
+        kernels = (*chosen, output.depth, ids, output.surface, for_boxes, recipe.lidar)
         if kernels not in seen:
             seen.add(kernels)
-            level_z_m = 0.0 if flood is None else flood.level_m
+            placed = make_plan(recipe, _warm_up_scene(0.0, with_labels=False)).placed.values()
+            level_z_m = next((p.water_level_z_m for p in placed if p.water_level_z_m), 0.0)
             scene = _warm_up_scene(level_z_m, with_labels=output.labels)
             render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
             if recipe.lidar == "weather":
@@ -354,8 +354,6 @@ def render_recipe(options: RenderOptions) -> int:
                 f"--layout source is for the scene's own frames"
             )
         recipes = recipes_for_source(scene, out, recipes, overwrite=options.overwrite)
-    if any(resolved.weather.flood is not None for resolved in recipes):
-        scene = replace(scene, ground=ground_of(scene))  # looked for once, not by every worker
     path = None
     if options.camera_path is not None:
         path = frames_from_path_file(options.camera_path, scene)

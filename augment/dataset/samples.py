@@ -27,7 +27,7 @@ camera's (OpenCV) x right, y down, z forward. The first pixel's centre is at (0.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import cv2
@@ -39,7 +39,8 @@ from torch.utils.data import get_worker_info
 from augment.boxes import PlacedBoxes, outline_boxes, shown_pixels
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat
-from augment.jobs.files import TABLES, BoxWeather, CameraRecord, depth_in_metres, visibility
+from augment.jobs.files import BoxWeather, CameraRecord, box_tables, depth_in_metres, visibility
+from augment.jobs.layout import mask_names
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import class_of_label
 
@@ -95,7 +96,7 @@ def box_tensors(
         quats = _turned(quats, world_from_frame)
     fractions = {
         name: torch.from_numpy(weather[kind][name].copy()) if kind in weather else None
-        for kind, table in TABLES.items()
+        for kind, table in box_tables().items()
         for name in table.sampled
     }
     return {
@@ -174,7 +175,6 @@ def _turned(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
 
 # ---- Batches of samples for a DataLoader ---------------------------------------------------------
 
-IMAGES = ("image", "depth", "semantic", "instance", "water", "snow")
 _MATRICES = ("K", "world_from_camera", "world_from_ego")
 
 
@@ -192,8 +192,9 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if "weathered" in first and "clean" in first:
         return {side: collate_frames([pair[side] for pair in samples]) for side in first}
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
-    for key in IMAGES:
-        if key not in ("water", "snow"):  # only such weather has these masks
+    masks = mask_names()
+    for key in ("image", *buffer_names()):
+        if key not in masks:  # only such weather has them
             _check_all_have(key, samples)
         batch[key] = stacked(batch[key])
     batch["camera"] = _cameras(batch["camera"])
@@ -254,44 +255,56 @@ def _whole(values: Sequence[Any]) -> Any:
 
 _WORLD = np.eye(4)
 ImageType = Literal["float32", "uint8"]
-BUFFERS = ("depth", "semantic", "instance", "water", "snow")
-LOADABLE = ("image", *BUFFERS, "boxes", "lidar")
-DEFAULT_LOAD = ("image", *BUFFERS, "boxes")  # sweeps are large, and few train on both
+
+
+def buffer_names() -> tuple[str, ...]:
+    """Images beside the picture: depth, semantic, instance, and the effects' masks."""
+    return ("depth", "semantic", "instance", *mask_names())
+
+
+def loadable() -> tuple[str, ...]:
+    """What samples can hold, by the names of `load`."""
+    return ("image", *buffer_names(), "boxes", "lidar")
 
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """What samples hold and how. load: of LOADABLE. box_frame: of boxes and LiDAR points."""
+    """What samples hold and how. load: of `loadable`. box_frame: of boxes and LiDAR points."""
 
-    image_type: ImageType = "float32"
-    load: frozenset[str] = frozenset(DEFAULT_LOAD)
-    box_frame: BoxFrame = "world"
+    image_type: ImageType
+    load: frozenset[str]
+    box_frame: BoxFrame
 
     @staticmethod
-    def checked(image_type: str, load: Collection[str], box_frame: str) -> SampleOptions:
-        """The options of these values. Raises ValueError: a value that there is not."""
+    def checked(
+        image_type: str = "float32", load: Collection[str] | None = None, box_frame: str = "world"
+    ) -> SampleOptions:
+        """The options of these values. load: None for all but sweeps, which are large, and few
+        train on both. Raises ValueError: a value that there is not.
+        """
+        if load is None:
+            load = set(loadable()) - {"lidar"}
         if image_type not in ("float32", "uint8"):
             raise ValueError(f"image_type must be 'float32' or 'uint8'; got {image_type!r}")
         if box_frame not in BOX_FRAMES:
             raise ValueError(f"box_frame must be one of {', '.join(BOX_FRAMES)}; got {box_frame!r}")
         # A single name is no collection of names, though its letters are one.
-        if isinstance(load, str) or not set(load) <= set(LOADABLE):
-            raise ValueError(f"load must be some of {', '.join(LOADABLE)}; got {load!r}")
+        if isinstance(load, str) or not set(load) <= set(loadable()):
+            raise ValueError(f"load must be some of {', '.join(loadable())}; got {load!r}")
         return SampleOptions(image_type, frozenset(load), box_frame)
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
     """Decoded images of one view. rgb: uint8 [H, W, 3]. depth: uint16 [H, W], steps of 1/256 m.
-    semantic: uint8 [H, W]. instance: uint16 [H, W]. water, snow: uint8 [H, W], 0 or 255.
+    semantic: uint8 [H, W]. instance: uint16 [H, W]. masks: uint8 [H, W], 0 or 255, by name.
     """
 
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
     semantic: np.ndarray | None = None
     instance: np.ndarray | None = None
-    water: np.ndarray | None = None
-    snow: np.ndarray | None = None
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +332,7 @@ def make_sample(
 ) -> dict[str, Any]:
     """One sample as the module describes it. names: scene, variant, frame, recipe_hash, surface."""
     depth, semantic, instance = pixels.depth, pixels.semantic, pixels.instance
-    water, snow = pixels.water, pixels.snow
+    masks = {name: pixels.masks.get(name) for name in mask_names()}
     origins = {"ego": world_from_ego.numpy(), "camera": camera.world_from_camera.numpy()}
     placed = (options.box_frame, origins.get(options.box_frame, _WORLD))
     boxes, lidar = labels.boxes, labels.lidar
@@ -328,8 +341,7 @@ def make_sample(
         "depth": None if depth is None else torch.from_numpy(depth_in_metres(depth)),
         "semantic": None if semantic is None else torch.from_numpy(semantic),
         "instance": None if instance is None else torch.from_numpy(instance.astype(np.int32)),
-        "water": None if water is None else torch.from_numpy(water == 255),
-        "snow": None if snow is None else torch.from_numpy(snow == 255),
+        **{n: None if mask is None else torch.from_numpy(mask == 255) for n, mask in masks.items()},
         "boxes": None
         if boxes is None
         else box_tensors(boxes, labels.box_weather or {}, *placed, instances=labels.instances),
@@ -454,7 +466,7 @@ def torchvision_sample(
         target["visible_fraction"] = boxes["visible_fraction"][chosen]
     if shown is not None:
         target["masks"] = wrap["mask"](shown[chosen])
-    buffers = (key for key in IMAGES if key != "image" and sample[key] is not None)
+    buffers = (key for key in buffer_names() if sample[key] is not None)
     target |= {key: wrap["mask"](sample[key]) for key in buffers}
     return wrap["image"](sample["image"]), target
 

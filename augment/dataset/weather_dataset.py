@@ -23,23 +23,23 @@ from torch.utils.data import Dataset, get_worker_info
 
 from augment.cameras import Camera, Frame
 from augment.dataset.samples import (
-    BUFFERS,
-    DEFAULT_LOAD,
-    LOADABLE,
     BoxFrame,
     ImageType,
     Labels,
     Pixels,
     SampleOptions,
+    buffer_names,
+    loadable,
     make_sample,
 )
+from augment.effects import share_effects
 from augment.errors import BackendUnavailable, OutputError
 from augment.jobs.files import (
-    TABLES,
     BoxNumbers,
     CameraRecord,
     SceneIndex,
     View,
+    box_tables,
     camera_record,
     check_view,
     decode_image,
@@ -52,15 +52,15 @@ from augment.jobs.files import (
     select_frames,
     uses_boxes,
 )
-from augment.jobs.layout import PATH_KINDS, resolve_inside, variant_name
+from augment.jobs.layout import mask_names, path_kinds, resolve_inside, variant_name
 from augment.jobs.manifest import OK, concat_rows, read_finished, weather_columns
-from augment.jobs.prepare import find_snow_support, remember, snow_of_recipe, store_maps
 from augment.jobs.processes import choose_backend
 from augment.jobs.quality import resolve_quality
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.tables import FrameBoxes, read_boxes, read_lidar
 from augment.jobs.worker import Renderer, default_renderer
 from augment.labels import LidarSweep
+from augment.memo import memo_of
 from augment.render.buffers import CUDA
 from augment.scene import Scene
 from recipes.files import with_digest
@@ -80,7 +80,7 @@ class SceneDataset(Dataset):
     The pixels are those of the files: depth is in steps of 1/256 m, and where the recipe writes
     JPEG the image passes through JPEG in memory. `paths` holds only None.
 
-    Where the recipe's snow can lie and which maps its style takes are found here, once for all
+    What all images share (where snow can lie, the maps of a style) is found here, once for all
     samples and worker processes. So are the settings of a recipe whose quality has still to choose
     them: `recipe` has them in numbers.
 
@@ -107,12 +107,12 @@ class SceneDataset(Dataset):
         backend: str = "auto",
         image_type: ImageType = "float32",
         renderer: Renderer | None = None,
-        load: Collection[str] = DEFAULT_LOAD,
+        load: Collection[str] | None = None,
         box_frame: BoxFrame = "world",
         transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         self.options = SampleOptions.checked(image_type, load, box_frame)
-        if "lidar" in load:
+        if load is not None and "lidar" in load:
             raise ValueError(
                 "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
                 "and read it with WeatherDataset"
@@ -131,19 +131,14 @@ class SceneDataset(Dataset):
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
 
-        snow = snow_of_recipe(self.recipe)
-        self._bed = None if snow is None else find_snow_support(scene, snow, backend=self._backend)
-        self._maps = store_maps(scene, [self.recipe])
+        share_effects(scene, [self.recipe], backend=self._backend)
+        self._memo = memo_of(scene).shared()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """In another process the scene is another object, which knows of no bed and no maps yet."""
+        """In another process the scene is another object, whose memo is empty."""
         self.__dict__.update(state)
         self._process = os.getpid()
-        snow = snow_of_recipe(self.recipe)
-        if snow is not None and self._bed is not None:
-            remember(self.scene, snow, self._bed)
-        for maps in self._maps:
-            maps.take_over(self.scene)
+        memo_of(self.scene).update(self._memo)
 
     def __len__(self) -> int:
         return len(self._items)
@@ -172,7 +167,7 @@ class SceneDataset(Dataset):
             world_from_ego=world_from_ego,
             labels=labels if "boxes" in load else Labels(),
             weather={n: v for n, v in recipe.columns().items() if isinstance(v, float)},
-            paths=dict.fromkeys(PATH_KINDS),
+            paths=dict.fromkeys(path_kinds()),
             names={
                 "scene": self.scene.name,
                 "variant": variant_name(recipe),
@@ -190,10 +185,9 @@ class SceneDataset(Dataset):
             if output.image != "png":
                 rgb = decode_image(encode_image(rgb, output))
         depth = None if view.depth_m is None else quantise_depth(view.depth_m)
-        buffers = (depth, view.semantic, view.instance, view.water, view.snow)
-        return Pixels(
-            rgb, *(b if kind in load else None for kind, b in zip(BUFFERS, buffers, strict=True))
-        )
+        buffers = {"depth": depth, "semantic": view.semantic, "instance": view.instance}
+        masks = {name: mask for name, mask in view.masks.items() if name in load}
+        return Pixels(rgb, **{k: b for k, b in buffers.items() if k in load}, masks=masks)
 
     def _labelled(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
         """A view with the boxes of its frame, and these as the files of a job would have them.
@@ -380,7 +374,7 @@ class Rows:
         return [(o, scenes.values[s], variants.values[v]) for o, s, v in each], codes
 
     def has(self, kind: str) -> np.ndarray:
-        """bool [N]: the rows that name a file of a kind of `samples.LOADABLE`."""
+        """bool [N]: the rows that name a file of a kind of `samples.loadable`."""
         column = self.columns[f"{'labels' if kind == 'boxes' else kind}_path"]
         assert isinstance(column, Paths)
         there = np.array([name is not None for name in column.names.values], bool)
@@ -566,13 +560,7 @@ def _unreadable(file: str, why: str) -> OutputError:
 
 # ---- What the files of one manifest row hold -----------------------------------------------------
 
-_TYPES = {
-    "depth": np.uint16,
-    "semantic": np.uint8,
-    "instance": np.uint16,
-    "water": np.uint8,
-    "snow": np.uint8,
-}
+_TYPES = {"depth": np.uint16, "instance": np.uint16}  # others are of 8 bits
 
 
 class RowReader:
@@ -582,13 +570,15 @@ class RowReader:
         self.store, self.verify = store, verify
         self._files = StoredFiles(store)
         self._boxes = Companions(self._files, read_boxes)
-        self._box_weather = {k: Companions(self._files, table.read) for k, table in TABLES.items()}
+        self._box_weather = {
+            k: Companions(self._files, table.read) for k, table in box_tables().items()
+        }
         self._calibration = Companions(self._files, read_entries)
         self._sweeps = Companions(self._files, _read_one_sweep)
 
     def names(self, rows: Rows, row: int) -> dict[str, str | None]:
         """The row's files by kind, as they are called here."""
-        found = {kind: _parts(rows, row, kind) for kind in PATH_KINDS}
+        found = {kind: _parts(rows, row, kind) for kind in path_kinds()}
         return {
             k: None if parts is None else self._files.name(*parts) for k, parts in found.items()
         }
@@ -598,11 +588,11 @@ class RowReader:
         images = {}
         if "image" in load:
             images["rgb"] = self._image(rows, row)
-        for kind in BUFFERS:
+        for kind in buffer_names():
             parts = _parts(rows, row, kind) if kind in load else None
             if parts is not None:
                 images[kind] = self._decoded(
-                    parts, lambda data, k=kind: decode_png(data, _TYPES[k])
+                    parts, lambda data, k=kind: decode_png(data, _TYPES.get(k, np.uint8))
                 )
         size = (rows["height"][row], rows["width"][row])
         for kind, image in images.items():
@@ -614,7 +604,8 @@ class RowReader:
                     f"it is {image.shape[1]}x{image.shape[0]}, the manifest says "
                     f"{size[1]}x{size[0]}",
                 )
-        return Pixels(**images)
+        masks = {name: images.pop(name) for name in mask_names() if name in images}
+        return Pixels(**images, masks=masks)
 
     def camera(self, rows: Rows, row: int) -> tuple[CameraRecord, torch.Tensor]:
         """The row's camera, and world_from_ego, float64 [4, 4]."""
@@ -712,8 +703,6 @@ def _read_one_sweep(path: Path) -> tuple[LidarSweep]:
 # ---- The dataset ---------------------------------------------------------------------------------
 
 _NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")
-# What samples may lack beside others that have it: only such weather has these masks.
-_MASKS = ("water", "snow")
 Sample = dict[str, Any]
 
 
@@ -752,7 +741,7 @@ class WeatherDataset(Dataset):
         frames: Collection[int] | None = None,
         image_type: ImageType = "float32",
         verify: bool = True,
-        load: Collection[str] = DEFAULT_LOAD,
+        load: Collection[str] | None = None,
         box_frame: BoxFrame = "world",
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
@@ -769,7 +758,7 @@ class WeatherDataset(Dataset):
 
     def given(self) -> frozenset[str]:
         """What of `load` the samples have, the masks of water and snow left out."""
-        load = self.options.load.difference(_MASKS)
+        load = self.options.load.difference(mask_names())
         return frozenset(k for k in load if k == "image" or self.rows.has(k).any())
 
     @property
@@ -856,7 +845,7 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
     """
     groups, codes = rows.variants()
     lacking = {}
-    for kind in sorted(set(load).difference(_MASKS, ["image"])):
+    for kind in sorted(set(load).difference(mask_names(), ["image"])):
         given = np.bincount(codes[rows.has(kind)], minlength=len(groups)) > 0
         if given.any() and not given.all():
             lacking[kind] = [group for group, there in zip(groups, given, strict=True) if not there]
@@ -865,7 +854,7 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
     message = "; ".join(
         f"{kind}: none in {_listed(found, uris)}" for kind, found in lacking.items()
     )
-    kept = tuple(kind for kind in LOADABLE if kind in load and kind not in lacking)
+    kept = tuple(kind for kind in loadable() if kind in load and kind not in lacking)
     raise ValueError(
         f"load asks for what only a part of the outputs has, so that batches would not stack. "
         f"{message}. Leave it out (load={kept!r}), choose outputs, scenes or variants that are "

@@ -1,0 +1,68 @@
+"""The effects, in the order in which they are applied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from augment.cameras import Camera
+from augment.effects.effect import Effect
+from augment.effects.flood.effect import FloodEffect
+from augment.effects.smog import SmogEffect
+from augment.effects.snow.effect import SnowEffect
+from augment.effects.style.effect import StyleEffect
+from augment.scene import Scene
+from recipes.schema import Recipe, add_section, remove_section
+
+# Style colours what stands in the weather; then come the air before it, snow on it, water over it.
+EFFECTS: tuple[Effect, ...] = (StyleEffect(), SmogEffect(), SnowEffect(), FloodEffect())
+
+
+def share_effects(
+    scene: Scene,
+    recipes: Sequence[Recipe],
+    *,
+    cameras: Sequence[Camera] | None = None,
+    folder: Path | None = None,
+    backend: str = "auto",
+    progress: bool = False,
+    only_files: bool = False,
+) -> None:
+    """Work out what all images of the recipes share, once: it is then in the scene's memo, whose
+    `shared()` other processes take over.
+
+    cameras: all that a camera path has, or None for the scene's: never a selection, so that no
+    image depends on what else is rendered. folder: for what lies in files, which later jobs find;
+    None to keep it in memory. backend: that renders the images. progress: bars on stderr.
+    only_files: nothing but what lies in files.
+
+    Raises:
+        SceneError, StyleError: an effect cannot be had in this scene.
+    """
+    for effect in EFFECTS:
+        if effect.shares_files or not only_files:
+            effect.share(scene, recipes, cameras, folder=folder, backend=backend, progress=progress)
+
+
+def add_effect(effect: Effect) -> None:
+    """Apply one more effect after those that are there, and let recipes speak of it.
+
+    Whoever walks the effects reads `augment.effects.EFFECTS` anew. Worker processes know the effect
+    if a module that they import adds it.
+
+    Raises:
+        ValueError: there is an effect of this name already.
+    """
+    global EFFECTS
+    if any(effect.name == other.name for other in EFFECTS):
+        raise ValueError(f"there is an effect {effect.name!r} already")
+    add_section(effect.section, effect.model)
+    EFFECTS = (*EFFECTS, effect)
+
+
+def remove_effect(name: str) -> None:
+    """Undo `add_effect`."""
+    global EFFECTS
+    (gone,) = (effect for effect in EFFECTS if effect.name == name)
+    remove_section(gone.section)
+    EFFECTS = tuple(effect for effect in EFFECTS if effect is not gone)

@@ -1,20 +1,119 @@
-"""Smog, haze and fog as an effect of a recipe, and the labels of boxes in it."""
+"""Smog, haze and fog: the fog of a recipe in a scene, and what it does to boxes and LiDAR.
+
+The physics of light is augment.render.fog.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
-from augment.labels import Boxes
-from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.drawing import LayerRenderer
+from augment.effects.effect import Active, Effect, EffectView, Placed, Step, skipped
+from augment.effects.lidar.beam import Echoes, LidarModel, signal
+from augment.effects.lidar.codes import LOST, SCATTERED
+from augment.errors import SceneError
+from augment.jobs.box_tables import BoxTable
+from augment.render.buffers import EXPECTED_DEPTH
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
+from augment.scene import Scene
+from recipes.schema import Recipe, Smog
+from recipes.smog import KOSCHMIEDER
 
-# ---- How much of the light of labelled boxes comes through the smog before them ------------------
-# Boxes come in the dataset's world, which lies `world_origin_m` off the scene's. NumPy on one
-# thread: the numbers depend on no thread count.
+# ---- The effect ----------------------------------------------------------------------------------
+
+PER_GAUSSIAN, ON_BUFFERS, SKY = "smog per Gaussian", "smog on buffers", "sky"
+
+
+@dataclass(frozen=True)
+class PlacedSmog:
+    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat."""
+
+    fog: Fog
+    on_buffers: bool
+
+
+class SmogEffect(Effect):
+    """Smog, haze and fog, in front of the scene and its sky."""
+
+    name, section, model = "smog", "weather.smog", Smog
+    folded: ClassVar = {PER_GAUSSIAN: ("weather.smog", None)}
+    # transmittance: 0 to 1, of the smog between camera and box; NaN of a box whose numbers are not
+    # finite. pixels: those it is the mean of; it is an estimate of none, or where NOT_COUNTED.
+    table = BoxTable(
+        name="box_smog",
+        file="labels/smog.parquet",
+        kind="box smog",
+        columns={"transmittance": np.float64, "pixels": np.int64},
+        sampled=("transmittance",),
+        visible=lambda numbers: numbers["transmittance"],
+    )
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        smog = self.of(recipe)
+        fog, reason = _in_heights(smog, scene)
+        if fog is None:
+            return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS), reason))
+        on_buffers = smog.model == "deferred"
+        other = "weather.smog.model chooses the other way"
+        sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
+        if fog.scale_height_m is None:
+            sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
+        steps = (
+            Step(PER_GAUSSIAN, not on_buffers, other if on_buffers else reason),
+            Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
+            sky,
+        )
+        buffers = frozenset({EXPECTED_DEPTH}) if on_buffers else frozenset()
+        return Placed(PlacedSmog(fog, on_buffers), steps, buffers)
+
+    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+        return replace(layers, fog=own.data.fog, fog_on_buffers=own.data.on_buffers)
+
+    def measure(
+        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+    ) -> dict[str, np.ndarray]:
+        data = view.placed.data
+        fog = None if data is None else data.fog
+        found = box_transmittance(placed, camera, fog, view.depth_m, view.water_level_z_m)
+        return {"transmittance": found.transmittance, "pixels": found.pixels}
+
+    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+        fog_echoes(echoes, own.data.fog, rng)
+
+
+def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
+    """The smog in the scene's heights, or None where it would change nothing; and why."""
+    if smog is None:
+        return None, "the recipe has no smog"
+    if smog.sigma_per_m == 0:
+        return None, "the smog has no density, so it changes nothing"
+    base_z_m = 0.0
+    reason = f"extinction {smog.sigma_per_m:.6g}/m, model {smog.model}"
+    if smog.scale_height_m is not None:
+        if scene.ground_z_m is None:
+            raise SceneError(
+                f"weather.smog.scale_height_m = {smog.scale_height_m} needs the road's height, "
+                f"which scene {scene.name!r} ({scene.source}) does not know; remove "
+                f"scale_height_m, or add ground_z=HEIGHT to the scene's URI"
+            )
+        base_z_m = scene.ground_z_m + smog.base_height_m
+        reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
+    if not scene.has_metric_scale:
+        reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
+    return Fog(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
+
+
+# ---- On labelled boxes ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +127,7 @@ class BoxTransmittance:
 
 
 def box_transmittance(
-    boxes: Boxes,
-    world_origin_m: Float64[np.ndarray, "3"],
+    placed: PlacedBoxes,
     camera: Camera,
     medium: Fog | None,
     surface_depth_m: Float32[np.ndarray, "H W"] | None,
@@ -42,7 +140,6 @@ def box_transmittance(
     its corners and its centre. water_level_z_m: scene world; an eye in the water looks at what
     else is in it through no smog, as `flood_view` draws it.
     """
-    placed = PlacedBoxes.of(boxes, world_origin_m)
     pixels = np.full(len(placed), NOT_COUNTED)
     transmittance = np.ones(len(placed))
     if medium is None:
@@ -69,3 +166,153 @@ def box_transmittance(
             pixels[number] = len(rows)
             transmittance[number] = float(transmittance_to(distance, point_z).mean())
     return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
+
+
+# ---- On a LiDAR sweep ----------------------------------------------------------------------------
+# Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse Weather", ICCV. The echo
+# of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau:
+#
+#     hard, from a surface at R0   (rho / pi) exp(-2 T(R0)) / R0^2
+#     soft, of droplets, at R      beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
+#                                  r = R - x, w = c tau / 2
+#
+# T is the optical depth, alpha the extinction, beta = 0.046 / MOR the backscatter, MOR = ln(20) /
+# alpha the meteorological optical range; xi rises from 0 at overlap_from_m to 1 at overlap_full_m.
+# Ranges count from the pulse's middle, so that a surface at R0 is reported at R0 and not at R0 + w.
+# The smog is that of the images, thinned to the LiDAR's wavelength (`wavelength_factor`).
+
+VISIBLE_UM = 0.55
+BACKSCATTER_MOR = 0.046  # beta x MOR, 1/sr
+MOR_OPTICAL_DEPTH = math.log(20)
+# Fog is clumpy: the backscatter of what a pulse fills varies about its mean as a gamma variate of
+# this shape, by half of it.
+CLUMPS = 4.0
+_STEP_M, _FAR_M = 0.02, 15.0  # of the soft echo, tabulated
+_PULSE_STEPS = 150
+_DENSITY_STEP = 0.02  # of log alpha, within which the soft echo is one
+
+# q(V) of Kim, McArthur and Korevaar (2001), V in km: sigma ~ wavelength^-q. Least V, slope, offset.
+_KIM = ((50.0, 0.0, 1.6), (6.0, 0.0, 1.3), (1.0, 0.16, 0.34), (0.5, 1.0, -0.5), (0.0, 0.0, 0.0))
+
+
+def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> float:
+    """Extinction at the LiDAR's wavelength over that of visible light (0.55 um).
+
+    (wavelength / 0.55 um)^-q with q by the visibility, see _KIM; measurements scatter by some 20 %.
+    At 905 nm: 1 in fog, whose droplets are larger than either wavelength, 0.78 at 1 km, 0.52 at 6.
+    """
+    if extinction_per_m <= 0:
+        return 1.0
+    visibility_km = KOSCHMIEDER / extinction_per_m / 1000
+    _, slope, offset = next(row for row in _KIM if visibility_km > row[0] or row[0] == 0)
+    return (wavelength_um / VISIBLE_UM) ** -(slope * visibility_km + offset)
+
+
+def extinction_at(medium: Fog, z_m: np.ndarray) -> np.ndarray:
+    """alpha [N] at heights, 1/metre."""
+    if medium.scale_height_m is None:
+        return np.full(len(z_m), medium.sigma_per_m)
+    height = (z_m - medium.base_z_m) / medium.scale_height_m
+    return medium.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
+
+
+class SoftEcho(NamedTuple):
+    """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as `signal`.
+    strongest [K]: the greatest up to each range. share [K]: of the whole echo, up to each range.
+    """
+
+    ranges_m: np.ndarray
+    signal: np.ndarray
+    strongest: np.ndarray
+    share: np.ndarray
+
+
+def soft_response(alpha_per_m: float, echoes_m: np.ndarray, model: LidarModel) -> np.ndarray:
+    """The soft integral, without near_gain, at reported ranges [K]; midpoint rule over the pulse.
+
+    An echo at R is reported at R - w. Droplets nearer than overlap_from_m are not seen.
+    """
+    w = model.pulse_m
+    x = (np.arange(_PULSE_STEPS) + 0.5) * (2 * w / _PULSE_STEPS)
+    r = echoes_m[:, None] + w - x
+    seen = np.clip(
+        (r - model.overlap_from_m) / (model.overlap_full_m - model.overlap_from_m), 0.0, 1.0
+    )
+    r = np.maximum(r, model.overlap_from_m)
+    echo = np.sin(math.pi * x / (2 * w)) ** 2 * np.exp(-2 * alpha_per_m * r) * seen / r**2
+    beta = BACKSCATTER_MOR * alpha_per_m / MOR_OPTICAL_DEPTH
+    return beta * echo.sum(1) * (2 * w / _PULSE_STEPS)
+
+
+@functools.lru_cache(maxsize=256)
+def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
+    """The soft echo tabulated; what comes from beyond _FAR_M is too weak to count."""
+    ranges = np.arange(model.overlap_from_m, _FAR_M, _STEP_M)
+    response = model.near_gain * soft_response(alpha_per_m, ranges, model)
+    total = np.cumsum(response)
+    share = total / max(total[-1], 1e-300)
+    return SoftEcho(ranges, response, np.maximum.accumulate(response), share)
+
+
+class Scatter(NamedTuple):
+    """The strongest echo of the droplets before each return. signal [N]: as `signal` gives it, 0
+    where none can be. ranges_m [N]: where it is reported.
+    """
+
+    signal: np.ndarray
+    ranges_m: np.ndarray
+
+
+def scatter_before(
+    medium: Fog,
+    eyes_z_m: np.ndarray,
+    ends_m: np.ndarray,
+    model: LidarModel,
+    rng: np.random.Generator,
+) -> Scatter:
+    """What comes back from the smog before surfaces at ends_m [N].
+
+    Its strength varies with the clumps that a beam meets (CLUMPS); the range of the strongest is
+    drawn from the echo's shape. N numbers of each are drawn whatever the density, so that denser
+    smog differs by nothing else.
+    """
+    count = len(ends_m)
+    clump = rng.standard_gamma(CLUMPS, count) / CLUMPS
+    where = rng.random(count)
+    alpha = extinction_at(medium, eyes_z_m)
+    out = Scatter(np.zeros(count), np.zeros(count))
+    usable = (alpha > 0) & (ends_m > model.overlap_from_m) & np.isfinite(alpha)
+    group = np.rint(np.log(np.where(usable, alpha, 1.0)) / _DENSITY_STEP).astype(np.int64)
+    low, high = (group[usable].min(), group[usable].max()) if usable.any() else (0, -1)
+    for number in range(low, high + 1):
+        rows = np.flatnonzero(usable & (group == number)) if high > low else np.flatnonzero(usable)
+        if not len(rows):
+            continue
+        is_uniform = medium.scale_height_m is None
+        mean = medium.sigma_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
+        echo = soft_echo(float(mean), model)
+        last = ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64)
+        last = np.clip(last, 0, len(echo.ranges_m) - 1)
+        out.signal[rows] = echo.strongest[last] * clump[rows]
+        at = np.interp(where[rows] * echo.share[last], echo.share, echo.ranges_m)
+        out.ranges_m[rows] = np.minimum(at, ends_m[rows])
+    return out
+
+
+def fog_echoes(echoes: Echoes, medium: Fog, rng: np.random.Generator) -> None:
+    """Echoes seen through the fog, or lost to its own. medium: of visible light."""
+    model = echoes.model
+    factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
+    medium = dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
+    eyes_z, air = echoes.origins[:, 2], echoes.air_m
+    ends_z = eyes_z + air * echoes.directions[:, 2]
+    tau = optical_depth_of_arrays(medium, air, eyes_z, ends_z, series_below=1e-4)
+    echoes.gain *= np.exp(-2 * tau)
+    scatter = scatter_before(medium, eyes_z, air, model, rng)
+    echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
+    wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
+    rows = np.flatnonzero(wins)
+    ranges = scatter.ranges_m[rows]
+    # As reflectance of a surface whose echo from that range is as strong.
+    white = signal(np.ones(len(rows)), np.maximum(ranges, 1e-3))
+    echoes.replace(rows, ranges, scatter.signal[rows] / white, SCATTERED)

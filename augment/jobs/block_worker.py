@@ -17,24 +17,25 @@ from pathlib import Path, PurePosixPath
 
 import pyarrow as pa
 
+from augment import effects
 from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
 from augment.jobs.atomic import remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
+from augment.jobs.files import box_tables
 from augment.jobs.layout import (
-    PATH_KINDS,
     STATE_FOLDER,
     folder_name,
     item_paths,
+    path_kinds,
     reading_back,
     variant_folder,
 )
 from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
-from augment.jobs.prepare import snow_of_recipe, store_snow_supports
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
 from augment.jobs.quality import resolve_quality_for
-from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.render_job import FILE_FOLDERS, RenderJob, SceneLoader, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
 from augment.jobs.worker import Outcome, Renderer, WorkTimes, describe
 from augment.scene import Scene
@@ -45,9 +46,14 @@ from recipes.schema import Recipe
 # sees them before the block's rows follow in one step. What belongs to several images lies by
 # blocks, so that no two write one file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 
-_OF_BLOCK = ("labels", "box_2d", "box_smog", "box_water", "box_snow", "calibration")
-_OF_IMAGE = tuple(kind for kind in PATH_KINDS if kind not in _OF_BLOCK)
-_OF_VARIANT = ("*/*/recipe.yaml", "*/*/style/*")
+_OF_VARIANT = ("*/*/recipe.yaml", *(f"*/*/{folder}/*" for folder in FILE_FOLDERS))
+
+
+def _of_block() -> set[str]:
+    """Kinds of files that belong to several images."""
+    return {"labels", "calibration", *box_tables()}
+
+
 REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
 
 
@@ -70,9 +76,9 @@ class Publisher:
         if outcome.status != OK or isinstance(self._store, LocalStore):
             return
         recipe = self._block.recipe
-        paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame).columns()
-        for kind in _OF_IMAGE:
-            path = paths[f"{kind}_path"]
+        paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame)
+        for kind in paths.keys() - _of_block():
+            path = paths[kind]
             if path is None or path in self._sent:  # cameras of a frame share its sweep
                 continue
             if kind != "lidar" or outcome.lidar:
@@ -82,10 +88,10 @@ class Publisher:
         """Send what is left, then make the block visible."""
         rows = read_manifest(self._folder)
         new = _renamed(rows, self._block.file_stem)
-        # The recipe, and the files of its style: every block of a variant has the same.
+        # The recipe, and the files that it names: every block of a variant has the same.
         of_variant = [p for glob in _OF_VARIANT for p in sorted(self._folder.glob(glob))]
         left = {p: p for p in (p.relative_to(self._folder).as_posix() for p in of_variant)}
-        for kind in PATH_KINDS:
+        for kind in path_kinds():
             there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()
             left |= {t: h for t, h in zip(there, here, strict=True) if h is not None}
         if isinstance(self._store, LocalStore):
@@ -113,7 +119,7 @@ def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
 
 def _renamed(rows: pa.Table, stem: str) -> pa.Table:
     """`labels/boxes.parquet` becomes `labels/boxes/<stem>.parquet`."""
-    for name in (f"{kind}_path" for kind in _OF_BLOCK):
+    for name in (f"{kind}_path" for kind in _of_block()):
         files = [None if p is None else PurePosixPath(p) for p in rows[name].to_pylist()]
         paths = [f and str(f.with_suffix("") / f"{stem}{f.suffix}") for f in files]
         place = rows.column_names.index(name)
@@ -376,7 +382,7 @@ class BlockWorker:
             with times.spent("open"):
                 scene = self._scene_of(block.uri, task.name)
             with times.spent("place"):
-                self._lay_bed(block, scene)
+                self._share(block, scene)
         self._enter(block)
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
@@ -389,7 +395,7 @@ class BlockWorker:
             cameras=block.cameras,
             backend=self._setup.backend,
             workers=2 if task.is_trial else 1,
-            snow_support_dir=self._snow_support_dir(),
+            shared_dir=self._shared_dir(),
         )
         with Publisher(self._store, folder, block) as publisher:
 
@@ -418,18 +424,21 @@ class BlockWorker:
             enter_variant(self._store, *variant, block.identity(self._setup.backend))
             self._entered.add(variant)
 
-    def _snow_support_dir(self) -> Path:
+    def _shared_dir(self) -> Path:
         if self._store.local_dir is not None:
             return self._store.local_dir / STATE_FOLDER
         assert self._setup.scratch is not None
         return self._setup.scratch
 
-    def _lay_bed(self, block: Block, scene: Scene) -> None:
-        """Let one process look where the snow can lie, and the others on this disk wait for it."""
-        if snow_of_recipe(block.recipe) is not None:
-            folder = self._snow_support_dir()
+    def _share(self, block: Block, scene: Scene) -> None:
+        """Let one process find what lies in files, and the others on this disk wait for it."""
+        recipe, backend = block.recipe, self._setup.backend
+        if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
+            folder = self._shared_dir()
             with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
-                store_snow_supports(scene, [block.recipe], folder, backend=self._setup.backend)
+                effects.share_effects(
+                    scene, [recipe], folder=folder, backend=backend, only_files=True
+                )
 
 
 class _SceneFailed(ClimateGSError):

@@ -41,7 +41,7 @@ from augment.jobs.block_worker import (
 from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
-from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
+from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, variant_name
 from augment.jobs.manifest import (
     FAILED,
     OK,
@@ -448,7 +448,7 @@ def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
                 frames=[having[len(having) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
-                snow_support_dir=Path(folder) / "beds",
+                shared_dir=Path(folder) / "beds",
             )
             started = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
@@ -669,7 +669,7 @@ class _Generation:
         """Publish a block whose images have all failed, unless others have finished it."""
         record = self._plan.records[block.scene]
         identity = block.identity(self._plan.backend)
-        nowhere = {f"{kind}_path": None for kind in PATH_KINDS}
+        nowhere = {f"{kind}_path": None for kind in path_kinds()}
         rows = [
             image_row(
                 block.scene,

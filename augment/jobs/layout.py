@@ -8,22 +8,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
+from augment import effects
 from augment.errors import OutputError
 from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
-# What is measured of the boxes, inside a variant's folder.
-_BOX_WEATHER = {
-    "box_2d": "labels/boxes_2d.parquet",
-    "box_water": "labels/water.parquet",
-    "box_snow": "labels/snow.parquet",
-    "box_smog": "labels/smog.parquet",
-}
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -47,30 +40,26 @@ def variant_name(recipe: Recipe) -> str:
     return f"{recipe.name}-{recipe.variant:03d}"
 
 
-@dataclass(frozen=True)
-class ItemPaths:
-    """Paths of one image and what belongs to it, relative to the output folder; None if unused."""
-
-    image: str
-    depth: str | None
-    semantic: str | None
-    instance: str | None
-    water: str | None
-    snow: str | None
-    lidar: str | None
-    labels: str | None
-    box_2d: str | None
-    box_water: str | None
-    box_snow: str | None
-    box_smog: str | None
-    calibration: str
-
-    def columns(self) -> dict[str, str | None]:
-        """As the manifest's columns: `image_path` and so on."""
-        return {f"{kind}_path": path for kind, path in asdict(self).items()}
+# Kinds of files whose paths a row of the manifest has, but for those of effects.
+_IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
+_LAST = "calibration"
+BOXES_2D = "box_2d"
 
 
-PATH_KINDS = tuple(ItemPaths.__dataclass_fields__)
+def path_kinds() -> tuple[str, ...]:
+    """In the order of the manifest's columns: `image` and so on, its column being `image_path`."""
+    tables = [e.table.name for e in reversed(effects.EFFECTS) if e.table]
+    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D, *tables, _LAST)
+
+
+def mask_names() -> tuple[str, ...]:
+    """Of the mask images that effects have."""
+    return tuple(e.mask for e in reversed(effects.EFFECTS) if e.mask)
+
+
+def path_columns(paths: Mapping[str, str | None]) -> dict[str, str | None]:
+    """Paths by kind as the manifest's columns."""
+    return {f"{kind}_path": path for kind, path in paths.items()}
 
 
 def variant_folder(scene: str, variant: str) -> str:
@@ -82,38 +71,37 @@ def box_weather_files(recipe: Recipe) -> dict[str, str]:
     """Files inside the variant's folder that say what is seen of the boxes, and what the weather
     does to them, by kind.
     """
-    present = {
-        "box_2d": True,
-        "box_water": recipe.weather.flood is not None,
-        "box_snow": recipe.weather.snow is not None,
-        "box_smog": recipe.weather.smog is not None,
-    }
-    return {k: _BOX_WEATHER[k] for k, there in present.items() if there and recipe.output.labels}
+    if not recipe.output.labels:
+        return {}
+    own = [e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None]
+    return {BOXES_2D: "labels/boxes_2d.parquet", **{table.name: table.file for table in own}}
 
 
-def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths:
-    """Where the image of one camera in one frame lies, and what else the recipe asks for."""
+def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str, str | None]:
+    """Where the image of one camera in one frame lies, and what else the recipe asks for, by kind:
+    relative to the output folder; None if unused.
+    """
     if frame < 0:
         raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")
-    output, weather = recipe.output, recipe.weather
-    tables = box_weather_files(recipe)
-    base = variant_folder(scene, variant_name(recipe))
+    output, base = recipe.output, variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
-    return ItemPaths(
-        image=f"{base}/images/{stem}.{output.image}",
-        depth=None if output.depth == "none" else f"{base}/depth/{stem}.png",
-        semantic=f"{base}/semantic/{stem}.png" if output.semantic else None,
-        instance=f"{base}/instance/{stem}.png" if output.instance else None,
-        water=None if weather.flood is None else f"{base}/water/{stem}.png",
-        snow=None if weather.snow is None else f"{base}/snow/{stem}.png",
-        lidar=f"{base}/lidar/{frame:06d}.parquet" if recipe.lidar else None,
-        labels=f"{base}/labels/boxes.parquet" if output.labels else None,
-        box_2d=f"{base}/{tables['box_2d']}" if "box_2d" in tables else None,
-        box_water=f"{base}/{tables['box_water']}" if "box_water" in tables else None,
-        box_snow=f"{base}/{tables['box_snow']}" if "box_snow" in tables else None,
-        box_smog=f"{base}/{tables['box_smog']}" if "box_smog" in tables else None,
-        calibration=f"{base}/calibration.json",
-    )
+    masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
+    used = {
+        "image": f"{base}/images/{stem}.{output.image}",
+        **{mask: f"{base}/{mask}/{stem}.png" for mask in masks},
+        **{name: f"{base}/{file}" for name, file in box_weather_files(recipe).items()},
+        _LAST: f"{base}/calibration.json",
+    }
+    if output.depth != "none":
+        used["depth"] = f"{base}/depth/{stem}.png"
+    for name in ("semantic", "instance"):
+        if getattr(output, name):
+            used[name] = f"{base}/{name}/{stem}.png"
+    if recipe.lidar:
+        used["lidar"] = f"{base}/lidar/{frame:06d}.parquet"
+    if output.labels:
+        used["labels"] = f"{base}/labels/boxes.parquet"
+    return {kind: used.get(kind) for kind in path_kinds()}
 
 
 @contextlib.contextmanager

@@ -20,16 +20,14 @@ from tqdm import tqdm
 
 import augment
 from augment.cameras import Camera, Frame
-from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import support_of
-from augment.effects.style.style import remember_maps, style_maps
+from augment.effects import share_effects
 from augment.errors import SceneError
 from augment.jobs.claims import try_claim
 from augment.jobs.files import trajectory_id
 from augment.jobs.layout import STATE_FOLDER, reading_back
-from augment.jobs.prepare import find_snow_support, remember, snow_of_recipe, style_to_apply
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
+from augment.memo import memo_of
 from augment.metrics.image import flip
 from augment.scene import Scene
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
@@ -192,10 +190,11 @@ class Bench:
         return self._ms[key]
 
     def hand_over(self, settings: Mapping[str, Value], scene: Scene) -> None:
-        """Let the scene know where snow of these settings can lie, if that was found here."""
-        snow = snow_of_recipe(with_settings(self._recipe, settings))
-        if snow is not None and self._cameras is None:
-            remember(scene, snow, find_snow_support(self._scene, snow, backend=self._backend))
+        """Let the scene know what images of these settings share, if that was found here."""
+        if self._cameras is None and self._renderer is None:
+            recipe = with_settings(self._recipe, settings)
+            share_effects(self._scene, [recipe], backend=self._backend)
+            memo_of(scene).update(memo_of(self._scene).shared())
 
     def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
         return self._trial(view, settings).picture
@@ -219,12 +218,7 @@ class Bench:
         """Find for a camera path what pictures would otherwise find for the scene's own cameras."""
         if self._cameras is None or self._renderer is not None:
             return
-        snow, style = snow_of_recipe(recipe), style_to_apply(recipe)
-        if snow is not None:
-            settings = placement_settings(snow)
-            support_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
-        if style is not None:
-            remember_maps(self._scene, style, style_maps(self._scene, style, cameras=self._cameras))
+        share_effects(self._scene, [recipe], cameras=self._cameras, backend=self._backend)
 
 
 def _key(settings: Mapping[str, Value]) -> tuple:

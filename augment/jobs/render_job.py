@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 import augment
 from augment.cameras import Frame
+from augment.effects import share_effects
 from augment.errors import OutputError
 from augment.jobs.atomic import (
     flush_folder,
@@ -37,10 +38,10 @@ from augment.jobs.atomic import (
 )
 from augment.jobs.claims import hold
 from augment.jobs.files import (
-    TABLES,
     BoxNumbers,
     Item,
     SceneIndex,
+    box_tables,
     calibration_bytes,
     frame_entry,
     read_entries,
@@ -50,35 +51,28 @@ from augment.jobs.files import (
 )
 from augment.jobs.layout import (
     MANIFEST,
-    PATH_KINDS,
     STATE_FOLDER,
     box_weather_files,
     folder_name,
     item_paths,
+    path_columns,
+    path_kinds,
     reading_back,
     variant_folder,
     variant_name,
 )
 from augment.jobs.manifest import (
     FAILED,
-    LATER,
     OK,
     Identity,
     Pictured,
     image_row,
+    later_columns,
     merge_rows,
     read_manifest,
     rows_of,
     shown_words,
     write_manifest,
-)
-from augment.jobs.prepare import (
-    StoredMaps,
-    StoredSnowSupport,
-    snow_of_recipe,
-    store_maps,
-    store_snow_supports,
-    style_to_apply,
 )
 from augment.jobs.processes import OutputLock, choose_backend, share_scene
 from augment.jobs.quality import resolve_quality_for
@@ -95,11 +89,12 @@ from augment.jobs.worker import (
     run_in_processes,
     run_serially,
 )
+from augment.memo import memo_of
 from augment.scene import Scene
+from recipes.fields import found, replaced
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
-from recipes.schema import Recipe
-from recipes.style import Style
+from recipes.schema import SECTIONS, Recipe
 
 # ---- What a variant has finished so far, on the disk, until the manifest has it ------------------
 # `.climategs/journal/<scene>/<variant>.jsonl` starts with the variant's identity and gains a line
@@ -178,14 +173,13 @@ def _line(value: dict[str, Any]) -> bytes:
 # ---- What of a job is done already, what is left, and what the manifest will say of it -----------
 
 # What belongs to a whole variant is written when the job ends.
-_OF_VARIANT = ("labels", *TABLES, "calibration")
 _log = logging.getLogger(__name__)
 
 
 @dataclass
 class VariantState:
     """One variant of the job. rows: what is known of its images, from this run and earlier ones.
-    box_weather: what is measured of the boxes of those images, by kind (see TABLES).
+    box_weather: what is measured of the boxes of those images, by kind (see box_tables).
     """
 
     recipe: Recipe
@@ -195,7 +189,7 @@ class VariantState:
     progress_log: ProgressLog
     rows: dict[Item, dict[str, Any]] = field(default_factory=dict)
     box_weather: dict[str, dict[Item, BoxNumbers]] = field(
-        default_factory=lambda: {kind: {} for kind in TABLES}
+        default_factory=lambda: {kind: {} for kind in box_tables()}
     )
     is_logged: bool = False
 
@@ -241,7 +235,8 @@ class JobState:
         """Enter what became of an image, durably. May be called from several threads."""
         variant = self.variants[outcome.variant]
         row = self._row(variant, outcome, frame)
-        measured = {k: TABLES[k].to_json(numbers) for k, numbers in outcome.box_weather.items()}
+        tables = box_tables()
+        measured = {k: tables[k].to_json(numbers) for k, numbers in outcome.box_weather.items()}
         variant.progress_log.append({**row, **measured})
         with self._lock:
             variant.rows[frame.index, outcome.camera] = row
@@ -255,14 +250,15 @@ class JobState:
         row = variant.rows.get(item)
         if row is None or row["status"] != OK:
             return False
-        measured = [kind for kind in TABLES if row[f"{kind}_path"] is not None]
+        measured = [kind for kind in box_tables() if row[f"{kind}_path"] is not None]
         if any(item not in variant.box_weather[kind] for kind in measured):
             return False
         if "box_2d" in measured:
             numbers = variant.box_weather["box_2d"][item]
             if not self.index.instances.agree(numbers.track_ids, numbers["instance"]):
                 return False
-        paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
+        of_variant = {"labels", "calibration", *box_tables()}
+        paths = [row[f"{kind}_path"] for kind in path_kinds() if kind not in of_variant]
         return all((self.out_dir / path).is_file() for path in paths if path is not None)
 
     def write_manifest(self, variants: Sequence[VariantState]) -> Path:
@@ -291,13 +287,13 @@ class JobState:
             if any(row.get(f"{kind}_path") for row in rows):
                 variant.box_weather[kind] = _read_table(kind, self.out_dir / variant.folder / file)
         for row in logged:  # which have the boxes' numbers beyond the manifest's columns
-            for kind, table in TABLES.items():
+            for kind, table in box_tables().items():
                 if (numbers := row.pop(kind, None)) is not None:
                     item = row["frame"], row["camera"]
                     variant.box_weather[kind][item] = table.from_json(numbers)
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
         shown = shown_words(variant.recipe)
-        known = [{**LATER, **row, **shown} for row in [*rows, *logged]]
+        known = [{**later_columns(), **row, **shown} for row in [*rows, *logged]]
         variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
 
@@ -341,12 +337,12 @@ class JobState:
     def _row(self, variant: VariantState, outcome: Outcome, frame: Frame) -> dict[str, Any]:
         recipe, index = variant.recipe, self.index
         camera = frame.cameras[outcome.camera].scaled(recipe.render.scale)
-        paths = item_paths(index.name, recipe, outcome.camera, frame.index).columns()
+        paths = path_columns(item_paths(index.name, recipe, outcome.camera, frame.index))
         if not outcome.lidar:
             paths["lidar_path"] = None
         if frame.index not in index.labelled:
             paths["labels_path"] = None
-        for kind in TABLES.keys() - outcome.box_weather.keys():
+        for kind in box_tables().keys() - outcome.box_weather.keys():
             paths[f"{kind}_path"] = None
         return image_row(
             index.name,
@@ -365,7 +361,7 @@ class JobState:
 def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:
     """A lost or damaged file counts as empty: only rendering again tells what was in it."""
     try:
-        return TABLES[kind].read(path)
+        return box_tables()[kind].read(path)
     except OutputError as error:
         _log.warning("%s; the images it belongs to are rendered again", error)
         return {}
@@ -472,7 +468,7 @@ def _write_box_weather(job_state: JobState, variant: VariantState, kind: str) ->
     # Not of an image that was measured once and has failed since.
     listed = {item for item, row in variant.rows.items() if row[f"{kind}_path"] is not None}
     known = variant.box_weather[kind]
-    write_atomic(path, TABLES[kind].to_bytes({i: known[i] for i in known if i in listed}))
+    write_atomic(path, box_tables()[kind].to_bytes({i: known[i] for i in known if i in listed}))
 
 
 def _read_or_drop(path: Path) -> dict[int, FrameBoxes]:
@@ -499,58 +495,60 @@ def _write_calibration(job_state: JobState, variant: VariantState, trajectory: s
     write_atomic(path, calibration_bytes(index, variant.name, trajectory, entries))
 
 
-# ---- The files of a style beside the images that it made: `<variant>/style/` ---------------------
+# ---- The files that a recipe names, beside the images: those of a style in `<variant>/style/` ----
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
-STYLE_FOLDER = "style"
+FILE_FOLDERS = tuple(path.split(".")[-1] for path, model in SECTIONS.items() if model.file_fields)
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
 
 
-def stored_names(style: Style) -> dict[str, str]:
-    """The name of each of the style's files inside the variant's folder, by field. The image keeps
-    its name where that is safe; another file of the same name gets its field's name before its own.
+def stored_names(recipe: Recipe) -> dict[str, str]:
+    """The name of each of the recipe's files inside the variant's folder, by dotted path of its
+    field. It is the file's own where that is safe; another file of the same name gets its field's
+    name before its own.
     """
-    names: dict[str, str] = {}
-    for key, path in style.files.items():
-        name = _safe_name(path)
-        while name.casefold() in {taken.casefold() for taken in names.values()}:
-            name = f"{key}-{name}"
-        names[key] = name
-    return {key: f"{STYLE_FOLDER}/{name}" for key, name in names.items()}
+    found: dict[str, str] = {}
+    for section_path, section in recipe.sections().items():
+        names: dict[str, str] = {}
+        for key, path in section.files.items():
+            name = _safe_name(path)
+            while name.casefold() in {taken.casefold() for taken in names.values()}:
+                name = f"{key}-{name}"
+            names[key] = name
+        folder = section_path.split(".")[-1]
+        found |= {f"{section_path}.{key}": f"{folder}/{name}" for key, name in names.items()}
+    return found
 
 
 def portable_recipe(recipe: Recipe) -> Recipe:
-    """The recipe with its style's files named from the variant's folder; its hash is the same."""
-    style = recipe.style
-    if style is None or not style.files:
-        return recipe
-    return recipe.model_copy(update={"style": style.model_copy(update=stored_names(style))})
+    """The recipe with its files named from the variant's folder; its hash is the same."""
+    for path, name in stored_names(recipe).items():
+        recipe = replaced(recipe, path, name)
+    return recipe
 
 
 def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
     """Refuse to overwrite (`folders`) files that the recipe is about to need."""
-    files = {} if recipe.style is None else recipe.style.files
-    for key, path in files.items():
-        real = Path(path).resolve()
+    for path in stored_names(recipe):
+        real = Path(found(recipe, path)).resolve()
         for folder in folders:
             if real.is_relative_to(folder.resolve()):
                 raise OutputError(
-                    f"style.{key} of recipe {recipe.name} is {real}, in the folder {folder}, "
+                    f"{path} of recipe {recipe.name} is {real}, in the folder {folder}, "
                     f"which is to be overwritten: copy the recipe and its files out of it first"
                 )
 
 
-def copy_style_files(recipe: Recipe, folder: Path) -> None:
-    """Put the style's files where `portable_recipe` names them. folder: the variant's. Raises
+def copy_files(recipe: Recipe, folder: Path) -> None:
+    """Put the recipe's files where `portable_recipe` names them. folder: the variant's. Raises
     RecipeError: they are unreadable or not those of the recipe's digest.
     """
-    if recipe.style is None or not recipe.style.files:
-        return
-    names = stored_names(recipe.style)
-    for key, data in read_files(recipe.style).items():
-        path = folder / names[key]
-        if not (path.is_file() and path.read_bytes() == data):
-            write_atomic(path, data)
+    names = stored_names(recipe)
+    for section_path, section in recipe.sections().items():
+        for key, data in read_files(section).items() if section.files else ():
+            path = folder / names[f"{section_path}.{key}"]
+            if not (path.is_file() and path.read_bytes() == data):
+                write_atomic(path, data)
 
 
 def _safe_name(path: str) -> str:
@@ -574,8 +572,9 @@ class RenderJob:
     for all. cameras: names, or None for all. camera_path: frames to render in place of the scene's
     own, poses in the scene's world; labels and LiDAR pass through where a frame of the scene has
     the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
-    variants' folders, finished or not, and choose their settings anew. snow_support_dir: keeps
-    the snow supports for later jobs; the output folder's state if None.
+    variants' folders, finished or not, and choose their settings anew. shared_dir: keeps
+    what lies in files of what images share (where snow can lie) for later jobs; the output folder's
+    state if None.
     """
 
     scene_uri: str
@@ -587,7 +586,7 @@ class RenderJob:
     workers: int = 1
     backend: str = "auto"
     overwrite: bool = False
-    snow_support_dir: Path | None = None
+    shared_dir: Path | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -606,7 +605,7 @@ class RenderJob:
 class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: a line each.
     seconds: wall clock. timings: seconds by kind of work, summed over threads and workers, or of
-    the job itself (open, settle, place, style, labels, share, finish); `worker.shares_of` says what
+    the job itself (open, settle, prepare, labels, share, finish); `worker.shares_of` says what
     bound it.
     """
 
@@ -680,8 +679,6 @@ class _Run:
         identities = [self._identity(recipe) for recipe in self.recipes]
         self.job_state = JobState(self.out_dir, self.index, self.recipes, identities)
         self.boxes = BoxCache(self.index)
-        self.snow_supports: tuple[StoredSnowSupport, ...] = ()
-        self.maps: tuple[StoredMaps, ...] = ()
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
@@ -721,16 +718,15 @@ class _Run:
         if chunks:
             self._begin(chunks)
             chunks = self._leave_unlabelled(chunks)
+        assert self.scene is not None
         setup = Setup(
             out_dir=str(self.out_dir),
             recipes=self.recipes,
             backend=self.backend,
             labelled=self.index.labelled,
             instances=self.index.instances,
-            snow_supports=self.snow_supports,
-            maps=self.maps,
+            memo=memo_of(self.scene).shared(),
         )
-        assert self.scene is not None
         if not chunks:
             return
         if self.job.workers == 1:
@@ -777,31 +773,23 @@ class _Run:
         version = augment.__version__
         return Identity(self.index.source, recipe.hash, self.trajectory, version, self.backend)
 
-    def _prepare(self, recipes: Collection[Recipe]) -> None:
-        """Find what images of these recipes share, for all cameras of the scene or the path. Where
-        their snow can lie, and the colour maps of their styles.
-        """
-        snowy = [recipe for recipe in recipes if snow_of_recipe(recipe) is not None]
-        styled = [recipe for recipe in recipes if style_to_apply(recipe) is not None]
+    def _prepare(self, recipes: Sequence[Recipe]) -> None:
+        """Find what images of these recipes share, for all cameras of the scene or the path."""
         assert self.scene is not None
         cameras, path = None, self.job.camera_path
-        if path is not None and (snowy or styled):
+        if path is not None and any(recipe.sections() for recipe in recipes):
             # An object of its own, or the caller's would remember what was found for this path.
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
-        if styled:
-            with self.times.spent("style"):
-                self.maps = store_maps(self.scene, styled, cameras=cameras)
-        if snowy:
-            with self.times.spent("place"):
-                self.snow_supports = store_snow_supports(
-                    self.scene,
-                    snowy,
-                    self.job.snow_support_dir or self.out_dir / STATE_FOLDER,
-                    cameras=cameras,
-                    backend=self.backend,
-                    progress=self.progress,
-                )
+        with self.times.spent("prepare"):
+            share_effects(
+                self.scene,
+                recipes,
+                cameras=cameras,
+                folder=self.job.shared_dir or self.out_dir / STATE_FOLDER,
+                backend=self.backend,
+                progress=self.progress,
+            )
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""
@@ -809,7 +797,7 @@ class _Run:
             variant = self.job_state.variants[number]
             variant.progress_log.begin(variant.identity)
             folder = self.out_dir / variant.folder
-            copy_style_files(variant.recipe, folder)
+            copy_files(variant.recipe, folder)
             text = dump_recipe(portable_recipe(variant.recipe)).encode()
             write_atomic(folder / "recipe.yaml", text)
 

@@ -11,7 +11,7 @@ import pickle
 import threading
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,6 @@ from augment.jobs.files import (
 )
 from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
-from augment.jobs.prepare import StoredMaps, StoredSnowSupport
 from augment.jobs.processes import (
     READY,
     ChildProcess,
@@ -57,6 +56,7 @@ from augment.jobs.processes import (
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note
 from augment.labels import Boxes, LidarSweep
+from augment.memo import memo_of
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -75,8 +75,7 @@ _WRITING = {ENCODE: "encoding", WRITE: "writing to disk", MEASURE: "boxes", LIDA
 _BESIDE = {
     "open": "opening scenes",
     "settle": "choosing settings",
-    "place": "looking where snow can lie",
-    "style": "working out styles",
+    "prepare": "preparing effects",
     "labels": "reading labels",
     "share": "handing the scene to workers",
     "finish": "writing manifests",
@@ -199,9 +198,8 @@ class Pending(Protocol):
 @dataclass(frozen=True)
 class Setup:
     """What rendering needs besides scene and frames; small, and picklable. labelled: numbers of the
-    frames whose labels and LiDAR pass through. instances: of the scene's objects. snow_supports:
-    where the recipes' snow can lie; the scene to render remembers them. maps: of the recipes'
-    styles.
+    frames whose labels and LiDAR pass through. instances: of the scene's objects. memo: what
+    the recipes' images share; the scene to render takes it over.
     """
 
     out_dir: str
@@ -209,8 +207,7 @@ class Setup:
     backend: str
     labelled: frozenset[int]
     instances: Instances
-    snow_supports: tuple[StoredSnowSupport, ...] = ()
-    maps: tuple[StoredMaps, ...] = ()
+    memo: Mapping[Hashable, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -296,7 +293,6 @@ class FrameRunner:
         self._scene, self._setup = scene, setup
         self._renderer = renderer or job_renderer(setup.backend)
         self._deliver, self._pump = deliver, pump
-        self._maps = {stored.style: stored for stored in setup.maps}
         self._boxes: dict[int, Boxes] = {}  # of the frames so far
         self._reading_boxes = threading.Lock()
         self._warned: set[str] = set()  # variants of which a sweep could not be weathered
@@ -308,8 +304,6 @@ class FrameRunner:
         may stay in flight until `land` or the next one.
         """
         recipe = self._setup.recipes[chunk.variant]
-        if recipe.style in self._maps:  # one at a time: a scene remembers few
-            self._maps[recipe.style].take_over(self._scene)
         lidar = self._submit(lambda: self._pass_lidar(chunk, recipe))
         for name in chunk.cameras:
             if stopped():
@@ -436,8 +430,7 @@ class FrameRunner:
         if recipe.lidar is None or chunk.frame not in self._setup.labelled:
             return PassedLidar()
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
-        assert paths.lidar is not None
-        target = Path(self._setup.out_dir) / paths.lidar
+        target = Path(self._setup.out_dir) / (paths["lidar"] or "")
         if target.exists():
             with contextlib.suppress(OutputError):  # a damaged one is written anew
                 return _passed(recipe, read_lidar_note(target))
@@ -460,7 +453,7 @@ class FrameRunner:
         have it is passed through, with the reason."""
         if recipe.lidar != "weather":
             return sweep, None
-        from augment.effects.lidar.beam import weathered_sweep
+        from augment.effects.lidar.sweep import weathered_sweep
 
         try:
             return weathered_sweep(self._scene, recipe, frame, sweep), None
@@ -515,8 +508,7 @@ def worker_main(
     send = sender(connection)
     try:
         scene, frames = shared.open()
-        for support in setup.snow_supports:
-            support.take_over(scene)
+        memo_of(scene).update(setup.memo)
     except Exception as error:
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return

@@ -6,10 +6,9 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from augment.effects.snow.cells import FLUSH, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.errors import SceneError
 from augment.jobs.atomic import write_atomic
+from augment.memo import memo_of
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, Scene
 
@@ -160,9 +160,6 @@ def _add(digest: hashlib.blake2b, *tensors: Tensor) -> None:
         digest.update(array.view(np.uint8).data if array.size else b"")
 
 
-_remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowSupport]] = WeakKeyDictionary()
-
-
 def support_of(
     scene: Scene,
     settings: PlacementSettings,
@@ -183,27 +180,64 @@ def support_of(
         SceneError: as place_snow_support.
         OutputError: the folder cannot be written.
     """
-    known = _remembered.setdefault(scene, {})
-    if settings in known:
-        return known[settings]
-    if cameras is None:
-        cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    key = "" if folder is None else support_key(scene, cameras, settings, backend=backend)
-    path = None if folder is None else support_path(folder, key)
-    if path is not None and path.exists():
-        try:
-            return known.setdefault(settings, load_support(path, key))
-        except SceneError as error:
-            logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-    support = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
-    if path is not None:
-        save_support(path, support, key)
-    return known.setdefault(settings, support)
+
+    def find() -> SnowSupport:
+        every = every_camera(scene) if cameras is None else cameras
+        key = "" if folder is None else support_key(scene, every, settings, backend=backend)
+        path = None if folder is None else support_path(folder, key)
+        if path is not None and path.exists():
+            try:
+                return load_support(path, key)
+            except SceneError as error:
+                logger.warning("the snow of %s is placed anew: %s", scene.name, error)
+        support = place_snow_support(scene, every, settings, backend=backend, progress=progress)
+        if path is not None:
+            save_support(path, support, key)
+        return support
+
+    return memo_of(scene).get(("snow support", settings), find)
 
 
-def remember_support(scene: Scene, settings: PlacementSettings, support: SnowSupport) -> None:
-    """Make `support_of` give this support for the scene and the settings from now on."""
-    _remembered.setdefault(scene, {})[settings] = support
+@dataclass(frozen=True)
+class StoredSupport:
+    """A support in its file."""
+
+    path: str
+    key: str
+
+    def load(self) -> SnowSupport:
+        return load_support(Path(self.path), self.key)
+
+
+def share_support(
+    scene: Scene,
+    settings: PlacementSettings,
+    cameras: Sequence[Camera] | None,
+    *,
+    folder: Path | None,
+    backend: str,
+    progress: bool = False,
+) -> None:
+    """Find the support and share it, in a file of the folder where there is one, with whoever
+    takes over the scene's memo. Arguments as of `support_of`.
+    """
+    options = {"cameras": cameras, "backend": backend}
+    support = support_of(scene, settings, folder=folder, progress=progress, **options)
+    stored: SnowSupport | StoredSupport = support
+    if folder is not None:
+        every = every_camera(scene) if cameras is None else cameras
+        key = support_key(scene, every, settings, backend=backend)
+        path = support_path(folder, key)
+        if not path.is_file():  # this process knew it from a job in another folder
+            save_support(path, support, key)
+        stored = StoredSupport(str(path), key)
+    memo = memo_of(scene)
+    memo.put(("snow support", settings), stored, shared=True)
+    memo.put(("snow support", settings), support)
+
+
+def every_camera(scene: Scene) -> list[Camera]:
+    return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
 def support_path(folder: Path, key: str) -> Path:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from jaxtyping import Float, Int16
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from augment.memo import memo_of
 from augment.render import composite_kernels
 from augment.render import sh as sh_layout
 from augment.render.buffers import AUTO, CPU, CUDA, kernels_for
@@ -92,13 +92,7 @@ def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
     seen = maps.seen_sky
     if seen is None or is_stand_in(scene.sky):
         return None
-    known, key = _remembered.setdefault(scene, {}), seen.numpy().tobytes()
-    if key not in known:
-        known[key] = _find(scene, seen)
-    return known[key]
-
-
-_remembered: WeakKeyDictionary[Scene, dict[bytes, Tensor | None]] = WeakKeyDictionary()
+    return memo_of(scene).get(("sky levels", seen.numpy().tobytes()), lambda: _find(scene, seen))
 
 
 def _find(scene: Scene, seen: Float[Tensor, "3 4"]) -> Int16[Tensor, "N"] | None:

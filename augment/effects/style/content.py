@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -32,6 +30,7 @@ from augment.effects.style.statistics import (
     Statistics,
     statistics_of,
 )
+from augment.memo import memo_of
 from augment.render.composite import composite_sky
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
@@ -45,7 +44,6 @@ PICTURES = 4  # that a network looks at
 PICTURE_SIZE = 256  # pixels, what networks take
 # Splats never cover a pixel altogether; what glimmers through in sum is no sky.
 MIN_SKY = 0.005
-MAX_REMEMBERED = 8  # results of a scene
 
 _CHANNELS = (ROAD, VEGETATION, REST)  # of the picture that says what a pixel shows
 _CLASS_CHANNEL = {
@@ -53,9 +51,6 @@ _CLASS_CHANNEL = {
     for cls in SemanticClass
     if (region := REGION_OF_CLASS.get(cls, REST)) in _CHANNELS
 }
-
-_T = TypeVar("_T")
-_remembered: WeakKeyDictionary[Scene, dict[tuple, object]] = WeakKeyDictionary()
 
 
 def content_statistics(
@@ -67,11 +62,11 @@ def content_statistics(
 
     cameras: those that the scene will be seen by; None for all of its own. per_region: also ROAD,
     VEGETATION and REST where they are seen, of a scene whose Gaussians know at least one of the
-    first two. Remembered for as long as the scene lives.
+    first two. Kept in the scene's memo.
     """
     views = select_views(scene, cameras, VIEWS)
-    key = (per_region, content_key(scene, cameras))
-    return _remember(scene, key, lambda: _statistics(scene, views, per_region))
+    key = ("content statistics", per_region, content_key(scene, cameras))
+    return memo_of(scene).get(key, lambda: _statistics(scene, views, per_region))
 
 
 def content_pictures(
@@ -80,11 +75,11 @@ def content_pictures(
     """Whole pictures of the scene with its sky, in [0, 1], squeezed to a square: for a network.
 
     cameras: as content_statistics. A scene that no camera sees gives one picture, of its
-    Gaussians' colours in no order. Remembered for as long as the scene lives.
+    Gaussians' colours in no order. Kept in the scene's memo.
     """
     views = select_views(scene, select_views(scene, cameras, VIEWS), PICTURES)
-    key = ("pictures", content_key(scene, cameras))
-    return _remember(scene, key, lambda: _pictures(scene, views))
+    key = ("content pictures", content_key(scene, cameras))
+    return memo_of(scene).get(key, lambda: _pictures(scene, views))
 
 
 def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashable:
@@ -301,13 +296,3 @@ def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def _small(camera: Camera) -> Camera:
     return camera.scaled(min(1.0, math.sqrt(VIEW_PIXELS / (camera.width * camera.height))))
-
-
-def _remember(scene: Scene, key: tuple, found: Callable[[], _T]) -> _T:
-    known = _remembered.setdefault(scene, {})
-    if key not in known:
-        value = found()
-        while len(known) >= MAX_REMEMBERED:
-            del known[next(iter(known))]
-        known[key] = value
-    return known[key]  # type: ignore[return-value]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -44,6 +42,7 @@ from augment.effects.style.statistics import (
     closed_maps,
 )
 from augment.errors import StyleError
+from augment.memo import memo_of
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
@@ -54,46 +53,27 @@ from recipes.yaml_tree import read_plain
 if TYPE_CHECKING:
     from augment.effects.style.network import Gscm
 
-MAX_REMEMBERED = 8  # styles of a scene
-
-_remembered: WeakKeyDictionary[Scene, dict[tuple, StyleMaps]] = WeakKeyDictionary()
-_given: WeakKeyDictionary[Scene, dict[Style, StyleMaps]] = WeakKeyDictionary()
-
 
 def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None = None) -> StyleMaps:
     """The maps that give the scene the style's colours, float32; identities at strength 0.
 
     style: image, mask and checkpoint are paths that can be opened as they are. cameras: those that
-    the scene will be seen by; None for all of its own. The last few are remembered for as long as
-    the scene lives, with what their files held when first read. `remember_maps` overrides this.
+    the scene will be seen by; None for all of its own. They are kept in the scene's memo,
+    with what their files held when first read; maps shared there come first.
 
     Raises:
         StyleError: an image, a preset or a checkpoint cannot be used.
     """
     if not style.changes:
         return StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
-    given = _given.get(scene, {}).get(style)
-    if given is not None:
-        return given
-    key = (style, content_key(scene, cameras))
-    known = _remembered.setdefault(scene, {})
-    if key not in known:
-        _put(known, key, _find_maps(scene, style, cameras))
-    return known[key]
+    memo = memo_of(scene)
 
+    def find() -> StyleMaps:
+        key = ("style maps of cameras", style, content_key(scene, cameras))
+        return memo.get(key, lambda: _find_maps(scene, style, cameras))
 
-def remember_maps(scene: Scene, style: Style, maps: StyleMaps) -> None:
-    """Make `style_maps` give these maps for the scene and the style from now on, whatever the
-    cameras.
-    """
-    _put(_given.setdefault(scene, {}), style, maps)
-
-
-def _put(known: dict[Any, StyleMaps], key: object, maps: StyleMaps) -> None:
-    """Remember the maps, and forget the oldest where there are too many."""
-    while len(known) >= MAX_REMEMBERED:
-        del known[next(iter(known))]
-    known[key] = maps
+    shared = ("style maps", style)
+    return memo.get(shared, find) if memo.known(shared) else find()
 
 
 def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
@@ -142,13 +122,8 @@ def _content_side(
     """The scene's half of its maps, remembered with the pictures and the network it is of."""
     from augment.effects.style.network import content_side
 
-    known = _content_sides.get(scene)
-    if known is None or known[0] is not net or known[1] is not content:
-        known = _content_sides[scene] = (net, content, content_side(net, content))
-    return known[2]
-
-
-_content_sides: WeakKeyDictionary[Scene, tuple[Gscm, Tensor, Tensor]] = WeakKeyDictionary()
+    key = ("content side", net, content)
+    return memo_of(scene).get(key, lambda: content_side(net, content))
 
 
 @functools.lru_cache(maxsize=2)
@@ -274,9 +249,6 @@ def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-_MAX_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
-
-
 @dataclass(frozen=True, eq=False)
 class SceneStyle:
     """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
@@ -337,24 +309,17 @@ class SceneStyle:
 
 
 def scene_style_of(scene: Scene, style: Style) -> SceneStyle:
-    """The style in the scene; remembered for as long as the scene lives and few others are asked
-    for.
+    """The style in the scene.
 
     Raises:
         StyleError: the style cannot be read.
     """
-    looks = _looks.setdefault(scene, OrderedDict())
     maps = style_maps(scene, style)
-    look = looks.get(style)
-    if look is None or look.maps is not maps:
+
+    def find() -> SceneStyle:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
         sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
-        look = looks[style] = SceneStyle(maps, sky, bare, levels, folds=style.evaluated == "sh")
-    looks.move_to_end(style)
-    while len(looks) > _MAX_LOOKS:
-        looks.popitem(last=False)
-    return look
+        return SceneStyle(maps, sky, bare, levels, folds=style.evaluated == "sh")
 
-
-_looks: WeakKeyDictionary[Scene, OrderedDict[Style, SceneStyle]] = WeakKeyDictionary()
+    return memo_of(scene).get(("scene style", style, maps), find)

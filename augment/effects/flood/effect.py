@@ -1,0 +1,234 @@
+"""A flood as an effect: where its water stands, what a camera sees of it, boxes and LiDAR in it."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from augment.bounds import lowest_z_m
+from augment.boxes import NOT_COUNTED, BoxPixels, PlacedBoxes, count_pixels
+from augment.cameras import Camera
+from augment.drawing import LayerRenderer
+from augment.effects.effect import (
+    Active,
+    Drawn,
+    Effect,
+    EffectView,
+    FrontSurface,
+    InView,
+    Placed,
+    Sight,
+    Step,
+    skipped,
+)
+from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT, render_flooded
+from augment.effects.flood.lidar import meet_flood
+from augment.effects.flood.water_plane import mirrored_camera, plane_depth, plane_window
+from augment.effects.flood.waves import make_waves
+from augment.effects.lidar.beam import Echoes
+from augment.ground import ground_of
+from augment.jobs.box_tables import BoxTable, share_of_pixels
+from augment.memo import memo_of
+from augment.scene import Scene
+from augment.semantics import SemanticClass
+from recipes.flood import Flood
+from recipes.schema import Recipe
+
+PASSES = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
+MIN_DEPTH_M = 0.05  # waves run in at least this much water
+_SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a coarse resolution
+
+
+class FloodEffect(Effect):
+    """Standing water; it draws the scene in layers, above the surface, below it and mirrored."""
+
+    name, section, model, mask = "flood", "weather.flood", Flood, "water"
+    draws = PASSES[1:3]
+    # submerged_fraction: of the box's height. pixels: that show the box, or NOT_COUNTED in an image
+    # without water in view. hidden_pixels: those behind water.
+    table = BoxTable(
+        name="box_water",
+        file="labels/water.parquet",
+        kind="box water",
+        columns={
+            "submerged_fraction": np.float64,
+            "pixels": np.int64,
+            "hidden_pixels": np.int64,
+            "hidden_fraction": np.float64,
+        },
+        sampled=("submerged_fraction", "hidden_fraction"),
+        derived={"hidden_fraction": share_of_pixels("hidden_pixels")},
+        visible=lambda numbers: 1 - numbers["hidden_fraction"],
+    )
+
+    def kernels(self, section: Flood) -> Hashable:
+        return section.reflection
+
+    def share(
+        self,
+        scene: Scene,
+        recipes: Sequence[Recipe],
+        cameras: Sequence[Camera] | None,
+        *,
+        folder: Path | None,
+        backend: str,
+        progress: bool,
+    ) -> None:
+        """The height of the road."""
+        if any(self.of(recipe) is not None for recipe in recipes):
+            memo_of(scene).put(("ground",), ground_of(scene), shared=True)
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        flood = self.of(recipe)
+        if flood is None:
+            return Placed(
+                None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
+            )
+        medium, reason = flood_medium(flood, recipe.seed, scene)
+        level_z_m = medium.level_z_m
+        if lowest_z_m(scene) >= level_z_m:
+            why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
+            return Placed(None, skipped(PASSES, why), water_level_z_m=level_z_m)
+        return Placed(medium, _steps(medium, reason), water_level_z_m=level_z_m)
+
+    def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
+        is_drawn = _is_under(own.data, camera) or plane_window(camera, own.data.level_z_m)
+        return layer_cameras(own.data, camera) if is_drawn else None
+
+    def in_view(self, own: Active, sight: Sight) -> InView:
+        camera = sight.camera
+        if _is_under(own.data, camera):
+            why = "the camera is under water: it sees what lies below and what lies above"
+            return InView(skipped=dict.fromkeys(PASSES, why))
+        if plane_window(camera, own.data.level_z_m) is None:
+            why = "no ray of this camera meets the water's plane"
+            return InView(False, dict.fromkeys(PASSES, why))
+        return InView()
+
+    def draw(
+        self, own: Active, layers: LayerRenderer, camera: Camera, buffers: frozenset[str]
+    ) -> Drawn | None:
+        found = render_flooded(layers, camera, own.data, buffers)
+        if found is None:
+            return None
+        why = "what stands before the water hides all of it"
+        hidden = dict.fromkeys(PASSES if found.is_hidden else (), why)
+        return Drawn(found.rgb, found.scene, {"water": found.water}, hidden)
+
+    def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
+        if _is_under(own.data, camera):  # seen from below, the surface has no depth
+            return FrontSurface(int(SemanticClass.WATER), None)
+        return FrontSurface(int(SemanticClass.WATER), plane_depth(camera, own.data.level_z_m))
+
+    def measure(
+        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+    ) -> dict[str, np.ndarray]:
+        level_z_m = view.placed.water_level_z_m
+        assert level_z_m is not None
+        pixels, hidden = np.full(len(placed), NOT_COUNTED), np.zeros(len(placed), np.int64)
+        if view.depth_m is not None and view.mask is not None:
+            counted = hidden_pixels(placed, camera, view.depth_m, view.mask)
+            pixels, hidden = counted.pixels, counted.marked
+        submerged = submerged_fraction(placed, level_z_m)
+        return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": hidden}
+
+    def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
+        meet_flood(echoes, own.data)
+
+
+def _is_under(medium: FloodMedium, camera: Camera) -> bool:
+    return float(camera.centre[2]) <= medium.level_z_m
+
+
+def flood_medium(flood: Flood, seed: int, scene: Scene) -> tuple[FloodMedium, str]:
+    """The flood at its height in the scene, and what explains it. seed: of the recipe.
+
+    Raises:
+        SceneError: the scene's scale, gravity or road is not known.
+    """
+    ground = ground_of(scene)
+    bases = {"lowest": ground.lowest_z_m, "median": ground.median_z_m, "absolute": 0.0}
+    level_z_m = bases[flood.reference] + flood.level_m
+    depth_m = max(level_z_m - ground.lowest_z_m, MIN_DEPTH_M)
+    medium = FloodMedium(
+        level_z_m=level_z_m,
+        extinction_per_m=flood.extinction_per_m_rgb,
+        rgb=flood.color,
+        waves=make_waves(flood.waves, seed=seed, depth_m=depth_m),
+        refraction_index=flood.refraction_index,
+        fresnel=flood.fresnel,
+        reflection=flood.reflection,
+    )
+    reason = (
+        f"surface at z = {level_z_m:.2f} m, {level_z_m - ground.lowest_z_m:.2f} m above the lowest "
+        f"road ({ground.source}), reflection {flood.reflection}, "
+        f"{len(medium.waves.amplitudes_m)} waves"
+    )
+    return medium, reason
+
+
+def _steps(medium: FloodMedium, reason: str) -> tuple[Step, ...]:
+    waves, tier = len(medium.waves.amplitudes_m), medium.reflection
+    mirrored = {
+        "sky": "reflection 'sky' shows no scene",
+        "screen_space": "at a quarter of the resolution, for what the screen does not show",
+        "mirrored": "at full resolution",
+    }
+    steps = (
+        (waves > 0, reason if waves else "the surface is still"),
+        (True, f"{reason}; splats are cut at the surface"),
+        (tier != "sky", mirrored[tier]),
+        (tier == "screen_space", f"reflection is {tier!r}"),
+    )
+    return tuple(Step(name, *step) for name, step in zip(PASSES, steps, strict=True))
+
+
+def layer_cameras(medium: FloodMedium, camera: Camera) -> tuple[Camera, ...]:
+    """Cameras that see, between them, what the layers of a view with water can show."""
+    wide = _grown(camera, MAX_SHIFT * camera.height + _SPARE_PX)
+    if medium.reflection == "sky" or _is_under(medium, camera):
+        return (wide,)
+    margin = MAX_MARGIN * max(camera.width, camera.height) + _SPARE_PX / COARSE
+    return wide, _grown(mirrored_camera(camera, medium.level_z_m), margin)
+
+
+def _grown(camera: Camera, margin_px: float) -> Camera:
+    m = int(np.ceil(margin_px))
+    return camera.cropped(-m, -m, camera.width + 2 * m, camera.height + 2 * m)
+
+
+# ---- Labelled boxes ------------------------------------------------------------------------------
+
+
+def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndarray, " B"]:
+    """The part of each box's height that is under water, 0 to 1; tilted boxes from their corners.
+
+    level_z_m: scene world. A box without height is wholly in or out; one whose numbers are not
+    finite has NaN.
+    """
+    z = placed.corners_m[..., 2]  # [B, 8]
+    low, high = z.min(axis=1), z.max(axis=1)
+    height = high - low
+    with np.errstate(invalid="ignore"):
+        fraction = (level_z_m - low) / np.where(height > 0, height, 1.0)
+        flat = np.where(level_z_m > low, 1.0, 0.0)
+    fraction = np.where(height > 0, np.clip(fraction, 0.0, 1.0), flat)
+    return np.where(placed.is_finite, fraction, np.nan)
+
+
+def hidden_pixels(
+    placed: PlacedBoxes,
+    camera: Camera,
+    scene_depth_m: Float32[np.ndarray, "H W"],
+    water: UInt8[np.ndarray, "H W"],
+) -> BoxPixels:
+    """How many pixels show each box, and how many of them (`marked`) do so through water.
+
+    scene_depth_m: z of the scene's own surface, seen through the water; 0 = none. water: 255 where
+    water is the first surface.
+    """
+    return count_pixels(placed, camera, scene_depth_m, water)

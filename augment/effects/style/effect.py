@@ -1,0 +1,113 @@
+"""Style as an effect: the colours of the scene, or of the finished picture, under its maps."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.drawing import LayerRenderer
+from augment.effects.effect import PICTURE, SCENE, Active, Drawn, Effect, Placed, Step
+from augment.effects.style.color_maps import StyleMaps
+from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
+from augment.memo import memo_of
+from augment.render.composite import map_colors
+from augment.scene import Scene
+from augment.timing import timed
+from recipes.schema import Recipe
+from recipes.style import Style
+
+ON_SCENE, ON_PICTURE = "style on the scene", "style on the picture"
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMaps:
+    """Maps as arrays: pickled tensors would lie in memory that is gone with their process."""
+
+    arrays: tuple[np.ndarray | None, ...]
+
+    @staticmethod
+    def of(maps: StyleMaps) -> PackedMaps:
+        tensors = (getattr(maps, field.name) for field in fields(maps))
+        return PackedMaps(tuple(None if t is None else t.numpy() for t in tensors))
+
+    def load(self) -> StyleMaps:
+        return StyleMaps(*(None if a is None else torch.from_numpy(a.copy()) for a in self.arrays))
+
+
+class StyleEffect(Effect):
+    """The colours of an image or a preset, taken on by what stands in the weather, or by all."""
+
+    name, section, model = "style", "style", Style
+    folded: ClassVar = {ON_SCENE: ("style", None)}
+
+    def kernels(self, section: Style) -> Hashable:
+        return (section.applied_to, section.method) if section.changes else None
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        style = self.of(recipe)
+        if style is None or not style.changes:
+            why = "the recipe has no style"
+            if style is not None:
+                why = "the style has no strength, so it changes nothing"
+            steps = (Step(ON_SCENE, False, why, SCENE), Step(ON_PICTURE, False, why, PICTURE))
+            return Placed(None, steps)
+        source = f"image {Path(style.image or '').name}"
+        if style.preset:
+            source = f"preset {style.preset!r}"
+        reason = f"{style.method} from {source} at strength {style.strength:g}"
+        on_picture = style.applied_to == "picture"
+        maps = "a map for every region" if style.per_region else "one map for all splats"
+        when = {
+            "color": "applied as they are projected",
+            "sh": "folded into the background's SH once, applied to actors as they are projected",
+        }[style.evaluated]
+        other = f"style.applied_to is {style.applied_to!r}"
+        how = f"{reason}, {maps}, {when}; snow and water keep their colours"
+        steps = (
+            Step(ON_SCENE, not on_picture, other if on_picture else how, SCENE),
+            Step(ON_PICTURE, on_picture, reason if on_picture else other, PICTURE),
+        )
+        return Placed(style, steps)
+
+    def prepare(self, own: Active) -> SceneStyle:
+        return scene_style_of(own.scene, own.data)
+
+    def relight(self, own: Active) -> Scene | None:
+        return own.prepared.lighting_scene if own.data.applied_to == "scene" else None
+
+    def share(
+        self,
+        scene: Scene,
+        recipes: Sequence[Recipe],
+        cameras: Sequence[Camera] | None,
+        *,
+        folder: Path | None,
+        backend: str,
+        progress: bool,
+    ) -> None:
+        """The maps, so that no other process renders what they are fitted to, or reads files."""
+        found = (self.of(recipe) for recipe in recipes)
+        for style in dict.fromkeys(s for s in found if s and s.changes):
+            maps = style_maps(scene, style, cameras=cameras)
+            memo = memo_of(scene)
+            memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
+            memo.put(("style maps", style), maps)
+
+    def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+        if own.data.applied_to == "picture":
+            return layers
+        style = own.prepared
+        return replace(layers, parts=style.on(layers.parts, backend=own.backend), sky=style.sky)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        if own.data.applied_to != "picture":
+            return drawn
+        with timed(ON_PICTURE):
+            rgb = map_colors(drawn.rgb, own.prepared.maps.picture, backend=own.backend)
+        return replace(drawn, rgb=rgb)
