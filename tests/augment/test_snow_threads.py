@@ -1,4 +1,4 @@
-"""Work on several threads: order, failures, and whose thread uses the GPU."""
+"""Work on several threads: order and failures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 import pytest
 
 from augment.effects.snow import height_map as in_threads
-from augment.effects.snow.height_map import in_order, on_device
+from augment.effects.snow.height_map import in_order
 
 
 @pytest.fixture(autouse=True, params=[1, 4])
@@ -30,18 +30,8 @@ def test_results_are_in_the_items_order(threads: int) -> None:
     assert len(told) == 5
     assert (threading.current_thread() in seen) == (threads == 1)
     assert in_order(late_first, []) == []
-
-
-def test_the_gpu_is_used_by_the_caller_alone(threads: int) -> None:
-    here = threading.current_thread()
-
-    def where(item: int) -> list[threading.Thread]:
-        return [on_device(threading.current_thread, backend) for backend in ("cuda", "cpu")]
-
-    found = in_order(where, range(9))
-    assert all(on_gpu is here for on_gpu, _ in found)
-    assert all((on_cpu is here) == (threads == 1) for _, on_cpu in found)
-    assert on_device(threading.current_thread, "cuda") is here
+    here = [threading.current_thread()] * 3  # which alone uses a GPU
+    assert in_order(lambda _: threading.current_thread(), range(3), backend="cuda") == here
 
 
 def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
@@ -49,7 +39,7 @@ def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
 
     def fails(item: int) -> int:
         begun.append(item)
-        return on_device(lambda: 1 // (item - 1), "cuda")
+        return 1 // (item - 1)
 
     with pytest.raises(ZeroDivisionError):
         in_order(fails, range(1, 500))

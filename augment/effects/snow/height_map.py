@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from queue import SimpleQueue
 from typing import Literal, TypeVar
 
 import cv2
@@ -37,7 +37,7 @@ from augment.render.threads import kernel_threads, thread_count
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass
 
-# ---- Work on several threads, with the GPU left to the thread that waits for them ----------------
+# ---- Work on several threads ---------------------------------------------------------------------
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -47,9 +47,10 @@ _ROWS = 8192  # of arrays, in one part: what is made from them stays in a core's
 
 
 class _Worker(threading.local):
-    """What a thread that works for `in_order` asks its caller to do."""
+    is_busy = False
 
-    calls: SimpleQueue[Callable[[], object]] | None = None
+    def begin(self) -> None:
+        self.is_busy = True
 
 
 _worker = _Worker()
@@ -60,71 +61,31 @@ def in_order(
     items: Iterable[Item],
     *,
     after_each: Callable[[], object] = lambda: None,
+    backend: str = AUTO,
 ) -> list[Result]:
     """The function's results for each item, in the items' order, found by as many threads as
-    kernels use: numpy, cv2 and kernels let other threads go on.
+    kernels use: numpy, cv2 and kernels let other threads go on. backend: with "cuda" by the calling
+    thread alone, which has the device and the stream that are meant.
 
     after_each: called in this thread, for one item after another.
     """
-    items = list(items)
+    items, results = list(items), []
     threads = min(thread_count(), len(items), _MAX_AT_ONCE)
-    results = []
-    if threads <= 1 or _worker.calls is not None:
-        for item in items:
-            results.append(function(item))
+    alone = threads <= 1 or _worker.is_busy or backend == CUDA
+    with (
+        nullcontext()
+        if alone
+        else ThreadPoolExecutor(threads, "placing snow", initializer=_worker.begin) as pool
+    ):
+        for result in map(function, items) if pool is None else pool.map(function, items):
+            results.append(result)
             after_each()
-        return results
-    calls: SimpleQueue[Callable[[], object]] = SimpleQueue()
-
-    def work(item: Item) -> Result:
-        _worker.calls = calls
-        return function(item)
-
-    with ThreadPoolExecutor(threads, thread_name_prefix="placing snow") as pool:
-        found = [pool.submit(work, item) for item in items]
-        for one in found:
-            one.add_done_callback(lambda _: calls.put(lambda: None))  # wakes the caller
-        try:
-            for one in found:
-                _answer_until(one, calls)
-                results.append(one.result())
-                after_each()
-        finally:
-            for one in found:
-                one.cancel()  # where one failed, the others are not begun
-            for one in found:
-                _answer_until(one, calls)
     return results
-
-
-def on_device(function: Callable[[], Result], backend: str) -> Result:
-    """The function's result. Work on a GPU is done by the caller of `in_order`, one call after
-    another: its thread has the device and the stream that are meant. That on the CPU is done here.
-    """
-    calls = _worker.calls
-    if calls is None or backend != CUDA:
-        return function()
-    result: Future[Result] = Future()
-
-    def call() -> None:
-        try:
-            result.set_result(function())
-        except BaseException as error:  # for the thread that asked
-            result.set_exception(error)
-
-    calls.put(call)
-    return result.result()
 
 
 def slices_of(count: int) -> list[slice]:
     """Parts of `count` rows, for `in_order`."""
     return [slice(start, min(count, start + _ROWS)) for start in range(0, count, _ROWS)]
-
-
-def _answer_until(one: Future[Result], calls: SimpleQueue[Callable[[], object]]) -> None:
-    """Do what threads ask for until one result is there."""
-    while not one.done():
-        calls.get()()
 
 
 # ---- What lies highest ---------------------------------------------------------------------------
@@ -252,6 +213,7 @@ def draw_from_above(
     shown = None
     if pixel_mask is not None:
         shown = torch.from_numpy(np.ascontiguousarray(pixel_mask[::-1]))
+        shown = gpu.upload(shown) if backend == CUDA else shown
     names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
     alpha, depths, medians, rgb, ids = _draw(
         parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
@@ -296,21 +258,19 @@ def _draw(
     """Buffers of a view from above, rows towards +y."""
     # Other depths than the mode's are for comparing them: rather slower with all buffers, which
     # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
-    asked, mask = names if MODE_DEPTH in names else BUFFERS, pixel_mask
-
-    def draw() -> list[np.ndarray]:
-        out = rasterize(
-            parts,
-            camera,
-            buffers=asked,
-            settings=RasterSettings(sh_degree=0, antialiased=antialiased),
-            clip=UNCUT,
-            pixel_mask=gpu.upload(mask) if mask is not None and backend == CUDA else mask,
-            backend=backend,
-        )
-        return [getattr(out, name).cpu().numpy() for name in names]
-
-    return [np.ascontiguousarray(image[::-1]) for image in on_device(draw, backend)]
+    out = rasterize(
+        parts,
+        camera,
+        buffers=names if MODE_DEPTH in names else BUFFERS,
+        settings=RasterSettings(sh_degree=0, antialiased=antialiased),
+        clip=UNCUT,
+        pixel_mask=gpu.upload(pixel_mask)
+        if pixel_mask is not None and backend == CUDA
+        else pixel_mask,
+        backend=backend,
+    )
+    images = (getattr(out, name).cpu().numpy() for name in names)
+    return [np.ascontiguousarray(image[::-1]) for image in images]
 
 
 def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:

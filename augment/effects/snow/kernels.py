@@ -32,7 +32,7 @@ from augment.effects.snow.profile import (
 from augment.render.cpu.jit import inner, kernel
 from augment.render.sh import SH_C0
 
-# ---- splat kernels -------------------------------------------------------------------------------
+# ---- Discs of snow on cells ----------------------------------------------------------------------
 
 MAX_WALLS = 8  # discs one above the other that close a wall
 LEAN = 1.5  # steepest slope that a cell's own disc follows
@@ -55,19 +55,22 @@ SHADED_HOLLOW, MAX_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, a
 THIN_M, THIN_LOSS = 0.005, 0.42  # depth through which the ground darkens snow, and how much
 PACKED_SHARE = 0.6  # brightness of packed snow, of fresh snow's
 DARKEST, BRIGHTEST = 0.35, 0.8  # light on the bare surface where the sun is out of sight, and full
-_UNIT = 2.0**-53
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-_A, _B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_S11, _S27, _S30, _S31 = (np.uint64(s) for s in (11, 27, 30, 31))
+_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
+_LOW, _UNIT = np.uint64(0xFFFFFFFF), 2.0**-53
+_S11, _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (11, 27, 30, 31, 32))
+
+
+@inner()
+def _mix(bits):
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    return bits ^ (bits >> _S31)
 
 
 @inner()
 def _uniform(bits, number):
     """The number-th random number of these bits, in [-1, 1)."""
-    bits = bits + np.uint64(number + 1) * _STEP
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    bits = bits ^ (bits >> _S31)
+    bits = _mix(bits + np.uint64(number + 1) * _X)
     return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
 
 
@@ -361,9 +364,7 @@ def bury(buried, buried_by, heights, opacities):
             opacities[buried[b]] = 0
 
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernels that split near discs of snow into finer ones; `augment.effects.snow.near_camera`
-# launches
+# ---- Near discs split into finer ones, as `near_camera.split_discs` defines it -------------------
 
 REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
 FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
@@ -375,19 +376,21 @@ CRUMB, CLOD = 0.6, 0.4  # shares of the two
 
 
 @kernel
-def count_splits(means, scales, pose, limits, finest, splits):
-    """Into how many discs along each side every disc is split, uint8 [S]; 0 where it stays whole.
+def count_splits(near, means, scales, pose, limits, finest, splits):
+    """Into how many discs along each side the near discs [D] are split, uint8 [D]; 0 where one
+    stays whole.
 
     pose: camera_from_part, float64 [3, 4]. limits: lowest and highest x / z, then y / z. finest:
     standard deviation of a disc over its distance, that splitting stops at.
     """
-    for i in prange(len(splits)):
+    for k in prange(len(splits)):
+        i = near[k]
         x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         right = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
         down = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
         away = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
         distance = math.sqrt(right * right + down * down + away * away)
-        splits[i] = 0
+        splits[k] = 0
         if away <= 0.0 or distance >= FARTHEST_M:
             continue
         if not (limits[0] * away <= right <= limits[1] * away):
@@ -396,7 +399,7 @@ def count_splits(means, scales, pose, limits, finest, splits):
             continue
         side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
         count = min(math.floor(side / (finest * distance) + 0.5), MAX_SPLITS)
-        splits[i] = count if count > 1 else 0
+        splits[k] = count if count > 1 else 0
 
 
 @inner()
@@ -488,20 +491,7 @@ def split(chosen, splits, firsts, view, noise, discs, fine):
                 s += 1
 
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernel of the snow's depth; `augment.effects.snow.profile` and `noise` define what it
-# computes
-
-_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
-_LOW = np.uint64(0xFFFFFFFF)
-_S27, _S30, _S31, _S32 = (np.uint64(s) for s in (27, 30, 31, 32))
-
-
-@inner()
-def _mix(bits):
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    return bits ^ (bits >> _S31)
+# ---- The snow's depth, as `profile` defines it ---------------------------------------------------
 
 
 @inner()

@@ -94,8 +94,7 @@ def split_near(
     pose = np.ascontiguousarray(camera.camera_from_world.numpy()[:3])
     with kernel_threads(ROWS):
         close_kernels.count_splits(
-            *(means[near], gaussians.scales.numpy()[near], pose, view_limits(camera)),
-            *(finest, splits),
+            *(near, means, gaussians.scales.numpy(), pose, view_limits(camera), finest, splits)
         )
     chosen = np.flatnonzero(splits)
     if len(chosen) == 0:
@@ -163,12 +162,9 @@ def split_discs(
     """
     g, device = gaussians, gaussians.means.device
     counts = splits * splits
-
-    def per_disc(values: Tensor) -> Tensor:
-        return torch.repeat_interleave(values, counts, dim=0, output_size=total)
-
-    disc, n = per_disc(chosen), per_disc(splits)
-    piece = torch.arange(total, device=device) - per_disc(counts.cumsum(0) - counts)
+    own = torch.repeat_interleave(counts, output_size=total)
+    disc, n = chosen[own], splits[own]
+    piece = torch.arange(total, device=device) - (counts.cumsum(0) - counts)[own]
     quats, scales, colors = g.quats[disc], g.scales[disc], g.sh[disc].double() * SH_C0 + 0.5
     axes = rotmat_from_quat(quats.double())
     sides = REACH * scales[:, :2].double()

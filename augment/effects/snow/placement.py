@@ -742,9 +742,10 @@ def place_snow_support(
         seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
         paths = wheel_paths(scene)
         work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
-        found = in_order(work.find, squares, after_each=bar.update)
+        in_turn = functools.partial(in_order, after_each=bar.update, backend=backend)
+        found = in_turn(work.find, squares)
         find = functools.partial(find_actor_cells, **vars(settings), backend=backend)
-        on_vehicles = zip(vehicles, in_order(find, vehicles, after_each=bar.update), strict=True)
+        on_vehicles = zip(vehicles, in_turn(find, vehicles), strict=True)
         actors = {actor.track_id: cells for actor, cells in on_vehicles if cells is not None}
     return SnowSupport(work.joined(found), actors)
 
