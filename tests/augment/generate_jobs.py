@@ -27,7 +27,7 @@ from augment.jobs.render_job import ProgressLog
 from augment.jobs.store import open_store
 from augment.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe
 from recipes.schema import Recipe
 
 NOTES = "CLIMATEGS_TEST_NOTES"

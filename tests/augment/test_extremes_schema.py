@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe
 from recipes.schema import Recipe
 from recipes.template import FieldSpec, Kind
 from tests.augment.extremes import (

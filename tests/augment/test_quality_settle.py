@@ -39,8 +39,7 @@ from augment.plan import make_plan
 from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.fields import found
-from recipes.load import load_recipe
-from recipes.parse import parse_recipe
+from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe, as_reference, free_knobs
 
 PLAIN = "output: {depth: none, labels: false, lidar: false}\n"

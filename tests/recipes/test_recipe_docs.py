@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from recipes.errors import RecipeError
-from recipes.load import preset_names
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe, preset_names
 from recipes.style import style_preset_names
 from recipes.template import root, words
 

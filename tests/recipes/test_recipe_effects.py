@@ -15,8 +15,7 @@ from recipes.errors import RecipeError
 from recipes.fields import FilePath, Number, Unit, Whole
 from recipes.files import read_files
 from recipes.json_schema import recipe_json_schema
-from recipes.load import dump_recipe, load_recipe
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, load_recipe, parse_recipe
 from recipes.schema import (
     KNOBS,
     SECTIONS,

@@ -11,8 +11,7 @@ import pytest
 
 from recipes.errors import RecipeError
 from recipes.files import digest_of, read_files, with_digest
-from recipes.load import dump_recipe, load_recipe
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, load_recipe, parse_recipe
 from recipes.schema import Recipe
 from recipes.style import Style
 

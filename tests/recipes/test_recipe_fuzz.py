@@ -6,8 +6,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from recipes.errors import RecipeError
-from recipes.load import dump_recipe
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, parse_recipe
 from recipes.template import RecipeTemplate, root
 
 KEYS = sorted(

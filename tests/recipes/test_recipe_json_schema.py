@@ -11,8 +11,7 @@ import yaml
 
 from recipes.errors import RecipeError
 from recipes.json_schema import DIALECT, recipe_json_schema, write_schema
-from recipes.load import dump_recipe, load_recipe, preset_names
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.template import root
 
 

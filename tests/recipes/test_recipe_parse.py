@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from recipes.errors import MAX_SHOWN, RecipeError
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe
 from recipes.template import Channels, Choice, Fixed, Normal, TripleLine, Uniform
 
 

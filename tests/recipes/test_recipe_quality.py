@@ -10,8 +10,7 @@ from recipes.errors import RecipeError
 from recipes.fields import changed, found, is_given, replaced
 from recipes.flood import Flood, Wave, Waves
 from recipes.job import scaled_recipe
-from recipes.load import dump_recipe
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, parse_recipe
 from recipes.schema import TIERS, Quality, Recipe, Render, Weather
 from recipes.style import Style
 from recipes.template import root

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
-from recipes.load import load_recipe
-from recipes.parse import parse_recipe
+from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Output, Quality, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.style import Style

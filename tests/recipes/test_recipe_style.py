@@ -10,7 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe
 from recipes.style import Style, style_preset_names, style_preset_text
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from recipes.errors import RecipeError
 from recipes.flood import Flood, Wave, Waves
-from recipes.load import dump_recipe
-from recipes.parse import parse_recipe
+from recipes.load import dump_recipe, parse_recipe
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.template import Fixed, RecipeTemplate

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
-from recipes.parse import parse_recipe
+from recipes.load import parse_recipe
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
 
 

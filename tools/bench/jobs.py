@@ -36,8 +36,7 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import WeatheredView, render_view
 from recipes.job import Job, JobRecipes
-from recipes.load import load_recipe
-from recipes.parse import parse_recipe
+from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe
 from recipes.template import RecipeTemplate
 from tools.bench.harness import (
