@@ -6,12 +6,10 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.flood import screen_space
 from augment.effects.flood.flood import Layer
-from augment.effects.flood.screen_space import ScreenReflection
+from augment.effects.flood.screen_space import trace_screen
 from augment.geometry import rigid, rotmat_from_quat
 from augment.render.threads import limit_threads
-from tests.augment.flood_programs import few_programs
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
 LEVEL_M = 0.3
@@ -25,16 +23,6 @@ def one_torch_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(autouse=True)
-def large_programs(monkeypatch):
-    few_programs(monkeypatch, 128)
-
-
-def trace_screen(*args, **kwargs) -> ScreenReflection:
-    found = screen_space.trace_screen(*args, **kwargs)
-    return dataclasses.replace(found, distance=found.distance.cpu(), weight=found.weight.cpu())
 
 
 def looking(
@@ -101,7 +89,7 @@ VIEWS = [(0, 0), (8, 0), (0, 25), (12, -40), (-10, 5), (35, 90)]
 
 
 @pytest.mark.parametrize(
-    ("backend", "view"), [*itertools.product(["reference", "cpu"], VIEWS[1::2]), ("cuda", VIEWS[1])]
+    ("backend", "view"), [*itertools.product(["reference", "cpu"], VIEWS[1::2])]
 )
 def test_rays_meet_a_wall_where_geometry_says(backend, view):
     pitch, roll = view
@@ -136,7 +124,7 @@ def test_a_wall_is_as_smooth_between_the_traced_pixels():
     assert torch.allclose(found[sure].double(), way[sure], rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     camera = looking(height=101)
     car_top, wall_top = 0.6, 5.0  # low and high enough for rays between them to be in the image
@@ -162,7 +150,7 @@ def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     assert found.distance[sky].isinf().all() and (found.weight[sky] == 1).all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     """A sign hangs before the sky: rays of water far behind it pass behind it."""
     camera = looking(0, height=151)
@@ -182,7 +170,7 @@ def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     assert found.distance[beside].isinf().all() and int((found.weight[beside] == 1).sum()) > 20
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_what_stands_above_the_image_is_not_known(backend):
     camera = looking(30)  # the horizon lies above the image
     front = see(camera, (WALL_M, -1e3, 1e3, 0.0, 1e3))
@@ -193,7 +181,7 @@ def test_what_stands_above_the_image_is_not_known(backend):
     assert (found.weight[above] == 0).all() and found.distance[above].isinf().all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_rays_that_come_back_to_the_camera_are_not_known(backend):
     """Looking straight down, past the point under the camera."""
     for roll in (0, 30):
@@ -203,9 +191,7 @@ def test_rays_that_come_back_to_the_camera_are_not_known(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize(
-    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4), ("cuda", 1)]
-)
+@pytest.mark.parametrize(("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4)])
 def test_nothing_stands_anywhere(backend, stride):
     camera = looking(0, height=65)
     front = see(camera)
@@ -216,7 +202,7 @@ def test_nothing_stands_anywhere(backend, stride):
     assert (found.weight[:32] == 0).all()  # above the horizon there is no water
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_pixels_without_water_have_no_reflection(backend):
     camera = looking(10)
     everything = dataclasses.replace(
@@ -249,24 +235,21 @@ def test_every_size_of_image_and_window(size, stride):
     assert float(beyond.weight.sum()) == pytest.approx(float(whole.weight.sum()), rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("backend", "pitch", "roll"),
-    [*(("cpu", *view) for view in (*VIEWS[::2], (80, 20))), ("cuda", 12, -40)],
-)
-def test_the_kernel_matches_the_definition(backend, pitch, roll):
+@pytest.mark.parametrize(("pitch", "roll"), [*VIEWS[::2], (80, 20)])
+def test_the_kernel_matches_the_definition(pitch, roll):
     camera = looking(pitch, roll, 131, 90, fx=80.0)
     front = see(camera, SIGN, CAR, WALL, (30.0, 2.0, 9.0, 1.0, 8.0))
-    fast = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
+    fast = trace_screen(front, camera, LEVEL_M, stride=1)
     slow = trace_screen(front, camera, LEVEL_M, backend="reference")
     close = torch.isclose(fast.distance, slow.distance, rtol=1e-3, atol=1e-3)
     close &= (fast.weight - slow.weight).abs() < 1e-3
-    # The definition steps over corners of pixels (a quarter of a pixel a step): there a ray may
+    # The definition steps over corners of pixels (a pixel of the longer axis a step): there a ray may
     # pass a silhouette that it grazes, about one ray in 300.
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 
 @pytest.mark.parametrize(
-    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4), ("cuda", 1)]
+    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4)]
 )
 def test_only_needed_pixels_are_traced(backend, stride):
     camera = looking(6, 10)

@@ -14,8 +14,8 @@ from augment.effects.flood.waves import (
     WaveSet,
     make_waves,
     normals_from_tangents,
-    phase_of,
-    tangent_terms,
+    phases_of,
+    tangents_of,
     turns_at,
     wave_field,
 )
@@ -47,9 +47,9 @@ def waves_of(count: int = 5, *, steepness: float = 0.5, low=0.4, high=6.0, slope
 def displaced_surface(waves: WaveSet, points: torch.Tensor, timestamp_ns: int) -> torch.Tensor:
     """Where points [N, 2] of the still plane are at that time; z counts from its level."""
     surface = torch.nn.functional.pad(points, (0, 1))
-    turns = turns_at(waves, timestamp_ns)
+    phases = phases_of(waves, turns_at(waves, timestamp_ns), points)
     for i, (dx, dy) in enumerate(waves.directions.tolist()):
-        theta = phase_of(waves, i, turns, points)
+        theta = phases[..., i]
         across = float(waves.steepness[i] / waves.wavenumbers[i]) * theta.cos()
         lift = float(waves.amplitudes_m[i]) * theta.sin()
         surface = surface + torch.stack([dx * across, dy * across, lift], dim=-1)
@@ -58,10 +58,8 @@ def displaced_surface(waves: WaveSet, points: torch.Tensor, timestamp_ns: int) -
 
 def wave_normals(waves: WaveSet, points: torch.Tensor, timestamp_ns: int) -> torch.Tensor:
     """Unit normals over parameter points, with every wave at full height."""
-    turns = turns_at(waves, timestamp_ns)
-    terms = [tangent_terms(waves, i, phase_of(waves, i, turns, points)) for i in range(len(turns))]
-    none = torch.zeros(*points.shape[:-1], 5, dtype=torch.float64)
-    return normals_from_tangents(sum(terms, none))
+    theta = phases_of(waves, turns_at(waves, timestamp_ns), points)
+    return normals_from_tangents(tangents_of(waves, theta))
 
 
 def camera_at(
@@ -233,7 +231,7 @@ def test_a_cusp_counts_as_level():
     assert wave_normals(waves, points, 0).tolist() == [[0, 0, 1]]
     # A camera over it, whose middle pixel is the cusp: float32 may see either flank, not NaN.
     camera = camera_at([1.0, 0, 3.0], down_deg=90, size=(9, 9), time=0)
-    for backend in ("cpu", "reference", "cuda"):
+    for backend in ("cpu", "reference"):
         field = fields_of(waves, camera, backend=backend)
         assert bool((field[:2].norm(dim=0) <= 1 + 1e-6).all())
 
@@ -266,7 +264,7 @@ SETS = {
 
 def fields_of(waves: WaveSet, camera: Camera, *, backend: str, level_z_m: float = 0.0):
     field = wave_field(waves, camera, level_z_m, backend=backend)
-    return torch.stack([field.normal_x, field.normal_y, field.slope_variance]).cpu()
+    return torch.stack([field.normal_x, field.normal_y, field.slope_variance])
 
 
 @pytest.mark.parametrize(
@@ -280,13 +278,13 @@ def fields_of(waves: WaveSet, camera: Camera, *, backend: str, level_z_m: float 
 )
 def test_the_kernel_matches_the_definition(waves, cameras):
     for name in cameras:
-        assert_matches_the_definition(SETS[waves], CAMERAS[name], "cpu")
+        assert_matches_the_definition(SETS[waves], CAMERAS[name])
         seen = fields_of(SETS[waves], CAMERAS[name], backend="reference")
         assert bool((seen != 0).any()) == (name != "up")
 
 
-def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) -> None:
-    fast = fields_of(waves, camera, backend=backend)
+def assert_matches_the_definition(waves: WaveSet, camera: Camera) -> None:
+    fast = fields_of(waves, camera, backend="cpu")
     slow = fields_of(waves, camera, backend="reference")
     assert fast.shape == slow.shape and fast.dtype == slow.dtype == torch.float32
     # Turns from an anchor at most 64 pixels away, at 4 pixels a turn: 16 * 6e-8 * 2 pi = 6e-6
@@ -295,27 +293,12 @@ def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) 
     assert float((fast - slow).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("camera", ["rolled", "down", "under water", "one pixel", "tele"])
-def test_the_gpu_s_kernel_matches_the_definition(camera):
-    camera = CAMERAS[camera]
-    last = camera.cropped(0, camera.height - 1, camera.width, 1)  # interpreted: slow
-    assert_matches_the_definition(SETS["24"], last, "cuda")
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("waves", SETS)
-def test_whole_images_on_a_gpu_match_the_definition(waves):
-    for camera in CAMERAS.values():
-        assert_matches_the_definition(SETS[waves], camera, "cuda")
-
-
-@pytest.mark.parametrize("backend", ["cpu", "cuda"])
-def test_a_wide_image_far_from_the_origin_is_as_exact(backend):
+def test_a_wide_image_far_from_the_origin_is_as_exact():
     """Waves that turn hundreds of times between the eye and the image's corner."""
     camera = camera_at([4e5, -3e5, 1.5], down_deg=2, size=(1600, 2), focal=1500.0, time=10**18)
     camera = dataclasses.replace(camera, cy=-30.0)
     waves = waves_of(6, steepness=0.3, slope=0.6, low=0.3, high=6.0)
-    assert_matches_the_definition(waves, camera, backend)
+    assert_matches_the_definition(waves, camera)
 
 
 def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.ndarray, ...]:
@@ -376,7 +359,7 @@ def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
     rays = camera.ray_directions(torch.float64)
     meets = (rays[..., 2] < 0) & (-1.5 / rays[..., 2] <= FARTHEST_M)
     assert 0.2 < float(meets.double().mean()) < 0.9
-    for backend in ("cpu", "reference", "cuda"):
+    for backend in ("cpu", "reference"):
         field = fields_of(waves, camera, backend=backend)
         assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
         assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())

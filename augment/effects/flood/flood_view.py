@@ -18,23 +18,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
-from augment.effects.flood.refraction import is_smooth
 from augment.effects.flood.screen_space import trace_screen
-from augment.effects.flood.water import shade_water
+from augment.effects.flood.water import is_smooth, shade_water
+from augment.effects.flood.water_kernels import HIDDEN_COVER
 from augment.effects.flood.water_plane import (
     Margins,
     Window,
     falling,
-    image_coordinates,
     mirrored_camera,
     mirrored_window,
     plane_depth,
@@ -42,52 +39,26 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import wave_field
-from augment.render.buffers import (
-    ALPHA,
-    AUTO,
-    CPU,
-    CUDA,
-    EXPECTED_DEPTH,
-    REFERENCE,
-    RGB,
-    SPLAT_IDS,
-    RenderOutput,
-    kernels_for,
-)
+from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import composite_sky, sky_behind
 from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
-from augment.render.threads import kernel_threads
 from augment.sky import Sky, sample_at
 from augment.timing import timed
 
 # ---- Layers composited ---------------------------------------------------------------------------
 
-ROWS = 32  # image rows a thread takes at a time
-
 
 def find_water(
-    alpha: Float[Tensor, "H W"], camera: Camera, *, backend: str = CPU
-) -> tuple[Bool[Tensor, "H W"], float]:
+    alpha: Float[Tensor, "H W"], camera: Camera
+) -> tuple[Bool[Tensor, "H W"], Float[Tensor, ""]]:
     """Where a camera above the water sees it first, and the largest share of it in any pixel.
 
     alpha: of what stands before the water, which is seen where that leaves more than half.
     """
-    kernels = kernels_for(backend, alpha)
-    if kernels == CUDA:
-        from augment.effects.flood import cuda
-
-        water, most = cuda.find_water(alpha, camera)
-        return water, float(most)  # waits for the GPU: what is drawn next depends on it
-    if kernels == CPU:
-        water = np.empty(tuple(alpha.shape), np.uint8)
-        shown = np.empty(len(alpha), np.float32)
-        with kernel_threads(ROWS):
-            water_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
-        return torch.from_numpy(water).view(torch.bool), float(shown.max())
-    share = torch.where(falling(camera), 1 - alpha, torch.zeros_like(alpha))
-    return share > 0.5, float(share.max())
+    share = torch.where(falling(camera, alpha.device), 1 - alpha, 0)
+    return share > 0.5, share.max()
 
 
 def composite_water(
@@ -102,41 +73,21 @@ def composite_water(
 ) -> Float[Tensor, "H W 3"]:
     """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
 
-    color: of the window's pixels. backend: kernels work in place, in the front's own colours.
+    color: of the window's pixels.
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
-    kernels = kernels_for(backend, rgb, alpha)
-    if kernels == REFERENCE:
-        image = composite_sky(rgb, alpha, camera, sky, fog=fog, backend=backend)
-        mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
-        meets = falling(window.of(camera))[..., None]
-        window.paste(image, torch.where(meets, mixed, window.cut(image)))
-        return image
-    if kernels == CUDA:
-        from augment.effects.flood import cuda
-
-        part, dry = rgb, cuda.dry_rows(camera)
-        if dry:
-            above = camera.cropped(0, 0, camera.width, dry)
-            part = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog, backend=backend)
-        cuda.composite_water(rgb, alpha, camera, window, color, part, dry)
-        return rgb
-    dry = _dry_rows(camera)
+    image, dry = rgb.clone(), _dry_rows(camera)
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
-        part = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog)
-        # Rows that show both: what falls there belongs to the water, the rest to the sky.
-        shared = rgb[window.top : dry].clone()
-        rgb[:dry] = part
-        if window.top < dry:
-            wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
-            rgb[window.top : dry][wet] = shared[wet]
-    with kernel_threads(ROWS):
-        images = alpha.numpy(), color.contiguous().numpy(), rgb.numpy()
-        rays = _rays(window.of(camera))
-        water_kernels.composite_water(*rays, window.top, window.left, *images)
-    return rgb
+        image[:dry] = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog, backend=backend)
+    mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
+    shared = min(max(dry - window.top, 0), len(mixed))  # rows that show both
+    if shared:
+        meets = falling(camera.cropped(window.left, window.top, mixed.shape[1], shared), rgb.device)
+        mixed[:shared] = torch.where(meets[..., None], mixed[:shared], window.cut(image)[:shared])
+    window.cut(image).copy_(mixed)
+    return image
 
 
 def _dry_rows(camera: Camera) -> int:
@@ -146,63 +97,33 @@ def _dry_rows(camera: Camera) -> int:
     return int(dry.max()) + 1 if len(dry) else 0
 
 
-def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rise = np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
-    return *image_coordinates(camera), rise
-
-
 def merge_depths(
-    front: RenderOutput,
-    behind: RenderOutput,
-    window: Window,
-    buffers: frozenset[str],
-    *,
-    backend: str = CPU,
+    front: RenderOutput, behind: RenderOutput, window: Window, buffers: frozenset[str]
 ) -> RenderOutput:
     """Buffers of two layers as one scene's, colour excepted; behind: what the window shows through
     the water.
 
     Alpha and expected depth are what one render would give; other buffers are those of the layer
-    that covers more of the pixel. backend: kernels work in place.
+    that covers more of the pixel.
     """
     assert front.alpha is not None and behind.alpha is not None
     requested = buffers - {RGB, ALPHA}
     if not requested:
         return RenderOutput()
-    values = {name: getattr(front, name) for name in (*requested, ALPHA)}
-    kernels = kernels_for(backend, front.alpha)
-    if kernels == CUDA:
-        from augment.effects.flood import cuda
-
-        pairs = {name: (values[name], getattr(behind, name)) for name in sorted(requested)}
-        depths = pairs.pop(EXPECTED_DEPTH, None)
-        cuda.merge_depths(front.alpha, behind.alpha, depths, list(pairs.values()), window)
-        return RenderOutput(**values)
-    if kernels == CPU:
-        here, there = window.overlap(front.alpha)
-        alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
-        with kernel_threads(ROWS):
-            for name in sorted(requested):
-                pair = (values[name].numpy()[here], getattr(behind, name).numpy()[there])
-                if name == EXPECTED_DEPTH:
-                    water_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
-                else:
-                    water_kernels.join_heavier(*alphas, *pair)
-            water_kernels.join_alpha(*alphas)
-        return RenderOutput(**values)
-    covered = torch.zeros_like(front.alpha)
-    window.paste(covered, behind.alpha)
-    share = (1 - front.alpha) * covered
-    values[ALPHA] = front.alpha + share
+    here, there = window.overlap(front.alpha)
+    alpha = front.alpha[here]
+    share = (1 - alpha) * behind.alpha[there]
+    total = alpha + share
+    merged = {ALPHA: total}
     for name in requested:
-        nearer = values[name]
-        other = torch.full_like(nearer, -1) if name == SPLAT_IDS else torch.zeros_like(nearer)
-        window.paste(other, getattr(behind, name))
+        nearer, other = getattr(front, name)[here], getattr(behind, name)[there]
         if name == EXPECTED_DEPTH:
-            total = front.alpha * nearer + share * other
-            values[name] = total / values[ALPHA].clamp_min(DEPTH_EPS)
+            merged[name] = (alpha * nearer + share * other) / total.clamp_min(DEPTH_EPS)
         else:
-            values[name] = torch.where(share > front.alpha, other, nearer)
+            merged[name] = torch.where(share > alpha, other, nearer)
+    values = {name: getattr(front, name).clone() for name in merged}
+    for name, value in merged.items():
+        values[name][here] = value
     return RenderOutput(**values)
 
 
@@ -307,21 +228,19 @@ def render_flooded(
         front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
     sky, fog = renderer.sky, renderer.fog
-    backend = renderer.backend
-    if backend == AUTO and front.alpha.device.type != "cpu":
-        backend = CUDA  # also passes without an image of their own run where the layers lie
+    backend, device = renderer.backend, front.alpha.device
     with timed("flood: where it is seen"):
-        water, most_shown = find_water(front.alpha, camera, backend=backend)
-    if most_shown < 1 - water_kernels.HIDDEN_COVER:
+        water, most_shown = find_water(front.alpha, camera)
+    if float(most_shown) < 1 - HIDDEN_COVER:  # waits for the GPU: what is drawn depends on it
         with timed("sky"):
             image = composite_sky(front.rgb, front.alpha, camera, sky, fog=fog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
     cover = window.cut(front.alpha)
-    seen = cover <= water_kernels.HIDDEN_COVER
+    seen = cover <= HIDDEN_COVER
     with timed("flood: waves"):
-        field = wave_field(medium.waves, crop, medium.level_z_m, backend=backend)
+        field = wave_field(medium.waves, crop, medium.level_z_m, device=device, backend=backend)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
@@ -350,7 +269,7 @@ def render_flooded(
         )
     with timed("flood: layers joined"):
         image = composite_water(front, camera, window, color, sky, fog, backend=backend)
-        scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
+        scene = merge_depths(front, bed, bed_window, buffers)
     return FloodedImage(image, scene, water)
 
 
@@ -441,5 +360,5 @@ def _from_below(
     image = view_from_below(*layers, medium, renderer.sky, renderer.fog)
     water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
-    scene = merge_depths(front, air, whole, buffers, backend=renderer.backend)
+    scene = merge_depths(front, air, whole, buffers)
     return FloodedImage(image, scene, water)

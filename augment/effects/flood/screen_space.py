@@ -18,7 +18,8 @@ plane if c < 0.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +29,8 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood import kernels
 from augment.effects.flood.flood import Layer
-from augment.effects.flood.water_plane import window_offset
-from augment.render.buffers import CPU, CUDA, kernels_for
+from augment.effects.flood.water_plane import Window, falling, window_offset
+from augment.render.buffers import CPU, kernels_for
 from augment.render.threads import kernel_threads
 
 # The kernels' thresholds, as numbers that torch takes.
@@ -39,8 +40,8 @@ COVERED, THICKNESS_M, THICKNESS = map(
 HIDDEN_PX, NEAR_M = float(kernels.HIDDEN_PX), float(kernels.NEAR_M)
 AGREEING, EDGE = float(kernels.AGREEING), float(kernels.EDGE)
 
-STEP_PX = 0.25  # of the definition's march
-RAYS = 1 << 18  # rays the definition marches at a time
+SAMPLES = 1 << 22  # that the definition looks at at a time; rays go on by at least MIN_PX
+MIN_PX = 16
 ROWS = 4  # rows of rays a thread takes at a time
 
 
@@ -75,9 +76,9 @@ def trace_screen(
     the image, come back to the camera's plane, or are lost behind something thin. It falls to 0
     over the outer 4 % of the image.
 
-    backend: kernels equal this definition but for rays that graze a silhouette's pixel. The CPU's
-    trace every `stride`-th pixel of rows and columns, interpolate where four agree and trace the
-    rest; it is 1, 2 or 4.
+    backend: the CPU's kernels equal this definition but for rays that graze a silhouette's pixel.
+    They trace every `stride`-th pixel of rows and columns, interpolate where four agree and trace
+    the rest; it is 1, 2 or 4.
 
     Raises:
         ValueError: the camera is no window of the front's.
@@ -89,13 +90,8 @@ def trace_screen(
         return ScreenReflection(front, distance, torch.zeros_like(distance))
     if needed is None:
         needed = torch.ones(size, dtype=torch.bool, device=device)
-    backend = kernels_for(backend, front.alpha.detach())
-    vertical = _vertical(front.camera, level_z_m)
-    if backend == CUDA:
-        from augment.effects.flood import cuda
-
-        found = cuda.trace(front, camera, left, top, needed, vertical)
-    elif backend == CPU:
+    if kernels_for(backend, front.alpha.detach()) == CPU:
+        vertical = _vertical(front.camera, level_z_m)
         found = _run_kernels(front, camera, vertical, (left, top), stride, needed)
     else:
         found = _trace(front, camera, level_z_m, left, top, needed)
@@ -137,30 +133,34 @@ def _run_kernels(
     return torch.from_numpy(distance), torch.from_numpy(weight)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rays:
-    """Mirrored rays in pixels; the letters are the module's.
+class _Rays(NamedTuple):
+    """Mirrored rays in pixels, [N] or [N, 1]; the letters are the module's.
 
     x, y: where they start. step_x, step_y: G / g. near: 1 / s. bend: c. scale: a g. end: the t at
     which the march is over; to_sky: infinitely far away. metres: |x|.
     """
 
-    x: Float[Tensor, "N"]
-    y: Float[Tensor, "N"]
-    step_x: Float[Tensor, "N"]
-    step_y: Float[Tensor, "N"]
-    near: Float[Tensor, "N"]
-    bend: Float[Tensor, "N"]
-    scale: Float[Tensor, "N"]
-    end: Float[Tensor, "N"]
-    to_sky: Bool[Tensor, "N"]
-    metres: Float[Tensor, "N"]
+    x: Tensor
+    y: Tensor
+    step_x: Tensor
+    step_y: Tensor
+    near: Tensor
+    bend: Tensor
+    scale: Tensor
+    end: Tensor
+    to_sky: Tensor
+    metres: Tensor
 
     def select(self, index: Tensor) -> _Rays:
-        return _Rays(*(getattr(self, f.name)[index] for f in fields(self)))
+        return _Rays(*(part[index] for part in self))
 
     def inverse_depth(self, t: Tensor) -> Tensor:
         return (1 - self.bend * t) * self.near
+
+    def pixel(self, t: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+        """Column and row after t pixels, inside the image."""
+        x = (self.x + t * self.step_x).floor().clamp(0, width - 1)
+        return x.long(), (self.y + t * self.step_y).floor().clamp(0, height - 1).long()
 
 
 def _mirrored_rays(camera: Camera, level_z_m: float, x: Tensor, y: Tensor) -> _Rays:
@@ -187,65 +187,65 @@ def _mirrored_rays(camera: Camera, level_z_m: float, x: Tensor, y: Tensor) -> _R
 def _trace(
     front: Layer, camera: Camera, level_z_m: float, left: int, top: int, needed: Bool[Tensor, "h w"]
 ) -> tuple[Tensor, Tensor]:
-    """The definition: every pixel, in small steps."""
-    whole = front.camera
-    row, column = torch.meshgrid(
-        torch.arange(camera.height) + top, torch.arange(camera.width) + left, indexing="ij"
-    )
-    inside = (row >= 0) & (row < whole.height) & (column >= 0) & (column < whole.width)
-    cover = torch.ones(row.shape, dtype=front.alpha.dtype)
-    cover[inside] = front.alpha.detach()[row[inside], column[inside]]
-    asked = needed & (cover < COVERED) & (camera.ray_directions(torch.float64)[..., 2] < 0)
-    x, y = column[asked].double() + 0.5, row[asked].double() + 0.5
+    """The definition: every pixel, in steps of a pixel along the ray's longer axis."""
+    whole, device = front.camera, front.alpha.device
+    alpha, depth = front.alpha.detach(), front.depth.detach()
+    window = Window(left, top, left + camera.width, top + camera.height)
+    cover = torch.ones(camera.height, camera.width, dtype=alpha.dtype, device=device)
+    here, there = window.overlap(alpha)
+    cover[there] = alpha[here]
+    asked = needed & (cover < COVERED) & falling(camera, device)
+    row, column = torch.nonzero(asked, as_tuple=True)
+    x, y = (column + (left + 0.5)).double(), (row + (top + 0.5)).double()
     rays = _mirrored_rays(whole, level_z_m, x, y)
-    solid = torch.where(front.alpha.detach() >= 0.5, 1 / front.depth.detach().double(), 0.0)
-    found = [_march(rays.select(part), solid) for part in torch.arange(len(x)).split(RAYS)]
-    distance = torch.full(row.shape, math.inf, dtype=torch.float64)
+    solid = torch.where(alpha >= 0.5, 1 / depth.double(), 0.0)
+    distance = torch.full(cover.shape, math.inf, device=device)
     weight = torch.zeros_like(distance)
-    if found:
-        distance[asked] = torch.cat([d for d, _ in found])
-        weight[asked] = torch.cat([w for _, w in found])
-    return distance.float(), weight.float()
+    way, trust = _march(rays, solid)
+    distance[row, column], weight[row, column] = way.float(), trust.float()
+    return distance, weight
 
 
 def _march(rays: _Rays, solid: Tensor) -> tuple[Tensor, Tensor]:
     """Metres to what is met and its weight. solid [H, W]: the front's inverse depth, 0 if none."""
     height, width = solid.shape
-    way = torch.full_like(rays.x, math.inf)
-    weight = torch.zeros_like(way)
-    hidden = torch.zeros_like(way)  # pixels spent behind something without a break
-    lost = torch.zeros_like(rays.to_sky)  # behind something at the last step
-    clean = torch.ones_like(lost)  # never was behind anything
-    going = torch.arange(len(way))
-    first = (rays.x.floor(), rays.y.floor())
-    step = 0
+    end_at = torch.full_like(rays.x, math.nan)  # steps to what is met, or to the sky
+    met_any = torch.zeros_like(rays.to_sky)
+    hidden = torch.zeros_like(rays.x, dtype=torch.long)  # steps behind something without a break
+    clean = torch.ones_like(rays.to_sky)  # never was behind anything
+    going, first = torch.arange(len(rays.x), device=solid.device), 1
     while len(going):
-        r = rays.select(going)
-        begin, step = step * STEP_PX, step + 1
-        over = begin >= r.end
-        ends = going[over & r.to_sky & clean[going]]
-        weight[ends] = _edge_weight(rays.select(ends), rays.end[ends], width, height)
-        finish = torch.minimum(torch.full_like(r.end, step * STEP_PX), r.end)
-        middle = 0.5 * (begin + finish)
-        x = (r.x + middle * r.step_x).floor().clamp(0, width - 1)
-        y = (r.y + middle * r.step_y).floor().clamp(0, height - 1)
-        surface = solid[y.long(), x.long()]
-        k0, k1 = r.inverse_depth(torch.full_like(r.end, begin)), r.inverse_depth(finish)
-        started = (x != first[0][going]) | (y != first[1][going])
-        reached = ~over & started & (surface > 0) & (torch.minimum(k0, k1) <= surface)
+        count = max(SAMPLES // len(going), MIN_PX)
+        r = rays.select(going[:, None])
+        step = torch.arange(first, first + count, device=solid.device)  # pixels' centres
+        over = step - 0.5 >= r.end
+        x, y = r.pixel(step, width, height)
+        surface = solid[y, x]
+        k0 = r.inverse_depth(step - 0.5)
+        k1 = r.inverse_depth(torch.minimum(step + 0.5, r.end))
+        reached = ~over & (surface > 0) & (torch.minimum(k0, k1) <= surface)
         met = reached & (torch.maximum(k0, k1) >= _back_side(surface))
-        hits = going[met]
-        hit, back = r.select(met), _back_side(surface[met])
-        t = _refine(hit, solid, x[met], y[met])
-        # Not farther than what was met, however the ray grazes it.
-        share = torch.maximum(hit.inverse_depth(t), back) / hit.near
-        way[hits] = hit.metres * t / (hit.scale * share)
-        weight[hits] = _edge_weight(hit, t, width, height)
         lost = reached & ~met
-        clean[going[lost]] = False
-        hidden[going] = torch.where(lost, hidden[going] + STEP_PX, 0.0)
-        going = going[~over & ~met & (hidden[going] <= HIDDEN_PX)]
-    return way, weight
+        # Steps behind something: since the last that was not, of this stretch or of those before.
+        free = torch.where(lost, first - 1 - hidden[going][:, None], step).cummax(1).values
+        stops = over | met | (step - free > HIDDEN_PX)
+        at = stops.to(torch.uint8).argmax(1, keepdim=True)
+        stopped = stops.gather(1, at)[:, 0]
+        was_clean = clean[going] & ~(lost & (step < first + at)).any(1)
+        hits = met.gather(1, at)[:, 0] & stopped
+        to_sky = over.gather(1, at)[:, 0] & stopped & was_clean & rays.to_sky[going]
+        reach = torch.where(hits, (first + at[:, 0]).to(solid.dtype), rays.end[going])
+        end_at[going] = torch.where(hits | to_sky, reach, math.nan)
+        met_any[going], clean[going] = hits, was_clean
+        hidden[going] = first + count - 1 - free[:, -1]
+        going, first = going[~stopped], first + count
+    x, y = rays.pixel(end_at.nan_to_num(0), width, height)
+    here = solid[y, x]
+    t = torch.where(met_any, _refine(rays, solid, x, y), end_at)
+    # Not farther than what was met, however the ray grazes it.
+    share = torch.maximum(rays.inverse_depth(t), _back_side(here)) / rays.near
+    way = torch.where(met_any, rays.metres * t / (rays.scale * share), math.inf)
+    return way, _edge_weight(rays, t, width, height).nan_to_num(0)
 
 
 def _back_side(surface: Tensor) -> Tensor:
@@ -259,10 +259,9 @@ def _refine(rays: _Rays, solid: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
     The plane's inverse depth is linear in the image, by differences to neighbours that agree.
     """
-    column, row = x.long(), y.long()
-    here = solid[row, column]
-    across = _slope(solid, here, row, column, 0, 1)
-    down = _slope(solid, here, row, column, 1, 0)
+    here = solid[y, x]
+    across = _slope(solid, here, y, x, 0, 1)
+    down = _slope(solid, here, y, x, 1, 0)
     off_x, off_y = x + 0.5 - rays.x, y + 0.5 - rays.y
     closing = -rays.bend * rays.near - across * rays.step_x - down * rays.step_y
     meet = (here - across * off_x - down * off_y - rays.near) / closing

@@ -1,4 +1,4 @@
-"""Numba kernels that shade a water surface and composite a flooded view's layers.
+"""The numba kernel that shades a water surface.
 
 `shade` implements `water.shade_water`. It sorts a row's water pixels into a smooth and a rough list
 and works on eight pixels at a time: rough ones need three slopes and mip levels, smooth ones the
@@ -26,7 +26,7 @@ from augment.render.layout import U
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 # (of numba's intrinsics it sees the compiler's first argument as well, and no result)
 
-# Constants of the definition (`refraction`, `water`), which the kernels round to float32.
+# Constants of the definition (`water`), which the kernels round to float32.
 # Water that is covered more than HIDDEN_COVER is one colour. Opaque surfaces let up to 4 % through
 # (a splat that would bring transmittance to 1e-4 is not blended, whatever is left before it), and
 # what shines through them is worth no reflections.
@@ -45,108 +45,6 @@ MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
 MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
 FAINT = 1 / 256  # a share of the sky that does not change what it shows through
-
-# ---- Mip levels ----------------------------------------------------------------------------------
-
-
-@kernel
-def pack(rgb, alpha, out):
-    """rgb [H, W, 3] and alpha [H, W] side by side in out [H, W, 4]."""
-    for i in prange(out.shape[0]):
-        for j in range(np.uint64(out.shape[1])):
-            for c in range(np.uint64(3)):
-                out[i, j, c] = rgb[i, j, c]
-            out[i, j, 3] = alpha[i, j]
-
-
-@kernel
-def halve_mip(image, out):
-    """Averages over 2 x 2 pixels of image [H, W, 4] into out [h, w, 4]."""
-    height, width, _ = image.shape
-    quarter = np.float32(0.25)
-    for i in prange(out.shape[0]):
-        top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
-        for j in range(np.uint64(out.shape[1])):
-            c0 = np.uint64(2) * j
-            c1 = min(c0 + np.uint64(1), np.uint64(width - 1))
-            for c in range(np.uint64(4)):
-                total = (image[top, c0, c] + image[bottom, c0, c]) + (
-                    image[top, c1, c] + image[bottom, c1, c]
-                )
-                out[i, j, c] = quarter * total
-
-
-# ---- Layers of a flooded view --------------------------------------------------------------------
-
-
-@inner()
-def _falls(u, v, rise):
-    """Vertical part of a pixel's ray, summed in the order of Camera.ray_directions."""
-    return (u * rise[0] + v * rise[1]) + rise[2]
-
-
-@kernel
-def find_water(u, v, rise, alpha, shown, water):
-    """water [H, W] uint8: 1 where a ray falls and alpha leaves more than half of it, else 0.
-
-    u [W], v [H]: image coordinates at unit depth, float64. rise [3]: world z along the camera's
-    axes. shown [H]: the largest share of a falling ray that alpha leaves in each row, 0 where none
-    falls.
-    """
-    for i in prange(alpha.shape[0]):
-        most = np.float32(0)
-        for j in range(alpha.shape[1]):
-            share = np.float32(1) - alpha[i, j]
-            share = share if _falls(u[j], v[i], rise) < 0.0 else np.float32(0)
-            most = max(most, share)
-            water[i, j] = np.uint8(share > np.float32(0.5))
-        shown[i] = most
-
-
-@kernel
-def composite_water(u, v, rise, top, left, alpha, color, rgb):
-    """rgb += (1 - alpha) color where rays fall. color: [h, w, 3], its corner at row top, column
-    left of rgb [H, W, 3]; u, v: of its own columns and rows.
-    """
-    for i in prange(color.shape[0]):
-        row = U(top + i)
-        for j in range(color.shape[1]):
-            if _falls(u[j], v[i], rise) < 0.0:
-                column = U(left + j)
-                transmittance = np.float32(1) - alpha[row, column]
-                for c in range(U(3)):
-                    rgb[row, column, c] += transmittance * color[U(i), U(j), c]
-
-
-@kernel
-def join_depth(alpha, behind_alpha, depth, behind_depth, least):
-    """Expected depth of two layers as one: means by weight, into depth [h, w]."""
-    for i in prange(alpha.shape[0]):
-        for j in range(alpha.shape[1]):
-            a = alpha[i, j]
-            share = (np.float32(1) - a) * behind_alpha[i, j]
-            total = a * depth[i, j] + share * behind_depth[i, j]
-            depth[i, j] = total / max(a + share, least)
-
-
-@kernel
-def join_heavier(alpha, behind_alpha, values, behind):
-    """Values of the layer that covers more of a pixel, into values [h, w]."""
-    for i in prange(alpha.shape[0]):
-        for j in range(alpha.shape[1]):
-            a = alpha[i, j]
-            if (np.float32(1) - a) * behind_alpha[i, j] > a:
-                values[i, j] = behind[i, j]
-
-
-@kernel
-def join_alpha(alpha, behind_alpha):
-    """alpha [h, w] += (1 - alpha) of the layer behind."""
-    for i in prange(alpha.shape[0]):
-        for j in range(alpha.shape[1]):
-            a = alpha[i, j]
-            alpha[i, j] = a + (np.float32(1) - a) * behind_alpha[i, j]
-
 
 # ---- The water's colour --------------------------------------------------------------------------
 
@@ -719,29 +617,85 @@ def _store_tap(s, tap, share, ray):
     v8.store(s, SHARE + t, share)
 
 
-@kernel
-def shade(
-    u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth,
-    offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes,
-    has_mirror, front_view, front_rgb, front_alpha, front_depth, has_front, front_distance,
-    front_weight, faces, size, medium_numbers, smooth_variance, out,
-):  # fmt: skip
-    """Water of the pixels of a camera into out [H, W, 3].
-
-    u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
-    (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
-    whose rays run front_distance. faces: flat cube map with its border, `size` squared texels a
-    face, four numbers each. mirror_mips: the mirrored layer's mip levels, four numbers a pixel.
-    mirror_sizes [levels, 3]: their first pixels, widths, heights. faces and mirror_mips go on a row
-    and a pixel beyond. smooth_variance: slope variance from which a pixel is rough.
+class Pixels(NamedTuple):
+    """u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera; all float64.
+    cover [H, W]: alpha before the water. left, top: of the camera's window in the bed's.
     """
+
+    u: np.ndarray
+    v: np.ndarray
+    axes: np.ndarray
+    cover: np.ndarray
+    left: int
+    top: int
+
+
+class Normals(NamedTuple):
+    """Of a wave field. smooth_variance: slope variance from which a pixel is rough."""
+
+    x: np.ndarray
+    y: np.ndarray
+    variance: np.ndarray
+    smooth_variance: np.float32
+
+
+class Image(NamedTuple):
+    """A layer, flat; empty where there is none. view [22]: focal length times the camera's right,
+    down (fx, fy) and forward axes; coefficients of column, row and 1 in the x, y, z of a pixel's
+    ray; cx, cy, width, height.
+    """
+
+    view: np.ndarray
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+
+
+class Mips(NamedTuple):
+    """Mip levels, four numbers a pixel, and a row and a pixel beyond them. sizes [levels, 3]: their
+    first pixels, widths, heights.
+    """
+
+    pixels: np.ndarray
+    sizes: np.ndarray
+
+
+class Rays(NamedTuple):
+    """Of the screen-space reflection: [H, W]."""
+
+    distance: np.ndarray
+    weight: np.ndarray
+
+
+class Faces(NamedTuple):
+    """A flat cube map with its border, `size` squared texels a face, four numbers each; a row and a
+    texel beyond them.
+    """
+
+    texels: np.ndarray
+    size: np.uint64
+
+
+@kernel
+def shade(pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out):
+    """Water of the pixels of a camera into out [H, W, 3]. front: what `rays` run through; only one
+    that is not empty counts, as of the mirror. water: numbers of `Medium`.
+    """
+    u, v, axes, cover, left, top = pixels
+    normal_x, normal_y, variance, smooth_variance = normals
+    bed_view, bed_rgb, bed_alpha, bed_depth = bed_image
+    mirror_view, mirror_rgb, mirror_alpha, mirror_depth = mirror_image
+    front_view, front_rgb, front_alpha, front_depth = front_image
+    mirror_mips, mirror_sizes = mips
+    front_distance, front_weight = rays
+    faces, size = sky
+    has_mirror, has_front = mirror_alpha.size > 0, front_alpha.size > 0
     height, width = cover.shape
-    left, top = offset
     for i in prange(height):
         bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
-        medium = _medium(medium_numbers)
+        medium = _medium(water)
         q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
-        pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+        places, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
         starts = np.zeros(16, np.int64)
         smooth_count, rough_count, j = U(0), U(0), 0
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
@@ -783,7 +737,7 @@ def shade(
                     d = front_distance[i, j]
                     q[DISTANCE + n] = d if d < F(np.inf) else -ONE
                     q[TRUST + n] = front_weight[i, j]
-                pixels[p] = j
+                places[p] = j
                 j += 1
             # The fuller list first, so that lists are short at a row's end only.
             rough = rough_count > smooth_count
@@ -818,10 +772,10 @@ def shade(
                 sx, sy = nx * upright, ny * upright
                 normal, c, inside, share, ray = _facet(sx, sy, view, medium)
                 # Through the surface.
-                water = _splat3(medium.rgb)
+                deep = _splat3(medium.rgb)
                 if medium.fog_per_m > ZERO:
-                    water = _blend3(_exponential(near), water, _splat3(medium.airlight))
-                below = water
+                    deep = _blend3(_exponential(near), deep, _splat3(medium.airlight))
+                below = deep
                 own_depth = v8.load(q, OWN_DEPTH + at)
                 bends = medium.index != ONE
                 tx, ty, steep = zero, zero, one / view[2]
@@ -843,11 +797,11 @@ def shade(
                     r, g, b, a = _fetched(s)
                     way = depth * steep
                     absorbed = (
-                        _absorb(r, a, water[0], way, medium.extinction[0]),
-                        _absorb(g, a, water[1], way, medium.extinction[1]),
-                        _absorb(b, a, water[2], way, medium.extinction[2]),
+                        _absorb(r, a, deep[0], way, medium.extinction[0]),
+                        _absorb(g, a, deep[1], way, medium.extinction[1]),
+                        _absorb(b, a, deep[2], way, medium.extinction[2]),
                     )
-                    below = _select3(clear, absorbed, water)
+                    below = _select3(clear, absorbed, deep)
                 sum_r, sum_g, sum_b = below
                 if bends:
                     # Mirrored rays and shares of the slopes.
@@ -902,11 +856,11 @@ def shade(
                         color = r * whole, g * whole, b * whole
                         if _any(shines):
                             rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)
-                            sky = _sky(s, faces, size, rx, ry, rz, near, medium)
+                            behind = _sky(s, faces, size, rx, ry, rz, near, medium)
                             before = (
-                                r + transmittance * sky[0],
-                                g + transmittance * sky[1],
-                                b + transmittance * sky[2],
+                                r + transmittance * behind[0],
+                                g + transmittance * behind[1],
+                                b + transmittance * behind[2],
                             )
                             color = _select3(shines, before, color)
                         share = v8.load(s, SHARE + t8)
@@ -917,6 +871,6 @@ def shade(
                 v8.store(s, G, sum_g)
                 v8.store(s, B, sum_b)
                 for k in range(min(LANES, n - first)):
-                    pixel = pixels[start + first + k]
+                    pixel = places[start + first + k]
                     out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
                     out[i, pixel, 2] = s[B + k]

@@ -4,46 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.geometry import any_in_squares, rigid
+from augment.geometry import rigid
 
-# ---- Which pixels of an image's rows see the water's plane ---------------------------------------
-# Float64 has to decide whether a ray falls, and near the horizon distances are divided by the small
-# fall. Along a row the fall is linear in the column: the rays that fall are an interval. Kernels
-# that know it and the fall at its end nearest to the horizon need no float64.
-
-BEGIN, END, ANCHOR, FALL = range(4)  # of a row's numbers
-ROW = 4
-
-Holds = Callable[[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]], Bool[np.ndarray, " n"]]
-
-
-def falling_rows(camera: Camera) -> Int32[np.ndarray, "H 4"]:
-    """Of each row: the first and one past the last column whose rays fall (by the float64 of
-    `Camera.ray_directions`), a column of these, and the bits of float32 world z of its ray, the one
-    nearest to zero.
-    """
-    u, v = image_coordinates(camera)
-    rise = camera.world_from_camera[2, :3].numpy()
-
-    def fall(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        return (u[columns] * rise[0] + v[rows] * rise[1]) + rise[2]
-
-    begin, end = column_intervals(camera, lambda rows, columns: fall(rows, columns) < 0)
-    anchor = np.where(rise[0] > 0, np.maximum(end - 1, 0), np.minimum(begin, camera.width - 1))
-    out = np.empty((camera.height, ROW), np.int32)
-    out[:, BEGIN], out[:, END], out[:, ANCHOR] = begin, end, anchor
-    out[:, FALL] = fall(np.arange(camera.height), anchor).astype(np.float32).view(np.int32)
-    return out
+# ---- Which rays meet the plane -------------------------------------------------------------------
 
 
 def image_coordinates(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -53,25 +25,27 @@ def image_coordinates(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def column_intervals(
-    camera: Camera, holds: Holds
-) -> tuple[Int64[np.ndarray, " H"], Int64[np.ndarray, " H"]]:
-    """First and one past the last column of each row in which something holds; equal where it holds
-    in none. holds(rows, columns): in every row true up to some column or from some column on.
-    """
-    rows, last = np.arange(camera.height), camera.width - 1
-    left, right = holds(rows, np.zeros_like(rows)), holds(rows, np.full_like(rows, last))
-    begin, end = np.zeros_like(rows), np.where(left & right, camera.width, 0)
-    mixed = np.nonzero(left != right)[0]
-    if len(mixed):
-        low, high = np.zeros_like(mixed), np.full_like(mixed, last)
-        for _ in range(last.bit_length()):
-            middle = (low + high) // 2
-            is_left = holds(mixed, middle) == left[mixed]
-            low, high = np.where(is_left, middle, low), np.where(is_left, high, middle)
-        begin[mixed] = np.where(left[mixed], 0, high)
-        end[mixed] = np.where(left[mixed], high, camera.width)
-    return begin, end
+def ray_z(camera: Camera, device: torch.device | None = None) -> Float[Tensor, "H W"]:
+    """World z of `Camera.ray_directions`, float64, to the bit: its sign says who sees water."""
+    u, v = (torch.from_numpy(part).to(device) for part in image_coordinates(camera))
+    right, down, ahead = camera.world_from_camera[2, :3].tolist()
+    return (u * right + (v * down)[:, None]) + ahead
+
+
+def falling(camera: Camera, device: torch.device | None = None) -> Bool[Tensor, "H W"]:
+    """Whose rays meet a level plane somewhere below the eye."""
+    return ray_z(camera, device) < 0
+
+
+def plane_depth(
+    camera: Camera, level_z_m: float, device: torch.device | None = None
+) -> Float[Tensor, "H W"]:
+    """z in metres, float64, at which pixels' rays meet the plane before the eye; else infinite."""
+    height = float(camera.centre[2]) - level_z_m
+    fall = -ray_z(camera, device)
+    meets = fall > 0 if height > 0 else fall < 0
+    depth = height / torch.where(meets, fall, torch.ones_like(fall))
+    return torch.where(meets, depth, torch.full_like(depth, math.inf))
 
 
 # ---- Windows of an image -------------------------------------------------------------------------
@@ -91,22 +65,17 @@ class Margins:
     def around(self, mask: Bool[Tensor, "h w"], reach: Margins) -> Bool[Tensor, "H W"]:
         """A window's mask as one of the grown window, grown by the reach in whole squares."""
         left, up, right, down = (-(-side // GRAIN) for side in dataclasses.astuple(reach))
-        if mask.device.type != "cpu":
-            pad, pool = torch.nn.functional.pad, torch.nn.functional.max_pool2d
-            inside = pad(mask.float()[None, None], (self.left, self.right, self.top, self.bottom))
-            coarse = pad(pool(inside, GRAIN, ceil_mode=True), (right, left, down, up))
-            grown = pool(coarse, (up + down + 1, left + right + 1), 1)
-            fine = grown[0, 0].repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
-            return (fine[: inside.shape[2], : inside.shape[3]] > 0).contiguous()
-        height, width = mask.shape
-        inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
-        inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
-        coarse = any_in_squares(inside, GRAIN)
-        square = np.ones((up + down + 1, left + right + 1), np.uint8)
-        # OpenCV grows towards what lies before the anchor in the kernel's own direction.
-        grown = cv2.dilate(coarse.astype(np.uint8), square, anchor=(right, down))
-        fine = grown.repeat(GRAIN, 0).repeat(GRAIN, 1)[: inside.shape[0], : inside.shape[1]]
-        return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
+        high = mask.shape[0] + self.top + self.bottom
+        wide = mask.shape[1] + self.left + self.right
+        rows, columns = -(-high // GRAIN), -(-wide // GRAIN)
+        inside = mask.new_zeros(rows * GRAIN, columns * GRAIN)
+        inside[self.top : self.top + mask.shape[0], self.left : self.left + mask.shape[1]] = mask
+        coarse = inside.view(rows, GRAIN, -1).any(1).view(rows, columns, GRAIN).any(2)
+        coarse = torch.nn.functional.pad(coarse.float()[None], (right, left, down, up))
+        size = (up + down + 1, left + right + 1)
+        grown = torch.nn.functional.max_pool2d(coarse, size, 1)[0] > 0
+        fine = grown.repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
+        return fine[:high, :wide].contiguous()
 
 
 @dataclass(frozen=True)
@@ -202,22 +171,6 @@ def _span(slope: float, best: float, size: int, centre: float) -> tuple[int, int
     else:
         last = min(last, math.ceil(max(min(edge, size), -1.0)))
     return (first, last) if first < last else None
-
-
-def falling(camera: Camera) -> Bool[Tensor, "H W"]:
-    """Whose rays meet a level plane somewhere below the eye."""
-    return camera.ray_directions(torch.float64)[..., 2] < 0
-
-
-def plane_depth(
-    camera: Camera, level_z_m: float, device: torch.device | None = None
-) -> Float[Tensor, "H W"]:
-    """z in metres, float64, at which pixels' rays meet the plane before the eye; else infinite."""
-    height = float(camera.centre[2]) - level_z_m
-    fall = -camera.ray_directions(torch.float64, device)[..., 2]
-    meets = fall > 0 if height > 0 else fall < 0
-    depth = height / torch.where(meets, fall, torch.ones_like(fall))
-    return torch.where(meets, depth, torch.full_like(depth, math.inf))
 
 
 def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:

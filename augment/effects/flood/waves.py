@@ -13,7 +13,7 @@ closed form is exact for one wave only.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +23,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.flood import kernels as waves_kernels
-from augment.render.buffers import CPU, CUDA, REFERENCE, kernels_for
-from augment.render.cuda.runtime import gpu_device
+from augment.render.buffers import CPU, kernels_for
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from recipes.flood import Wave, Waves
@@ -48,6 +47,10 @@ class WaveSet:
     phases_rad: Float64[np.ndarray, "N"]
     depth_m: float
 
+    def select(self, part: slice) -> WaveSet:
+        names = ("directions", "amplitudes_m", "wavelengths_m", "steepness", "phases_rad")
+        return replace(self, **{name: getattr(self, name)[part] for name in names})
+
     @property
     def is_flat(self) -> bool:
         """No wave lifts the surface, so its normal points up everywhere."""
@@ -60,7 +63,7 @@ class WaveSet:
 
     @property
     def tangent_factors(self) -> tuple[np.ndarray, ...]:
-        """S (Dx Dx, Dx Dy, Dy Dy), k A (Dx, Dy): [N] each, see `tangent_terms`."""
+        """S (Dx Dx, Dx Dy, Dy Dy), k A (Dx, Dy): [N] each, see `tangents_of`."""
         (dx, dy), bends = self.directions.T, self.steepness
         slopes = self.wavenumbers * self.amplitudes_m
         return bends * dx * dx, bends * dx * dy, bends * dy * dy, slopes * dx, slopes * dy
@@ -99,27 +102,25 @@ def turns_at(waves: WaveSet, timestamp_ns: int) -> np.ndarray:
     return np.remainder(waves.phases_rad / (2 * math.pi), 1.0) - np.asarray(passed, np.float64)
 
 
-def phase_of(
-    waves: WaveSet, index: int, turns: np.ndarray, points_xy: Float64[Tensor, "*B 2"]
-) -> Float64[Tensor, "*B"]:
-    """theta of one wave over parameter points, radians, not reduced. turns: of `turns_at`."""
-    dx, dy = waves.directions[index].tolist()
-    way = points_xy[..., 0] * dx + points_xy[..., 1] * dy
-    return float(waves.wavenumbers[index]) * way + 2 * math.pi * float(turns[index])
+def phases_of(
+    waves: WaveSet, turns: Float64[np.ndarray, "N"], points_xy: Float64[Tensor, "*B 2"]
+) -> Float64[Tensor, "*B N"]:
+    """theta of each wave over parameter points, radians, not reduced. turns: of `turns_at`."""
+    device = points_xy.device
+    per_metre = torch.from_numpy(waves.wavenumbers * waves.directions.T).to(device)
+    return points_xy @ per_metre + torch.from_numpy(2 * math.pi * turns).to(device)
 
 
-def tangent_terms(
-    waves: WaveSet, index: int, theta: Float64[Tensor, "*B"]
+def tangents_of(
+    waves: WaveSet, theta: Float64[Tensor, "*B N"], weight: Float64[Tensor, "*B N"] | float = 1.0
 ) -> Float64[Tensor, "*B 5"]:
-    """What one wave adds to the tangents: S sin(theta) (Dx Dx, Dx Dy, Dy Dy), k A cos(theta) D.
+    """The waves' sums of S sin(theta) (Dx Dx, Dx Dy, Dy Dy) and k A cos(theta) D.
 
-    The tangents are (1 - xx, -xy, gx) and (-xy, 1 - yy, gy) with the sums over the waves.
+    With them the tangents are (1 - xx, -xy, gx) and (-xy, 1 - yy, gy).
     """
-    dx, dy = waves.directions[index].tolist()
-    squeeze = float(waves.steepness[index]) * theta.sin()
-    slope = float(waves.wavenumbers[index] * waves.amplitudes_m[index]) * theta.cos()
-    terms = [dx * dx * squeeze, dx * dy * squeeze, dy * dy * squeeze, dx * slope, dy * slope]
-    return torch.stack(terms, dim=-1)
+    factors = torch.from_numpy(np.stack(waves.tangent_factors, axis=1)).to(theta.device)
+    squeezes, slopes = weight * theta.sin() @ factors[:, :3], weight * theta.cos() @ factors[:, 3:]
+    return torch.cat([squeezes, slopes], dim=-1)
 
 
 def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, "*B 3"]:
@@ -129,7 +130,7 @@ def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, 
     up = ((1 - xx) * (1 - yy) - xy * xy).clamp_min(0)
     normals = torch.stack([-xy * gy - (1 - yy) * gx, -xy * gx - (1 - xx) * gy, up], dim=-1)
     length = normals.norm(dim=-1, keepdim=True)
-    level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=length.device)
     return torch.where(length > CUSP, normals / length.clamp_min(CUSP), level)
 
 
@@ -217,53 +218,52 @@ FARTHEST_M = 1e7  # depth beyond which a ray counts as running beside the plane
 TOUCHING_M = 1e-9  # an eye closer to the plane than this lies in it and sees nothing of it
 UPRIGHT = 1e-6  # horizontal part of a ray, at unit z, below which its direction is world x
 ROWS = 8  # image rows a thread takes at a time
+WAVES = 8  # that the definition takes at a time
 
 
 def wave_field(
-    waves: WaveSet, camera: Camera, level_z_m: float, *, backend: str = CPU
+    waves: WaveSet,
+    camera: Camera,
+    level_z_m: float,
+    *,
+    device: torch.device | None = None,
+    backend: str = CPU,
 ) -> WaveField:
     """The waves at every pixel of a camera, at its own time. level_z_m: the plane, scene world.
 
-    backend: kernels equal the definition within 1e-5 of a normal's components, clear of cusps.
-    "cuda" leaves the field on the GPU.
+    device: where the field is wanted; the CPU if None. backend: the CPU's kernel equals the
+    definition within 1e-5 of a normal's components, clear of cusps.
     """
     height = float(camera.centre[2]) - level_z_m
-    kernels = kernels_for(backend)
     if waves.is_flat or abs(height) < TOUCHING_M:
-        device = gpu_device() if kernels == CUDA else None
         still = torch.zeros(camera.height, camera.width, device=device)
         return WaveField(still, still, still)
-    if kernels == CUDA:
-        from augment.effects.flood import cuda
-
-        limits = (UPRIGHT, FADED_PX, FULL_PX)
-        return cuda.fill_field(waves, camera, height, farthest=FARTHEST_M, limits=limits)
-    return (_define if kernels == REFERENCE else _run_kernel)(waves, camera, height)
-
-
-def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:
-    rays = camera.ray_directions(torch.float64)
+    if kernels_for(backend) == CPU and (device is None or device.type == "cpu"):
+        return _run_kernel(waves, camera, height)
+    rays = camera.ray_directions(torch.float64, device)
     away = -height / rays[..., 2]
     meets = (away > 0) & (away <= FARTHEST_M)
     away, z = away.where(meets, 0.0), rays[..., 2].where(meets, 1.0)
-    points = camera.centre[:2] + away[..., None] * rays[..., :2]
+    points = camera.centre[:2].to(rays.device) + away[..., None] * rays[..., :2]
     per_column, per_row = _footprint(camera, rays, away, z)
     level = rays[..., :2].norm(dim=-1, keepdim=True)
-    east = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    east = torch.tensor([1.0, 0.0], dtype=torch.float64, device=device)
     view = torch.where(level >= UPRIGHT, rays[..., :2] / level.clamp_min(UPRIGHT), east)
 
-    tangents = torch.zeros((*away.shape, 5), dtype=torch.float64)
-    variance = torch.zeros_like(away)
+    tangents, variance = torch.zeros_like(rays[..., :1]), torch.zeros_like(away)
     turns = turns_at(waves, camera.timestamp_ns)
-    for i, direction in enumerate(torch.from_numpy(waves.directions)):
-        rate = torch.hypot(per_column @ direction, per_row @ direction)  # metres per pixel
-        length_px = float(waves.wavelengths_m[i]) / rate.clamp_min(1e-300)
+    for first in range(0, len(turns), WAVES):
+        some = waves.select(slice(first, first + WAVES))
+        theta = phases_of(some, turns[first : first + WAVES], points)
+        directions = torch.from_numpy(some.directions.T).to(rays.device)
+        rate = torch.hypot(per_column @ directions, per_row @ directions)  # metres per pixel
+        length_px = torch.from_numpy(some.wavelengths_m).to(rays.device) / rate.clamp_min(1e-300)
         t = ((length_px - FADED_PX) / (FULL_PX - FADED_PX)).clamp(0, 1)
         weight = t * t * (3 - 2 * t)
-        terms = tangent_terms(waves, i, phase_of(waves, i, turns, points))
-        tangents += weight[..., None] * terms
-        slope = float(waves.wavenumbers[i] * waves.amplitudes_m[i]) * (view @ direction)
-        variance += 0.5 * (1 - weight**2) * slope**2
+        tangents = tangents + tangents_of(some, theta, weight)
+        slopes = torch.from_numpy(some.wavenumbers * some.amplitudes_m).to(rays.device)
+        lost = (1 - weight**2) * (slopes * (view @ directions)) ** 2
+        variance = variance + 0.5 * lost.sum(-1)
     normals = normals_from_tangents(tangents)
     fields = (normals[..., 0], normals[..., 1], variance)
     return WaveField(*(field.where(meets, 0.0).float() for field in fields))
@@ -271,7 +271,7 @@ def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:
 
 def _footprint(camera: Camera, rays: Tensor, away: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     """Metres of world x and y, [H, W, 2] each, that the plane point moves per column and row."""
-    rotation = camera.world_from_camera[:3, :3]
+    rotation = camera.world_from_camera[:3, :3].to(rays.device)
     across, down = (
         away[..., None] * (turn[:2] - (turn[2] / z)[..., None] * rays[..., :2])
         for turn in (rotation[:, 0] / camera.fx, rotation[:, 1] / camera.fy)

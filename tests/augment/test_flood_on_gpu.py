@@ -1,4 +1,4 @@
-"""Flooded views on the GPU: its data flow on a pretended one, and what only the GPU's way has."""
+"""Flooded views whose layers lie on a GPU, here a pretended one: all passes run there."""
 
 from __future__ import annotations
 
@@ -8,29 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from augment import drawing
 from augment.cameras import Camera
-from augment.effects.flood import flood_view
+from augment.drawing import LayerRenderer
 from augment.effects.flood.flood import FloodMedium
-from augment.effects.flood.flood_view import (
-    FloodedImage,
-    LayerRenderer,
-    merge_depths,
-    render_flooded,
-)
-from augment.effects.flood.water_plane import (
-    ANCHOR,
-    BEGIN,
-    END,
-    FALL,
-    Margins,
-    Window,
-    falling,
-    falling_rows,
-    resized,
-)
+from augment.effects.flood.flood_view import FloodedImage, render_flooded
+from augment.effects.flood.water_plane import Margins, resized
 from augment.effects.flood.waves import make_waves
 from augment.geometry import rigid
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS, RenderOutput
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog
@@ -38,17 +24,11 @@ from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky
 from recipes.flood import Waves
-from tests.augment.flood_programs import few_programs
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import sh_of
 
 ROAD_Z, LEVEL = -1.5, -1.1
 LAYERED, UNIFORM = (Fog(0.03, (0.6, 0.6, 0.65), h, LEVEL) for h in (8.0, None))
-
-
-@pytest.fixture(autouse=True)
-def large_programs(monkeypatch):
-    few_programs(monkeypatch)
 
 
 def camera(width=33, height=21, *, z=0.0, pitch=0.1, roll=0.05) -> Camera:
@@ -104,7 +84,7 @@ def drawn_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
         moved = {name: part.to(device) for name, part in images.items() if part is not None}
         return RenderOutput(**moved)
 
-    monkeypatch.setattr(flood_view, "rasterize", rasterize_here)
+    monkeypatch.setattr(drawing, "rasterize", rasterize_here)
 
 
 def flooded(
@@ -118,10 +98,9 @@ def flooded(
 ) -> FloodedImage:
     """hidden_by: stands for the scene."""
     faces = torch.rand(6, 4, 4, 3, generator=torch.Generator().manual_seed(3))
-    smogs = (None, smog) if deferred else (smog, None)
     seen = parts() if hidden_by is None else [PosedGaussians(hidden_by)]
-    painter = LayerRenderer(seen, CubemapSky(faces), RasterSettings(), *smogs, backend)
-    image = render_flooded(painter, view, water, frozenset({EXPECTED_DEPTH, SPLAT_IDS}))
+    renderer = LayerRenderer(seen, CubemapSky(faces), smog, deferred, RasterSettings(), backend)
+    image = render_flooded(renderer, view, water, frozenset({EXPECTED_DEPTH, SPLAT_IDS}))
     assert image is not None
     return image
 
@@ -137,7 +116,6 @@ def same_picture(there: FloodedImage, here: FloodedImage, budget: float) -> None
         assert float((~torch.isclose(a, b, rtol=1e-4, atol=1e-4)).float().mean()) <= budget, name
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("reflection", "smog", "deferred"),
     [("screen_space", LAYERED, False), ("mirrored", UNIFORM, True)],
@@ -153,7 +131,6 @@ def test_a_flooded_view_stays_on_the_gpu_and_is_the_cpu_s(monkeypatch, reflectio
         same_picture(there, here, 0.05 if reflection == "screen_space" else 0.01)
 
 
-@pytest.mark.long
 def test_a_view_from_under_the_water_stays_on_the_gpu(monkeypatch):
     view, water = camera(z=-1.3, pitch=-0.3), medium("sky", "still")
     here = flooded("cpu", view, water, LAYERED, deferred=False)
@@ -177,43 +154,6 @@ def test_a_small_flooded_view_from_its_splats_on(monkeypatch):
     with pretended_gpu(monkeypatch):
         there = flooded("cuda", view, water, None, deferred=False, hidden_by=few)
         same_picture(there, here, 0.02)
-
-
-@pytest.mark.parametrize("roll", [0.0, 0.2, 1.6, 3.1, -0.7])
-def test_the_rays_that_fall_are_an_interval_of_each_row(roll):
-    view = camera(37, 29, roll=roll)
-    rows, falls = falling_rows(view), falling(view).numpy()
-    columns = np.arange(view.width)
-    inside = (columns >= rows[:, BEGIN, None]) & (columns < rows[:, END, None])
-    assert np.array_equal(inside, falls) and falls.any() and not falls.all()
-    fall = view.ray_directions(torch.float64)[..., 2].numpy()
-    slope = np.float32(view.camera_from_world[0, 2] / view.fx)
-    nearest = rows[:, FALL].copy().view(np.float32)[:, None]
-    found = nearest + (columns - rows[:, ANCHOR, None]).astype(np.float32) * slope
-    # Relative, also where it is small: sums of numbers of one sign.
-    assert np.abs(found[falls] / fall[falls] - 1).max() < 3e-7
-
-
-@pytest.mark.parametrize(
-    "window", [Window(-3, 5, 20, 30), Window(4, -2, 50, 9), Window(0, 0, 9, 7)]
-)
-def test_layers_are_joined_as_defined(window):
-    generator = torch.Generator().manual_seed(2)
-
-    def layer(height: int, width: int) -> RenderOutput:
-        images = [torch.rand(height, width, generator=generator) for _ in range(3)]
-        ids = torch.randint(0, 99, (height, width), generator=generator, dtype=torch.int32)
-        return RenderOutput(
-            alpha=images[0], expected_depth=images[1], median_depth=images[2], splat_ids=ids
-        )
-
-    front = layer(21, 33)
-    behind = layer(window.bottom - window.top, window.right - window.left)
-    names = frozenset({RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS})
-    expected = merge_depths(front, behind, window, names, backend="reference")
-    joined = merge_depths(front, behind, window, names, backend="cuda")
-    for name in names - {RGB}:
-        torch.testing.assert_close(getattr(joined, name).cpu(), getattr(expected, name))
 
 
 def test_masks_grow_and_shrink_on_a_gpu_as_they_do_here(monkeypatch):
