@@ -71,7 +71,7 @@ _FRONT = ("-y", "+x", "-x", "+z", "-z")
 
 
 @dataclass(frozen=True)
-class Style:
+class Facade:
     wall: Look
     base: Look
     trim: Look
@@ -130,36 +130,36 @@ def glazing(
     return join([panels(bars, depth_m - 0.02, frame, edges), glass])
 
 
-def window(size_m: tuple[float, float], style: Style, fine: bool) -> Shapes:
+def window(size_m: tuple[float, float], facade: Facade, fine: bool) -> Shapes:
     """One window with reveals, sill and surround; its opening's lower left corner is the origin."""
     width, height = size_m
     opening = (0.0, 0.0, width, height)
     columns, rows = ((2, 2) if height > 1.7 else (2, 1)) if fine else (1, 1)
     parts = [
-        glazing(opening, columns, rows, REVEAL_M, style.frame),
-        reveals(opening, REVEAL_M, style.trim if style.has_surround else style.wall),
-        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), style.trim, faces=_FRONT),
+        glazing(opening, columns, rows, REVEAL_M, facade.frame),
+        reveals(opening, REVEAL_M, facade.trim if facade.has_surround else facade.wall),
+        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), facade.trim, faces=_FRONT),
     ]
-    if style.has_surround:
+    if facade.has_surround:
         band = SURROUND_M
         low = [(-band, -0.035, 0.0), (width, -0.035, 0.0), (-band, -0.06, height)]
         high = [(0.0, 0, height), (width + band, 0, height), (width + band, 0, height + 0.2)]
-        parts.append(boxes(low, high, style.trim, faces=_FRONT))
+        parts.append(boxes(low, high, facade.trim, faces=_FRONT))
     return join(parts)
 
 
-def window_hole(corner: tuple[float, float], style: Style) -> list[Rectangle]:
+def window_hole(corner: tuple[float, float], facade: Facade) -> list[Rectangle]:
     """What a window takes out of the wall: its opening, surround and sill."""
-    (x, z), (width, height) = corner, style.window_m
+    (x, z), (width, height) = corner, facade.window_m
     holes = [(x - 0.08, z - 0.08, x + width + 0.08, z), (x, z, x + width, z + height)]
-    if style.has_surround:
+    if facade.has_surround:
         band = SURROUND_M
         holes += [(x - band, z, x + width + band, z + height)]
         holes += [(x - band, z + height, x + width + band, z + height + 0.2)]
     return holes
 
 
-def door(opening: Rectangle, style: Style) -> Shapes:
+def door(opening: Rectangle, facade: Facade) -> Shapes:
     """A panelled door with a fanlight and a step."""
     x0, z0, x1, z1 = opening
     split = z1 - 0.55
@@ -168,20 +168,20 @@ def door(opening: Rectangle, style: Style) -> Shapes:
     fields = [(low, z0 + 0.25, high, z0 + 0.95), (low, z0 + 1.1, high, split - 0.16)]
     frames, edges = cut(opening, [leaf, light])
     stiles, stile_edges = cut(leaf, fields)
-    dark = style.accent.tinted(np.array(style.accent.rgb) * 0.7)
+    dark = facade.accent.tinted(np.array(facade.accent.rgb) * 0.7)
     return join(
         [
-            panels(frames, REVEAL_M - 0.02, style.frame, edges),
-            panels(stiles, REVEAL_M, style.accent, stile_edges),
+            panels(frames, REVEAL_M - 0.02, facade.frame, edges),
+            panels(stiles, REVEAL_M, facade.accent, stile_edges),
             panels(np.array(fields), REVEAL_M + 0.015, dark),
             panels(np.array([light]), REVEAL_M, GLASS),
-            reveals(opening, REVEAL_M, style.wall),
-            boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), style.base),
+            reveals(opening, REVEAL_M, facade.wall),
+            boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), facade.base),
         ]
     )
 
 
-def shop_front(opening: Rectangle, style: Style, awning: bool) -> Shapes:
+def shop_front(opening: Rectangle, facade: Facade, awning: bool) -> Shapes:
     """A shop: plinth, large panes, a glass door, a sign above and perhaps an awning."""
     x0, z0, x1, z1 = opening
     depth = 0.18
@@ -191,19 +191,19 @@ def shop_front(opening: Rectangle, style: Style, awning: bool) -> Shapes:
     sign_z, columns = z1 + 0.08, max(1, round((door_x - x0) / 1.7))
     low, high = (x0 - 0.1, -0.12, sign_z), (x1 + 0.1, 0.02, sign_z + 0.62)
     parts = [
-        panels(np.array([plinth]), depth - 0.04, style.accent),
-        glazing(show, columns, 1, depth, style.accent, 0.09, SHOP_GLASS),
-        glazing(entry, 1, 2, depth, style.accent, 0.11),
-        reveals(opening, depth, style.accent),
-        boxes(low, high, style.accent, faces=_FRONT),
-        _lettering(x0, x1, sign_z, style),
+        panels(np.array([plinth]), depth - 0.04, facade.accent),
+        glazing(show, columns, 1, depth, facade.accent, 0.09, SHOP_GLASS),
+        glazing(entry, 1, 2, depth, facade.accent, 0.11),
+        reveals(opening, depth, facade.accent),
+        boxes(low, high, facade.accent, faces=_FRONT),
+        _lettering(x0, x1, sign_z, facade),
     ]
     if awning:
-        parts.append(_awning(x0, x1, z1 + 0.05, style))
+        parts.append(_awning(x0, x1, z1 + 0.05, facade))
     return join(parts)
 
 
-def _lettering(x0: float, x1: float, z: float, style: Style) -> Shapes:
+def _lettering(x0: float, x1: float, z: float, facade: Facade) -> Shapes:
     """Light blocks on the sign that read as letters from afar."""
     middle, pitch = (x0 + x1) / 2, 0.32
     count = int(min(12, (x1 - x0 - 0.8) / pitch))
@@ -211,16 +211,16 @@ def _lettering(x0: float, x1: float, z: float, style: Style) -> Shapes:
     tall = 0.18 + 0.10 * ((np.arange(count) * 5) % 3 == 0)
     sides = np.broadcast_arrays(starts, z + 0.17, starts + 0.2, z + 0.17 + tall)
     rectangles = np.stack(sides, 1)
-    return panels(rectangles[(np.arange(count) % 5) != 3], -0.135, style.trim)
+    return panels(rectangles[(np.arange(count) % 5) != 3], -0.135, facade.trim)
 
 
-def _awning(x0: float, x1: float, z: float, style: Style) -> Shapes:
+def _awning(x0: float, x1: float, z: float, facade: Facade) -> Shapes:
     """Striped cloth, sloping out over the pavement, with a hem."""
     count = max(4, round((x1 - x0) / 0.45))
     edges = np.linspace(x0, x1, count + 1)[:-1]
     slope, hem = np.array([0.0, 1.2, 0.55]), np.array([0.0, 0.0, -0.2])
     parts = []
-    for start, look in ((0, style.accent), (1, style.trim)):
+    for start, look in ((0, facade.accent), (1, facade.trim)):
         x = edges[start::2]
         u = ((x1 - x0) / count, 0.0, 0.0)
         top = xyz(x, -1.25, z - 0.55)
@@ -281,7 +281,7 @@ def build_buildings(layout: Layout) -> Shapes:
     return join(parts)
 
 
-def draw_style(rng: np.random.Generator) -> Style:
+def draw_facade(rng: np.random.Generator) -> Facade:
     """Colours and measures of one house."""
     rgb, material = WALLS[rng.integers(len(WALLS))]
     rgb = np.array(rgb) * rng.uniform(0.88, 1.06)
@@ -289,7 +289,7 @@ def draw_style(rng: np.random.Generator) -> Style:
     wall = Look(tuple(rgb), Class.BUILDING, material, backed=True)
     base = Look(tuple(rgb * 0.35 + 0.10), Class.BUILDING, Material.STONE)
     white = rng.random() < 0.7 or material == Material.BRICK
-    return Style(
+    return Facade(
         wall=wall,
         base=base,
         trim=stone.tinted((0.74, 0.72, 0.67)) if white else stone,
@@ -306,34 +306,37 @@ def draw_style(rng: np.random.Generator) -> Style:
 def _house(seed: int, width: float, fine: bool) -> Shapes:
     """A house on x in [0, width], its front at y = 0."""
     rng = np.random.default_rng(seed)
-    style = draw_style(rng)
+    facade = draw_facade(rng)
     floors = int(rng.integers(2, 4))
-    eaves = style.ground_m + floors * style.floor_m + 0.35
+    eaves = facade.ground_m + floors * facade.floor_m + 0.35
     count = max(2, round(width / rng.uniform(2.5, 3.1)))
     pitch = width / count
     holes: list[Rectangle] = []
-    parts = [_ground_floor(rng, style, width, count, holes, fine)]
+    parts = [_ground_floor(rng, facade, width, count, holes, fine)]
 
     places = []
     for j, i in itertools.product(range(floors), range(count)):
-        x, z = (i + 0.5) * pitch - style.window_m[0] / 2, style.ground_m + j * style.floor_m + 0.75
-        holes += window_hole((x, z), style)
+        x, z = (
+            (i + 0.5) * pitch - facade.window_m[0] / 2,
+            facade.ground_m + j * facade.floor_m + 0.75,
+        )
+        holes += window_hole((x, z), facade)
         places.append((x, 0.0, z))
-    parts.append(window(style.window_m, style, fine).repeated(np.array(places)))
+    parts.append(window(facade.window_m, facade, fine).repeated(np.array(places)))
 
     for z0, z1, reach in (
-        (style.ground_m + 0.12, style.ground_m + 0.3, 0.09),
+        (facade.ground_m + 0.12, facade.ground_m + 0.3, 0.09),
         (eaves - 0.32, eaves, 0.28),
     ):
         holes.append((0.0, z0, width, z1))
-        parts.append(boxes((0.0, -reach, z0), (width, 0.0, z1), style.trim, faces=_LEDGE))
+        parts.append(boxes((0.0, -reach, z0), (width, 0.0, z1), facade.trim, faces=_LEDGE))
     holes.append((0.0, BASE_M, width, 0.5))
     base, edges = cut((0.0, BASE_M, width, 0.5), [h for h in holes[:-1] if h[1] < 0.5])
-    parts.append(panels(base, -0.0, style.base, edges))
+    parts.append(panels(base, -0.0, facade.base, edges))
     wall, edges = cut((0.0, 0.5, width, eaves), holes)
-    parts.append(panels(wall, 0.0, style.wall, edges))
-    parts += [_back(style, width, eaves), _roof(rng, style, width, eaves)]
-    inner = Look(style.wall.rgb, Class.BUILDING)
+    parts.append(panels(wall, 0.0, facade.wall, edges))
+    parts += [_back(facade, width, eaves), _roof(rng, facade, width, eaves)]
+    inner = Look(facade.wall.rgb, Class.BUILDING)
     parts.append(panels(np.array([(0.0, BASE_M, width, eaves)]), INNER_WALL_M, inner))
     zinc = Look((0.22, 0.22, 0.215), Class.BUILDING)
     parts.append(tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, zinc))  # a rainpipe
@@ -341,15 +344,15 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
 
 
 def _ground_floor(
-    rng: np.random.Generator, style: Style, width: float, count: int, holes: list, fine: bool
+    rng: np.random.Generator, facade: Facade, width: float, count: int, holes: list, fine: bool
 ) -> Shapes:
     """Shop, or a door between windows; adds its holes to the wall's."""
     floor = float(pavement_z(FACADE_M)) + 0.02
-    if style.has_shop:
+    if facade.has_shop:
         opening = (0.45, floor, width - 0.45, floor + 2.75)
         holes.append(opening)
         holes.append((0.35, opening[3] + 0.08, width - 0.35, opening[3] + 0.70))
-        return shop_front(opening, style, bool(rng.random() < 0.45))
+        return shop_front(opening, facade, bool(rng.random() < 0.45))
     pitch = width / count
     entry = int(rng.integers(count))
     parts = []
@@ -360,26 +363,26 @@ def _ground_floor(
             opening = (middle - 0.58, floor + 0.12, middle + 0.58, floor + 2.95)
             holes.append(opening)
             holes.append((opening[0] - 0.1, BASE_M, opening[2] + 0.1, opening[1]))
-            parts.append(door(opening, style))
+            parts.append(door(opening, facade))
         else:
-            corner = (middle - style.window_m[0] / 2, 1.15)
-            holes += window_hole(corner, style)
+            corner = (middle - facade.window_m[0] / 2, 1.15)
+            holes += window_hole(corner, facade)
             places.append((corner[0], 0.0, corner[1]))
     if places:
-        parts.append(window(style.window_m, style, fine).repeated(np.array(places)))
+        parts.append(window(facade.window_m, facade, fine).repeated(np.array(places)))
     return join(parts)
 
 
-def _back(style: Style, width: float, eaves: float) -> Shapes:
+def _back(facade: Facade, width: float, eaves: float) -> Shapes:
     """Side and back walls, plain."""
-    wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=1.6)
+    wall = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material, spacing=1.6)
     low, high = (0.0, 0.0, BASE_M), (width, DEPTH_M, eaves)
     return boxes(low, high, wall, faces=("+x", "-x", "+y"))
 
 
-def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) -> Shapes:
+def _roof(rng: np.random.Generator, facade: Facade, width: float, eaves: float) -> Shapes:
     if rng.random() < 0.35:
-        return _flat_roof(style, width, eaves)
+        return _flat_roof(facade, width, eaves)
     tiles = Look(ROOFS[rng.integers(len(ROOFS))], Class.BUILDING, Material.TILES, spacing=1.3)
     rise, half = (DEPTH_M / 2) * float(np.tan(np.radians(rng.uniform(30, 40)))), DEPTH_M / 2
     over = 0.35
@@ -387,15 +390,15 @@ def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) ->
     edge_z = eaves - drop + 0.12
     slope = np.array([0.0, half + over, rise + drop])
     low, high = (0.0, -over - 0.12, edge_z - 0.14), (width, -over + 0.02, edge_z + 0.0)
-    gutter = style.trim.tinted((0.25, 0.24, 0.23))
+    gutter = facade.trim.tinted((0.25, 0.24, 0.23))
     under = (0, -over, edge_z - 0.02)
     parts = [
         parallelograms((0.0, -over, edge_z), (width, 0, 0), slope, tiles),
         parallelograms((width, DEPTH_M + over, edge_z), (-width, 0, 0), slope * [1, -1, 1], tiles),
         boxes(low, high, gutter, faces=_LEDGE, edges=0),
-        parallelograms(under, (0, over, 0), (width, 0, 0), style.trim, edges=0),
+        parallelograms(under, (0, over, 0), (width, 0, 0), facade.trim, edges=0),
     ]
-    gable = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=0.8)
+    gable = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material, spacing=0.8)
     for x, flip in ((0.0, True), (width, False)):
         a, b, c = (x, 0.0, eaves), (x, DEPTH_M, eaves), (x, half, eaves + rise + 0.1)
         parts.append(triangle(np.array([a, c, b] if flip else [a, b, c]), gable))
@@ -406,16 +409,16 @@ def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) ->
     return join(parts)
 
 
-def _flat_roof(style: Style, width: float, eaves: float) -> Shapes:
+def _flat_roof(facade: Facade, width: float, eaves: float) -> Shapes:
     """A roof behind a parapet."""
     top = eaves + 0.75
     gravel = Look((0.30, 0.29, 0.27), Class.BUILDING, Material.ASPHALT, spacing=1.6)
-    parapet = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
+    parapet = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material)
     return join(
         [
             parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel),
             boxes((0, 0, eaves), (width, 0.3, top), parapet, faces=("-y", "+y", "+x", "-x")),
-            boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), style.trim, faces=_LEDGE),
+            boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), facade.trim, faces=_LEDGE),
         ]
     )
 
@@ -442,9 +445,9 @@ def _second_row(layout: Layout) -> Shapes:
         x = layout.x0 - 4.0
         while x < layout.x1 + 4.0:
             width, height = rng.uniform(9, 15), rng.uniform(6.5, 9.5)
-            style = draw_style(rng)
+            facade = draw_facade(rng)
             y = side * rng.uniform(36, 44)
-            wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
+            wall = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material)
             columns = np.arange(1.2, width - 1.6, 2.6)
             holes = [(w, z, w + 1.2, z + 1.5) for z in (1.2, 4.2) for w in columns]
             front, edges = cut((0.0, BASE_M, width, height), holes)
@@ -453,8 +456,8 @@ def _second_row(layout: Layout) -> Shapes:
                     panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
                     panels(np.array(holes), 0.1, _PANE),
                     *[reveals(h, 0.1, wall) for h in holes],
-                    _back(style, width, height),
-                    _roof(rng, style, width, height),
+                    _back(facade, width, height),
+                    _roof(rng, facade, width, height),
                 ]
             )
             corner = (x if side > 0 else x + width, y, 0.0)

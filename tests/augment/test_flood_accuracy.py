@@ -14,8 +14,8 @@ from augment.render.sh import evaluate_sh
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import ConstantSky
 from tests.scenes import camera_ahead, random_gaussians
-from tools.bench import effects
-from tools.bench.effects import analytic_error, mirror_gaussians, tier_error, water_masks
+from tools.bench import flood
+from tools.bench.flood import analytic_error, mirror_gaussians, tier_error, water_masks
 
 QUERY = {"seed": "3", "frames": "2", "gaussians": "120000"}
 URI = "procedural:street?" + "&".join(f"{k}={v}" for k, v in QUERY.items())
@@ -110,9 +110,9 @@ def test_colours_that_depend_on_the_view_are_mirrored(monkeypatch):
     error = analytic_error(scene, camera)
     assert error["water_share"] > 0.2
     assert error["psnr_db"] >= 100  # without cut splats only rounding is left: measured 151 dB
-    kept = effects.mirror_gaussians
+    kept = flood.mirror_gaussians
     monkeypatch.setattr(
-        effects, "mirror_gaussians", lambda own: dataclasses.replace(kept(own), sh=own.sh)
+        flood, "mirror_gaussians", lambda own: dataclasses.replace(kept(own), sh=own.sh)
     )
     assert analytic_error(scene, camera)["psnr_db"] < 60  # colours as seen from the eye itself
 

@@ -5,9 +5,9 @@ import pytest
 
 from adapters.procedural import open_truth
 from adapters.uri import parse_uri
-from recipes.schema import Smog
 from tests.streets import open_street
-from tools.bench.effects import smog_error, smog_model_recipe, truth_view
+from tools.bench.scenes import recipe_of
+from tools.bench.smog import smog_error, truth_view
 
 STREET = "procedural:street?seed=3&frames=1&gaussians=150000&parked=4&moving=1&pedestrians=1"
 
@@ -24,8 +24,8 @@ def street():
 @pytest.mark.parametrize("scale_height_m", [None, 15.0])
 def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):
     scene, view = street
-    smog = Smog(visibility_m=80, scale_height_m=scale_height_m)
-    error = smog_error(smog_model_recipe(smog, model), scene, view)
+    smog = {"visibility_m": 80, "scale_height_m": scale_height_m, "model": model}
+    error = smog_error(recipe_of({"smog": smog}), scene, view)
     smooth = error[view.regions["smooth"]]
     assert len(smooth) > 10_000  # most of the picture that is not sky is measured
     # The bounds a viewer cannot see: one grey level at the median, four at the worst hundredth.

@@ -18,9 +18,9 @@ from augment.effects.snow.cells import FLUSH, SnowCells
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
-from tools.bench.effects import (
+from tools.bench.scenes import all_cameras
+from tools.bench.snow import (
     SHADINGS,
-    all_cameras,
     camera_from_above,
     cells_over,
     pixel_places,

@@ -18,7 +18,7 @@ from augment.semantics import SemanticClass
 from augment.views import render_buffers
 from tests.scenes import sh_of
 from tests.snow_scenes import drive, sheet, wall
-from tools.bench.scenes import style_recipe
+from tools.bench.style import style_recipe
 
 
 def folding_error(scene, camera):

@@ -14,8 +14,7 @@ from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
 from tests.streets import SMALL_STREET, open_street
-from tools.bench import dataset, effects, fit, jobs, raster
-from tools.bench.effects import EffectCase
+from tools.bench import EFFECTS, dataset, fit, flood, jobs, raster, scenes, snow, style
 from tools.bench.harness import (
     WallClock,
     peak_mib_in_subprocess,
@@ -25,7 +24,7 @@ from tools.bench.harness import (
     spread,
     spread_ratio,
 )
-from tools.bench.scenes import RasterCase, random_scene
+from tools.bench.scenes import EffectCase, RasterCase, measure_effect, random_scene
 from tools.cli import main
 
 
@@ -138,14 +137,15 @@ def test_raster_measures_stages_work_and_the_reference():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", effects.EFFECTS)
+@pytest.mark.parametrize("name", EFFECTS)
 def test_effects_have_their_tables(name, monkeypatch):
-    monkeypatch.setattr(effects, "open_scene", open_street)
-    monkeypatch.setattr(effects, "WAVES", ("calm",))
+    for module in (scenes, snow, style):
+        monkeypatch.setattr(module, "open_scene", open_street)
+    monkeypatch.setattr(flood, "WAVES", ("calm",))
     size = {"width": 96, "height": 64, "scale": 0.2, "cell_m": 0.2, "splats": 2_000}
     views = {"frames": (0,), "cameras": ("front",), "presets": ("overcast",), "memory": False}
     case = EffectCase(scenes=(SMALL_STREET,), street=SMALL_STREET, **size, **views)
-    result = effects.measure(name, case=case, repeats=1)
+    result = measure_effect(name, 1, case)
     tables = check_figures(result)
     frames, stages = (
         next(rows for title, rows in tables.items() if title.startswith(start))

@@ -104,7 +104,7 @@ def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
     road, ground = sheet((2, 6), (-2, 2), rgb=(0.3, 0.35, 0.3)), Ground(0.0, 0.0, "stated")
     street = drive(road, wall(7.0, (-3, 3), (0, 2.5)), ground=ground, ground_z_m=0.0)
     camera = street.frames[0].cameras["ahead"].scaled(0.25)
-    kinds = (gpu.CLEAN, gpu.SMOG, gpu.FLOOD, gpu.SNOW)
+    kinds = ("clean", "smog", "flood balanced", "snow fast tier")
     recipes = {name: gpu.frame_recipes(0.4)[name] for name in kinds}
     agreement = gpu.raster_agreement(SMALL)
     assert all(each["p999"] < 1e-4 and each["pixels"] == 20 * 17 for each in agreement.values())
@@ -113,12 +113,14 @@ def test_sections_targets_and_the_page(monkeypatch, tmp_path, capfd):
     monkeypatch.setattr(gpu, "PLACEMENTS", 1)
     placed = gpu.measure_placement(street, "test:street", cell_m=0.4)
     assert placed["cells"] > 0 and placed["cameras"] == 2
-    same = gpu.frame_agreement(street, camera, {gpu.SNOW: recipes[gpu.SNOW]})
+    same = gpu.frame_agreement(street, camera, {"snow fast tier": recipes["snow fast tier"]})
     assert [each["max"] for each in same.values()] == [0]
     found = {
         "ceilings": {**dataclasses.asdict(SPEEDS), "gpu": None},
         "raster": clean,
         "frames": gpu.measure_frames(street, camera, recipes, once(WallClock())),
+        "passes": gpu.measure_passes(street, camera, {"clean": recipes["clean"]}),
+        "launches": {"launches": {"clean": {"torch": 5, "triton": 9, "host_ms": 0.5}}},
         "placement": {"scenes": [{**placed, "named": True}]},
         "agreement": {"raster": {"clean": {**agreement["clean"], "p999": 2e-3}}, "frames": same},
     }
@@ -144,6 +146,30 @@ def test_without_ceilings_nothing_else_is_measured_and_unknown_sections_are_refu
     assert "could not be measured" in found["raster"]["left_out"]
     with pytest.raises(ValueError, match=r"sections are ceilings, .*; got y"):
         measure(GpuCase(), sections=("y",), timing=once())
+
+
+def test_views_are_no_launches_and_interpreted_kernels_hide_their_own_operations():
+    with gpu.TorchOps() as ops:
+        rows = torch.ones(6).reshape(2, 3)[1]  # one operation and two views of it
+        assert float((rows * 2).sum()) == 6
+    assert ops.count == 3
+    gaussians, camera = random_scene(SMALL)
+    parts = [PosedGaussians(gaussians)]
+    gpu.draw(parts, camera)
+    with gpu.interpreted_kernels() as kernels, gpu.TorchOps() as ops:
+        gpu.draw(parts, camera)
+    assert len(kernels) >= 3 and min(kernels) > 0  # projection, lists, blending
+    assert 0 < ops.count < 100
+
+
+@pytest.mark.long
+def test_launches_of_a_frame_need_no_gpu():
+    scene, camera = gpu.interpreted_street()
+    recipes = gpu.frame_recipes(0.4)
+    found = gpu.count_launches(scene, camera, {n: recipes[n] for n in ("clean", "smog")})
+    clean, smog = found["launches"].values()
+    assert clean["triton"] == smog["triton"] > 0  # fog costs the projection, and no launch
+    assert clean["torch"] > 0 and clean["host_ms"] > 0
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

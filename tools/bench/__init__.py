@@ -4,6 +4,7 @@ and writes its figures as JSON where it is told to. Subjects are imported when t
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -52,8 +53,10 @@ def bench_effects(
         json_file: Also write the figures to this file, by effect.
     """
     results: dict[str, Any] = {}
+    subject = _subject("scenes")
+    case = dataclasses.replace(subject.QUICK if quick else subject.WHOLE, photos=photos)
     for name in only:
-        results[name] = _subject("effects").measure(name, quick, scene, photos, repeats)
+        results[name] = subject.measure_effect(name, repeats, case, scene)
         _show(results[name], None)
         write_json(json_file, results, say=name == only[-1])
     return 0
@@ -118,16 +121,16 @@ def bench_gpu(
         quick: A small scene.
         placement: A scene to find a place for snow in, besides the street; may be given several
             times.
-        sections: Some of raster, style, frames, placement and agreement (with the CPU backend's
-            pictures); by default all.
+        sections: Some of raster, style, frames, passes (beside the CPU's), placement, agreement
+            (with the CPU backend's pictures) and launches (counted, without a GPU too); by default
+            all.
         minutes: After these a section that still runs is stopped, and no other begins.
         table: Also write the tables, as Markdown: into a document's marked place, or a file of
             their own.
         json_file: Also write the figures to this file, after every section.
     """
-    import dataclasses
-
-    _subject("harness").check_gpu()
+    if set(sections) != {"launches"}:
+        _subject("harness").check_gpu()
     subject = _subject("gpu")
     case = dataclasses.replace(subject.QUICK if quick else subject.WHOLE, placement=placement)
     timing = subject.Timing(repeats=repeats)

@@ -4,7 +4,7 @@ Sections run in the order of their weight, each in a process of its own: one tha
 by a fault that leaves the GPU unusable to its process, or that finds no time left, is said to be
 missing, and the others count. Beside times stands the least that a picture can take: the longer of
 what its stages move, at the speed of a copy, and of its blends, at the speed of a kernel that does
-nothing else.
+nothing else. What a frame launches is counted where there is no GPU, too.
 """
 
 from __future__ import annotations
@@ -15,25 +15,26 @@ import functools
 import importlib.util
 import itertools
 import math
+import os
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from adapters.base import open_scene
 from augment.cameras import Camera
-from augment.effects.snow.placement import place_snow_support
-from augment.effects.snow.snow import placement_settings
-from augment.effects.style.color_maps import StyleMaps, style_gaussians
-from augment.plan import make_plan
-from augment.render.buffers import ALPHA, RGB, RenderOutput
+from augment.render.buffers import ALPHA, CPU, RGB, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda.driver import list_tiles, project, rasterize_cuda
 from augment.render.cuda.runtime import gpu_device, launch
@@ -50,20 +51,9 @@ from augment.render.layout import (
     MEAN_Y,
     SHARP_X,
 )
-from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.views import begin_view, render_buffers, render_view
-from recipes.schema import (
-    TIERS,
-    Flood,
-    Recipe,
-    Smog,
-    Snow,
-    Style,
-    Value,
-    Weather,
-    knobs_of,
-    with_settings,
-)
+from augment.scene import Gaussians, Ground, PosedGaussians, Scene
+from augment.views import begin_view, render_view
+from recipes.schema import TIERS, Recipe, knobs_of, with_settings
 from tools.bench.harness import (
     Action,
     Cell,
@@ -86,18 +76,21 @@ from tools.bench.harness import (
     spread_ratio,
 )
 from tools.bench.scenes import (
+    CLEAN,
     LARGE_CASE,
-    PICTURE_ONLY,
     SMALL_CASE,
+    WATER,
     RasterCase,
-    flood_recipe,
+    all_cameras,
+    frame_of,
     random_scene,
-    scene_of_recipe,
-    smog_recipe,
-    snow_recipe,
-    style_recipe,
+    recipe_of,
+    street_uri,
+    time_frames,
     water_camera,
 )
+from tools.bench.snow import placement
+from tools.bench.style import fold
 from tools.output import write_json
 
 BACKEND = "cuda"
@@ -105,10 +98,7 @@ BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
 MEDIUM = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
 STAGES = ("project", "list", "blend")
-PLACEMENTS = 3  # that count
-CLEAN, SMOG, FLOOD, SCREEN = "clean", "smog", "flood balanced", "flood balanced, screen space"
-SNOW, SNOW_PIXELS, STYLE = "snow fast tier", "snow per pixel", "style"
-ALL = "all at once, balanced"
+PLACEMENTS = PASSES = 3  # that count
 START = "<!-- gpu: made by climategs bench gpu --table docs/performance.md -->"
 END = "<!-- end of gpu -->"
 
@@ -271,9 +261,9 @@ def count_blends(
 
 
 def draw(
-    parts: list[PosedGaussians], camera: Camera, smog: Fog | None = None, timer: Any = None
+    parts: list[PosedGaussians], camera: Camera, fog: Fog | None = None, timer: Any = None
 ) -> RenderOutput:
-    return rasterize_cuda(parts, camera, BUFFERS, SETTINGS, smog, timer=timer)
+    return rasterize_cuda(parts, camera, BUFFERS, SETTINGS, fog, timer=timer)
 
 
 def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
@@ -282,24 +272,21 @@ def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figu
     """
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
-    frames = {CLEAN: lambda: draw(parts, camera), SMOG: lambda: draw(parts, camera, MEDIUM)}
+    frames = {"clean": lambda: draw(parts, camera), "smog": lambda: draw(parts, camera, MEDIUM)}
     stages = []
     for _ in range(timing.warm_up + timing.repeats):  # in frames of their own
         timer = GpuStageTimer()
         draw(parts, camera, timer=timer)
         stages.append(timer.milliseconds())
-    peak, extra = peak_gpu_mib(frames[CLEAN])  # before gsplat's copy of the scene lies there, too
+    peak, extra = peak_gpu_mib(frames["clean"])  # before gsplat's copy of the scene lies there, too
     first, second = ([getattr(draw(parts, camera), n).cpu() for n in sorted(BUFFERS)] for _ in "ab")
     draws = gsplat_draws(gaussians, camera)
     others = {} if isinstance(draws, str) else draws
-    seconds = timing.rounds({**frames, **others})
-    gsplat: Figures = {"left_out": draws}
+    seconds, gsplat = timing.rounds({**frames, **others}), {"left_out": draws}
     if others:
         fastest = min(others, key=lambda name: statistics.median(seconds[name]))
-        ours = draw(parts, camera).rgb
-        assert ours is not None
-        ratio = spread_ratio(seconds[CLEAN], seconds[fastest])
-        rgb = image_difference(ours, others[fastest]())
+        ratio = spread_ratio(seconds["clean"], seconds[fastest])
+        rgb = image_difference(draw(parts, camera).rgb, others[fastest]())
         gsplat = {"way": fastest, "ratio": ratio, "rgb": rgb}
     return {
         "case": case.name,
@@ -310,7 +297,7 @@ def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figu
         "same_bits": all(map(torch.equal, first, second)),
         "floor": floor_of(parts, camera, draw(parts, camera), ceilings),
         "ms": {name: spread_ms(each) for name, each in seconds.items()},
-        "smog_over_clean": spread_ratio(seconds[SMOG], seconds[CLEAN]),
+        "smog_over_clean": spread_ratio(seconds["smog"], seconds["clean"]),
         "gsplat": gsplat,
     }
 
@@ -365,30 +352,32 @@ def frame_recipes(cell_m: float = 0.05) -> dict[str, Recipe]:
     the reference's, mirrored reflection and all, but for what the tier takes back; the fast tier of
     snow lights it per splat.
     """
-    flood = flood_recipe("mirrored", "calm")
-    weather = Weather(
-        smog=Smog(visibility_m=400.0, scale_height_m=120.0),
-        flood=Flood(level_m=0.15, turbidity_ntu=20.0),
-        snow=Snow(depth_m=0.1, cell_m=cell_m),
-    )
-    everything = Recipe(weather=weather, style=Style(preset="overcast"), output=PICTURE_ONLY)
+    calm = {**WATER, "waves": {"preset": "calm"}}
+    layer, overcast = {"depth_m": 0.1, "cell_m": cell_m}, {"style": {"preset": "overcast"}}
+    weather = {
+        "smog": {"visibility_m": 400.0, "scale_height_m": 120.0},
+        "flood": {"level_m": 0.15, "turbidity_ntu": 20.0},
+        "snow": layer,
+    }
+    wet = {name: recipe_of({"flood": {**calm, "reflection": name}})
+           for name in ("mirrored", "screen_space")}  # fmt: skip
     return {
-        CLEAN: Recipe(output=PICTURE_ONLY),
-        SMOG: smog_recipe(),
-        FLOOD: balanced(flood),
-        SCREEN: balanced(flood, {"weather.flood.reflection": "screen_space"}),
-        SNOW: snow_recipe("per_splat", cell_m=cell_m),
-        SNOW_PIXELS: snow_recipe("per_pixel", cell_m=cell_m),
-        STYLE: style_recipe(),
-        ALL: balanced(everything),
+        "clean": CLEAN,
+        "smog": recipe_of({"smog": {"visibility_m": 200}}),
+        "flood balanced": balanced(wet["mirrored"]),
+        "flood balanced, screen space": balanced(wet["screen_space"], "weather.flood.reflection"),
+        "snow fast tier": recipe_of({"snow": {**layer, "shading": "per_splat"}}),
+        "snow per pixel": recipe_of({"snow": {**layer, "shading": "per_pixel"}}),
+        "style": recipe_of(overcast),
+        "all at once, balanced": balanced(recipe_of({**weather, **overcast})),
     }
 
 
-def balanced(recipe: Recipe, given: Mapping[str, Value] | None = None) -> Recipe:
-    """The recipe as `quality: balanced` would set it, all it gives itself too, but for `given`."""
+def balanced(recipe: Recipe, *kept: str) -> Recipe:
+    """The recipe as `quality: balanced` would set it, all it gives itself too, but for `kept`."""
     tier = TIERS["balanced"]
-    chosen = {k.path: tier.get(k.path, k.reference) for k in knobs_of(recipe) if k.chosen}
-    return with_settings(recipe, chosen | dict(given or {}))
+    knobs = (knob for knob in knobs_of(recipe) if knob.chosen and knob.path not in kept)
+    return with_settings(recipe, {knob.path: tier.get(knob.path, knob.reference) for knob in knobs})
 
 
 def measure_frames(
@@ -398,25 +387,18 @@ def measure_frames(
     on the host.
     """
     rows: dict[str, Figures] = {}
-
-    def frame_of(name: str) -> functools.partial:
-        own, plan = scene_of_recipe(scene, recipes[name], BACKEND), make_plan(recipes[name], scene)
-        frame = functools.partial(render_buffers, own, camera, plan, backend=BACKEND)
+    scenes = {name: dataclasses.replace(scene) for name in recipes}  # each has a memo of its own
+    actions = {n: frame_of(scenes[n], camera, recipe, BACKEND) for n, recipe in recipes.items()}
+    for name, frame in actions.items():  # one after the other: nobody else's snow counts as memory
         frame()  # compiles, copies the scene and places what stays with it
-        return frame
-
-    for name in recipes:  # one after the other: nobody else's snow counts as memory
-        frame = frame_of(name)
         peak, extra = peak_gpu_mib(frame)
         same_bits = torch.equal(frame().rgb.cpu(), frame().rgb.cpu())
         rows[name] = {"peak_mib": peak, "frame_mib": extra, "same_bits": same_bits}
-        del frame
-    actions = {name: frame_of(name) for name in recipes}
     seconds = timing.rounds(actions)
     for name, row in rows.items():
         row["ms"] = spread_ms(seconds[name])
-        row["over_clean"] = spread_ratio(seconds[name], seconds[CLEAN])
-        row["delivered"] = _delivered(actions[name].args[0], camera, recipes[name], timing)
+        row["over_clean"] = spread_ratio(seconds[name], seconds["clean"])
+        row["delivered"] = _delivered(scenes[name], camera, recipes[name], timing)
     return {
         "camera": f"{camera.name} {camera.width}x{camera.height}",
         "gaussians": sum(len(part.gaussians) for part in scene.parts_for(camera)),
@@ -440,35 +422,117 @@ def _delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> 
     return {"ms": alone, "row_ms": 1e3 * (time.perf_counter() - start) / (timing.repeats + 1)}
 
 
-def measure_style(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
+def measure_passes(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) -> Figures:
+    """Milliseconds of every pass of a frame on the GPU and on the CPU, each waited for."""
+    found: Figures = {}
+    for name, recipe in recipes.items():
+        own, found[name] = dataclasses.replace(scene), {}
+        for backend in (BACKEND, CPU):
+            _, stages = time_frames(own, camera, {"": recipe}, PASSES, backend)
+            found[name][backend] = stages[""]
+    return {"passes": found}
+
+
+# ---- what a frame launches ----------------------------------------------------------------------
+
+# Of torch's operations those that compute nothing: they make memory, or fetch a number.
+IDLE = ("empty", "new_empty", "_local_scalar_dense")
+
+
+class TorchOps(TorchDispatchMode):
+    """Counts operations that would start a kernel on a GPU: all but views and IDLE ones."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        is_view = any(r.alias_info and not r.alias_info.is_write for r in func._schema.returns)
+        self.count += not (is_view or func.__name__.startswith(IDLE))
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def interpreted_kernels() -> Iterator[list[float]]:
+    """Seconds of each of Triton's kernels inside, whose own torch operations nobody counts."""
+    from triton.runtime.interpreter import GridExecutor
+
+    run, seconds = GridExecutor.__call__, []
+
+    def timed_run(*arguments: Any, **given: Any) -> None:
+        start = time.perf_counter()
+        with _disable_current_modes():
+            run(*arguments, **given)
+        seconds.append(time.perf_counter() - start)
+
+    GridExecutor.__call__ = timed_run
+    try:
+        yield seconds
+    finally:
+        GridExecutor.__call__ = run
+
+
+def count_launches(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]) -> Figures:
+    """Of a frame to floats on the GPU: torch's operations and Triton's kernels, which do not depend
+    on sizes; host_ms: the least time of all but the kernels, of a picture so small that operations
+    take no longer than it takes to start them. Needs no GPU: kernels are interpreted.
+    """
+    found: Figures = {}
+    for name, recipe in recipes.items():
+        own, hosts = dataclasses.replace(scene), []
+        frame_of(own, camera, recipe, CPU)()  # places what stays with the scene
+        frame = frame_of(own, camera, recipe, BACKEND)
+        frame()
+        for _ in range(PASSES):
+            with interpreted_kernels() as kernels:
+                start = time.perf_counter()
+                frame()
+                hosts.append(1e3 * (time.perf_counter() - start - sum(kernels)))
+        with interpreted_kernels() as kernels, TorchOps() as ops:
+            frame()
+        found[name] = {"torch": ops.count, "triton": len(kernels), "host_ms": min(hosts)}
+    return {"launches": found}
+
+
+def interpreted_street() -> tuple[Scene, Camera]:
+    """The street's frame and sky around a road and a wall of few splats, for an interpreter."""
+    x, y = np.meshgrid(np.arange(3.0, 13.0), np.arange(-5.0, 5.0))
+    road, wall = np.stack([x, y, 0 * x], -1), np.stack([0 * x + 13, y, (x - 3) / 3], -1)
+    means = torch.from_numpy(np.concatenate([road, wall])).reshape(-1, 3).float()
+    count = len(means)
+    scales = torch.tensor([[0.6, 0.6, 0.02], [0.02, 0.6, 0.6]]).repeat_interleave(count // 2, 0)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    splats = Gaussians(means, quats, scales, torch.ones(count), torch.zeros(count, 1, 3))
+    ground = Ground(0.0, 0.0, "stated")
+    scene = dataclasses.replace(
+        open_scene(street_uri(gaussians=60_000)), background=splats, actors=(), ground=ground
+    )
+    return scene, water_camera(scene, 48, 32, CPU)
+
+
+# ---- what is done once for a scene --------------------------------------------------------------
+
+
+def measure_fold(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
     """Folding one map and writing the mapped SH of random Gaussians of degree 3, on the GPU."""
     own, _ = random_scene(case)
     fields = {f.name: getattr(own, f.name) for f in dataclasses.fields(own)}
     tensors = {k: v.to(gpu_device()) for k, v in fields.items() if isinstance(v, Tensor)}
     gaussians = dataclasses.replace(own, **tensors)
-    one = 0.9 * torch.eye(3, 4)
-    maps, out = StyleMaps(one[None], one, one), torch.empty_like(gaussians.sh)
-
-    def fold() -> None:
-        style_gaussians(gaussians, maps, out=out, backend=BACKEND)
-
-    fold()
-    ms = spread_ms(timing.rounds({"fold": fold})["fold"])
-    moved = 2 * out.nbytes
-    floor = {"bytes": moved, "ms": {"frame": ceilings.ms(moved)}}
+    out = torch.empty_like(gaussians.sh)
+    action = fold(gaussians, 1, out, BACKEND)
+    action()
+    floor = {"bytes": 2 * out.nbytes, "ms": {"frame": ceilings.ms(2 * out.nbytes)}}
+    ms = spread_ms(timing.rounds({"fold": action})["fold"])
     return {"gaussians": len(gaussians), "ms": ms, "floor": floor}
 
 
 def measure_placement(scene: Scene, uri: str, cell_m: float = 0.05) -> Figures:
     """Seconds of finding where snow can lie, for all cameras, on the host's clock."""
-    cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
-    place = functools.partial(place_snow_support, scene, cameras, settings, backend=BACKEND)
+    place = placement(scene, cell_m, BACKEND)
     return {
         "scene": scene.name,
         "uri": uri,
         "gaussians": len(scene.background) + sum(len(a.gaussians) for a in scene.actors),
-        "cameras": len(cameras),
+        "cameras": len(all_cameras(scene)),
         "cells": len(place().ground),
         "place_s": spread(rounds({"place": place}, PLACEMENTS)["place"]),
         "peak_mib": peak_gpu_mib(place)[0],
@@ -482,11 +546,9 @@ def raster_agreement(case: RasterCase) -> Figures:
 
     gaussians, camera = random_scene(case)
     parts, found = [PosedGaussians(gaussians)], {}
-    for name, smog in ((CLEAN, None), (SMOG, MEDIUM)):
-        expected = rasterize_cpu(parts, camera, BUFFERS, SETTINGS, smog).rgb
-        own = draw(parts, camera, smog).rgb
-        assert expected is not None and own is not None
-        found[name] = image_difference(own, expected)
+    for name, fog in (("clean", None), ("smog", MEDIUM)):
+        expected = rasterize_cpu(parts, camera, BUFFERS, SETTINGS, fog).rgb
+        found[name] = image_difference(draw(parts, camera, fog).rgb, expected)
     return found
 
 
@@ -494,9 +556,9 @@ def frame_agreement(scene: Scene, camera: Camera, recipes: Mapping[str, Recipe])
     """The same by recipe; snow lies where one of them found a place for it."""
     found = {}
     for name, recipe in recipes.items():
-        own, plan = scene_of_recipe(scene, recipe, BACKEND), make_plan(recipe, scene)
-        images = [render_buffers(own, camera, plan, backend=b).rgb for b in (BACKEND, "cpu")]
-        found[name] = image_difference(images[0], images[1])
+        own = dataclasses.replace(scene)
+        images = [frame_of(own, camera, recipe, backend)().rgb for backend in (BACKEND, CPU)]
+        found[name] = image_difference(*images)
     return found
 
 
@@ -510,7 +572,7 @@ class GpuCase:
     """
 
     raster: RasterCase = LARGE_CASE
-    street: str = "procedural:street?seed=3&frames=1&gaussians=1000000"
+    street: str = street_uri(gaussians=1_000_000)
     width: int = 1600
     height: int = 1066
     placement: tuple[str, ...] = ()
@@ -522,28 +584,30 @@ class GpuCase:
         return scene, water_camera(scene, self.width, self.height, BACKEND)
 
 
-WHOLE = GpuCase()
-QUICK = GpuCase(SMALL_CASE, "procedural:street?seed=3&frames=1", width=640, height=426)
-CEILINGS = "ceilings"
-SECTIONS = (CEILINGS, "raster", "style", "frames", "placement", "agreement")
+WHOLE, QUICK = GpuCase(), GpuCase(SMALL_CASE, street_uri(), width=640, height=426)
+CEILINGS, LAUNCHES = "ceilings", "launches"
+SECTIONS = (CEILINGS, "raster", "style", "frames", "passes", "placement", "agreement", LAUNCHES)
 
 
 def run_section(name: str, case: GpuCase, timing: Timing, ceilings: Ceilings | None) -> Figures:
     """One of SECTIONS; ceilings: None for their own."""
-    if ceilings is None:
-        found = measure_ceilings(timing, **case.load)
-        return {**dataclasses.asdict(found), "gpu": gpu_facts()}
     recipes = frame_recipes(case.cell_m)
     match name:
+        case "ceilings":
+            return {**dataclasses.asdict(measure_ceilings(timing, **case.load)), "gpu": gpu_facts()}
         case "raster":
             return measure_raster(case.raster, timing, ceilings)
         case "style":
-            return measure_style(case.raster, timing, ceilings)
+            return measure_fold(case.raster, timing, ceilings)
         case "frames":
             return measure_frames(*case.open_street(), recipes, timing)
+        case "passes":
+            return measure_passes(*case.open_street(), recipes)
         case "agreement":
             frames = frame_agreement(*case.open_street(), recipes)
             return {"raster": raster_agreement(case.raster), "frames": frames}
+        case "launches":
+            return count_launches(*interpreted_street(), frame_recipes(cell_m=0.4))
     uris = (*case.placement, case.street)
     found = [measure_placement(open_scene(uri), uri, case.cell_m) for uri in uris]
     return {"scenes": [{**each, "named": each["uri"] != case.street} for each in found]}
@@ -568,16 +632,16 @@ def measure(
         raise ValueError(f"sections are {', '.join(SECTIONS)}; got {', '.join(unknown)}")
     timing, start, machine = timing or Timing(), time.perf_counter(), machine_facts()
     found: Figures = {name: {"left_out": "not asked for"} for name in SECTIONS}
+    asked = {*sections, *([] if set(sections) == {LAUNCHES} else [CEILINGS])}
     ceilings: Ceilings | None = None
-    for name in SECTIONS:
-        if name != CEILINGS and name not in sections:
-            continue
-        if name != CEILINGS and ceilings is None:
+    for name in (name for name in SECTIONS if name in asked):
+        if name not in (CEILINGS, LAUNCHES) and ceilings is None:
             found[name] = {"left_out": "the GPU's ceilings could not be measured"}
             continue
         left_s = 60 * minutes - (time.perf_counter() - start)
         work = (run_section, (name, case, timing, ceilings))
-        found[name] = run_in_subprocess(*work, left_s) if in_processes else guarded(*work)
+        with mock.patch.dict(os.environ, {"TRITON_INTERPRET": "1"} if name == LAUNCHES else {}):
+            found[name] = run_in_subprocess(*work, left_s) if in_processes else guarded(*work)
         if "bytes_per_s" in found[name]:
             ceilings = Ceilings(found[name]["bytes_per_s"], found[name]["blends_per_s"])
         write_json(json_file, gpu_figures(found, timing, machine), say=False)
@@ -630,13 +694,13 @@ def _worst(errors: Figures) -> float:
 
 
 TARGETS = (
-    Target("clean frame", "ms", 3.0, "raster", lambda f: f["ms"][CLEAN], has_floor=True),
+    Target("clean frame", "ms", 3.0, "raster", lambda f: f["ms"]["clean"], has_floor=True),
     Target("smog in splats, over clean", "x", 1.1, "raster", lambda f: f["smog_over_clean"]),
     Target("street: smog, over clean", "x", 1.1, "frames",
-           lambda f: f["frames"][SMOG]["over_clean"]),
-    Target("street: flood balanced", "ms", 6.0, "frames", lambda f: f["frames"][FLOOD]["ms"]),
+           lambda f: f["frames"]["smog"]["over_clean"]),
+    Target("street: flood balanced", "ms", 6.0, "frames", lambda f: f["frames"]["flood balanced"]["ms"]),
     Target("street: snow fast tier, over clean", "x", 1.3, "frames",
-           lambda f: f["frames"][SNOW]["over_clean"]),
+           lambda f: f["frames"]["snow fast tier"]["over_clean"]),
     Target("street: most memory of any frame and its scene", "GB", 2.0, "frames",
            lambda f: _gigabytes(*(row["peak_mib"] for row in f["frames"].values()))),
     Target("street: rgb off the CPU backend's, 99.9 %, worst frame", "", 1e-3, "agreement",
@@ -701,7 +765,7 @@ def gpu_tables(found: Figures) -> list[Table]:
         rows = []
         for name, ms in {**raster["stages_ms"], **raster["ms"]}.items():
             least, moved = floor["ms"].get(name), floor["bytes_of"].get(name)
-            if name in (CLEAN, SMOG):
+            if name in ("clean", "smog"):
                 least, moved = floor["ms"]["frame"], floor["bytes"]
             cells: Sequence[Cell] = (None, None, None, None)
             if least is not None and (median := ms["median"]):
@@ -719,6 +783,20 @@ def gpu_tables(found: Figures) -> list[Table]:
             rows.append((name, *row["ms"].values(), row["over_clean"]["median"], *delivered, *rest))
         title = f"Street, {frames['gaussians']:,} Gaussians, {frames['camera']}"
         tables.append(Table(title, columns, rows))
+    if "passes" in found["passes"]:
+        rows = [
+            (name, stage, ms, each[CPU].get(stage))
+            for name, each in found["passes"]["passes"].items()
+            for stage, ms in each[BACKEND].items()
+            if max(ms, each[CPU].get(stage, 0)) >= 0.1
+        ]
+        columns = ("frame", "pass", "GPU ms", "CPU ms")
+        tables.append(Table("Passes, each waited for; below 0.1 ms left out", columns, rows))
+    if "launches" in found[LAUNCHES]:
+        columns = ("frame", "torch operations", "Triton kernels", "host ms")
+        rows = [(name, *each.values()) for name, each in found[LAUNCHES]["launches"].items()]
+        note = "host: of all but Triton's launches, on this machine"
+        tables.append(Table("What a frame launches on a GPU", columns, rows, note))
     if "scenes" in found["placement"]:
         columns = ("scene", "Gaussians", "cameras", "cells", "s", "min", "p90")
         keys = ("scene", "gaussians", "cameras", "cells")

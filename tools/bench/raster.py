@@ -32,7 +32,7 @@ from tools.bench.scenes import LARGE_CASE, SMALL_CASE, RasterCase, random_scene
 STAGES = ("project", "sort", "bin", "raster")
 BUFFERS = frozenset({RGB, ALPHA})
 SETTINGS = RasterSettings()
-SMOG = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
+FOG = Fog(sigma_per_m=0.03, rgb=(0.7, 0.72, 0.75))
 COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M pairs/s",
            "scene MiB", "frame MiB")  # fmt: skip
 REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",
@@ -93,7 +93,7 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
         stages.append({})
         rasterize_cpu(parts, camera, BUFFERS, SETTINGS, None, stage_times=stages[-1])
 
-    seconds = rounds({"clear": clear, "smog": lambda: _draw(parts, camera, SMOG)}, repeats)
+    seconds = rounds({"clear": clear, "smog": lambda: _draw(parts, camera, FOG)}, repeats)
     tiles = bin_to_tiles(project_parts(parts, camera, SETTINGS), camera)
     return {
         "case": case.name,
@@ -109,8 +109,8 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
     }
 
 
-def _draw(parts: list[PosedGaussians], camera: Camera, smog: Fog | None = None) -> RenderOutput:
-    return rasterize_cpu(parts, camera, BUFFERS, SETTINGS, smog)
+def _draw(parts: list[PosedGaussians], camera: Camera, fog: Fog | None = None) -> RenderOutput:
+    return rasterize_cpu(parts, camera, BUFFERS, SETTINGS, fog)
 
 
 def frame_of(case: RasterCase) -> Action:

@@ -1,31 +1,45 @@
-"""Scenes, cameras and recipes that several subjects of `climategs bench` measure."""
+"""What several subjects of `climategs bench` measure: scenes, cameras, recipes, and what a frame
+under an effect costs beside the clean one.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
-from adapters.base import open_scene
+from adapters.base import open_scene, parse_uri
+from adapters.procedural import StreetTruth, open_truth
 from augment.cameras import Camera
-from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import remember_support, support_of
-from augment.effects.style.style import remember_maps, style_maps
 from augment.geometry import rigid
 from augment.jobs.layout import folder_name, variant_name
 from augment.jobs.render_job import RenderJob, run_job
 from augment.plan import make_plan
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
+from augment.timing import stopwatch
 from augment.views import render_buffers
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.weather import Flood, Snow, Style, Waves
+from recipes.schema import Output, Recipe, Weather
+from tools.bench.harness import (
+    Action,
+    Figures,
+    Table,
+    figures,
+    machine_facts,
+    median_ms,
+    peak_mib_in_subprocess,
+    rounds,
+    spread_ratio,
+)
 
 ZOOMS = (1.0, 0.8, 1.25, 1.6, 2.0, 2.5)  # the first that is near is taken
 NEAR_SHARE = 0.05  # of the image; as much off is about a third, too
@@ -66,14 +80,10 @@ def random_scene(case: RasterCase, *, seed: int = 0) -> tuple[Gaussians, Camera]
     opacities = np.clip(rng.beta(0.9, 1.2, count), 0.005, 1)
     sh = rng.normal(0, 0.1, (count, 16, 3))
     sh[:, 0] = (rng.uniform(0, 1, (count, 3)) - 0.5) / SH_C0
-    fields = {
-        "means": np.stack([z, -x, -y], -1),  # the camera looks along +x, z is up
-        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        "scales": scales,
-        "opacities": opacities,
-        "sh": sh,
-    }
-    gaussians = Gaussians(**{k: torch.from_numpy(v.astype(np.float32)) for k, v in fields.items()})
+    means = np.stack([z, -x, -y], -1)  # the camera looks along +x, z is up
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    fields = (means, quats, scales, opacities, sh)
+    gaussians = Gaussians(*(torch.from_numpy(each.astype(np.float32)) for each in fields))
     rotation = torch.tensor([[0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
     pose = rigid(rotation, torch.zeros(3, dtype=torch.float64))
     centre = (case.width / 2, case.height / 2)
@@ -97,10 +107,14 @@ def front_camera(scene: Scene, width: int | None = None) -> Camera:
     return camera if width is None else camera.scaled(width / camera.width)
 
 
+def all_cameras(scene: Scene) -> list[Camera]:
+    return [camera for frame in scene.frames for camera in frame.cameras.values()]
+
+
 def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -> Camera:
     """`front_camera`, zoomed where less or more than about a third of the image is water."""
     own, choice = front_camera(scene), []
-    plan = make_plan(flood_recipe("sky"), scene)
+    recipe = recipe_of({"flood": {**WATER, "reflection": "sky", "waves": {"preset": "still"}}})
     for zoom in ZOOMS:
         scale = zoom * width / own.width
         cx, cy = (
@@ -109,7 +123,7 @@ def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
         )
         size = {"width": width, "height": height, "cx": cx, "cy": cy}
         camera = dataclasses.replace(own, fx=own.fx * scale, fy=own.fy * scale, **size)
-        water = render_buffers(scene, camera.scaled(0.125), plan, backend=backend).water
+        water = frame_of(scene, camera.scaled(SMALL), recipe, backend)().water
         off = abs((0.0 if water is None else float(water.float().mean())) - 1 / 3)
         if off <= NEAR_SHARE:
             return camera
@@ -117,53 +131,31 @@ def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
     return min(choice, key=lambda entry: entry[0])[1]
 
 
+# ---- recipes ------------------------------------------------------------------------------------
+
 PICTURE_ONLY = Output(depth="none", labels=False)
+CLEAN = Recipe(output=PICTURE_ONLY)
+# Water 25 cm above the median road, the middle one of a drive that may have a slope.
+WATER = {"level_m": 0.25, "reference": "median"}
 
 
-def flood_recipe(
-    reflection: str = "mirrored",
-    waves: str = "still",
-    *,
-    output: Output = PICTURE_ONLY,
-    **flood: Any,
-) -> Recipe:
-    """Water 25 cm above the median road, the middle one of a drive that may have a slope."""
-    fields = {"level_m": 0.25, "reference": "median", "reflection": reflection, **flood}
-    water = Flood.model_validate({**fields, "waves": Waves.model_validate({"preset": waves})})
-    return Recipe(weather=Weather(flood=water), output=output)
+def recipe_of(effects: Mapping[str, Any], output: Output = PICTURE_ONLY) -> Recipe:
+    """effects: fields of each, by the effect's name."""
+    weather = {name: fields for name, fields in effects.items() if name in Weather.model_fields}
+    others = {name: fields for name, fields in effects.items() if name not in weather}
+    return Recipe.model_validate({"weather": weather, "output": output, **others})
 
 
-def snow_recipe(
-    shading: str | None = "per_splat",
-    *,
-    cell_m: float = 0.05,
-    output: Output = PICTURE_ONLY,
-    **weather: Any,
-) -> Recipe:
-    """10 cm of snow; shading: None for none. weather: what else the recipe has."""
-    if shading is not None:
-        fields = {"depth_m": 0.1, "shading": shading, "cell_m": cell_m}
-        weather["snow"] = Snow.model_validate(fields)
-    return Recipe(weather=Weather(**weather), output=output)
-
-
-def smog_recipe(visibility_m: float = 200) -> Recipe:
-    return Recipe(weather=Weather(smog=Smog(visibility_m=visibility_m)), output=PICTURE_ONLY)
-
-
-def style_recipe(preset: str = "overcast", **style: Any) -> Recipe:
-    return Recipe(style=Style.model_validate({"preset": preset, **style}), output=PICTURE_ONLY)
+def frame_of(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> Action:
+    """Renders a view as floats, by a plan that is made once."""
+    plan = make_plan(recipe, scene)
+    return functools.partial(render_buffers, scene, camera, plan, backend=backend)
 
 
 def record_street(
-    folder: Path,
-    recipe: Recipe,
-    *,
-    scale: float = 1.0,
+    folder: Path, recipe: Recipe, *, scale: float = 1.0, frames: int, gaussians: int,
     cameras: Sequence[str] | None = None,
-    frames: int,
-    gaussians: int,
-) -> tuple[Scene, Path]:
+) -> tuple[Scene, Path]:  # fmt: skip
     """The procedural street, and the folder of one variant of it that a job has written."""
     scene = open_scene(street_uri(frames, gaussians))
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": scale})})
@@ -172,16 +164,118 @@ def record_street(
     return scene, folder / folder_name(scene.name) / variant_name(recipe)
 
 
-def scene_of_recipe(scene: Scene, recipe: Recipe, backend: str = "auto") -> Scene:
-    """A scene of the same arrays that remembers a recipe's snow and style maps, as long as it
-    lives: only a few are kept at a time, and none may be found anew between two timed frames.
+# ---- what an effect costs -----------------------------------------------------------------------
+
+SMALL = 0.125  # resolution of the frame that loads kernels before memory is measured
+Cases = Mapping[str, tuple[Recipe, Recipe]]  # with the effect, and the clean frame beside it
+
+
+@dataclass(frozen=True)
+class EffectCase:
+    """What an effect is measured on. scenes: of its cost, in an image of width x height pixels.
+    street: of its errors, procedural, because the truth must be known; frames, cameras, scale: of
+    the street's views. cell_m: of snow near the path. splats: of the SH that a style maps. presets:
+    styles whose pictures are compared, empty for all. photos: a folder that style methods are
+    scored on. memory: whether it is measured.
     """
-    own = dataclasses.replace(scene)
-    snow, style = recipe.weather.snow, recipe.style
-    if snow is not None:
-        settings = placement_settings(snow)
-        remember_support(own, settings, support_of(scene, settings, backend=backend))
-    if style is not None:
-        usual = style.model_copy(update={"evaluated": "color"})
-        remember_maps(own, style, style_maps(scene, usual))
-    return own
+
+    scenes: tuple[str, ...] = (street_uri(gaussians=1_000_000),)
+    width: int = 1600
+    height: int = 1066
+    street: str = street_uri(6)
+    frames: tuple[int, ...] = (0, 5)
+    cameras: tuple[str, ...] = ("front", "left", "back")
+    scale: float = 1.0
+    cell_m: float = 0.05
+    splats: int = 1_000_000
+    presets: tuple[str, ...] = ()
+    photos: Path | None = None
+    memory: bool = True
+
+    def open_street(self) -> tuple[Scene, StreetTruth]:
+        return open_scene(self.street), open_truth(parse_uri(self.street)[2])
+
+    def views(self, street: Scene, scale: float = 1.0) -> list[Camera]:
+        return [
+            street.frame(frame).cameras[name].scaled(self.scale * scale)
+            for frame in self.frames
+            for name in self.cameras
+        ]
+
+
+WHOLE = EffectCase()
+QUICK = EffectCase(
+    (street_uri(),), 800, 533, street_uri(2, 120_000), (0,), ("front",), scale=0.5, cell_m=0.1,
+    splats=200_000, presets=("overcast", "golden-hour"),
+)  # fmt: skip
+
+
+def measure_effect(
+    effect: str, repeats: int, case: EffectCase, scene: str | None = None
+) -> Figures:
+    """effect: a module of this folder. scene: another whose cost is measured, too."""
+    machine, scenes = machine_facts(), (*case.scenes, *([scene] if scene else []))
+    subject = importlib.import_module(f"tools.bench.{effect}")
+    tables = subject.tables(dataclasses.replace(case, scenes=scenes), repeats)
+    return figures(effect, tables, machine=machine)
+
+
+def cost_tables(case: EffectCase, cases: Cases, staged: Sequence[str], repeats: int) -> list[Table]:
+    """Of every scene: frames of every case in turns with clean ones. staged: cases whose stages and
+    memory are shown.
+    """
+    tables: list[Table] = []
+    for uri in case.scenes:
+        scene = open_scene(uri)
+        camera = water_camera(scene, case.width, case.height)
+        rows, stages = [], {}
+        for name, (recipe, clean) in tqdm(cases.items(), "frames", leave=False):
+            pair = {"effect": recipe, "clean": clean}
+            seconds, stage_times = time_frames(scene, camera, pair, repeats)
+            ratio = spread_ratio(seconds["effect"], seconds["clean"]).values()
+            clean_ms, effect_ms = median_ms(seconds["clean"]), median_ms(seconds["effect"])
+            rows.append([name, clean_ms, effect_ms, *ratio])
+            if name in staged:
+                stages.setdefault("clean", {**stage_times["clean"], "whole": clean_ms})
+                stages[name] = {**stage_times["effect"], "whole": effect_ms}
+        names = dict.fromkeys(s for each in stages.values() for s in each if s != "whole")
+        shown = [s for s in names if any(each.get(s, 0) >= 0.1 for each in stages.values())]
+        by_stage = [[s, *(each.get(s) for each in stages.values())] for s in (*shown, "whole")]
+        count = sum(len(part.gaussians) for part in scene.parts_for(camera))
+        title = f"Frames: {uri}, {count:,} Gaussians, {camera.name} {case.width}x{case.height}"
+        columns = ("case", "clean ms", "with it ms", "ratio", "least", "p90")
+        tables.append(Table(title, columns, rows))
+        tables.append(Table("Stages, ms; those below 0.1 left out", ("stage", *stages), by_stage))
+        if case.memory:
+            recipes = {"clean": cases[staged[0]][1], **{name: cases[name][0] for name in staged}}
+            size = (uri, case.width, case.height)
+            mib = [[n, peak_mib_in_subprocess(_warm_frame, (*size, r))] for n, r in recipes.items()]
+            tables.append(Table("Memory of a frame above its scene", ("case", "MiB"), mib))
+    return tables
+
+
+def time_frames(
+    scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], repeats: int, backend: str = "auto"
+) -> tuple[dict[str, list[float]], dict[str, dict[str, float]]]:
+    """Seconds of each recipe's frames as floats, and medians of their stages, milliseconds."""
+    stage_times: dict[str, list[dict[str, float]]] = {name: [] for name in recipes}
+
+    def timed_frame(name: str, frame: Action) -> None:
+        with stopwatch() as seconds:
+            frame()
+        stage_times[name].append(seconds)
+
+    frames = {name: frame_of(scene, camera, recipe, backend) for name, recipe in recipes.items()}
+    actions = {name: functools.partial(timed_frame, name, frame) for name, frame in frames.items()}
+    return rounds(actions, repeats), {
+        name: {stage: median_ms([lap.get(stage, 0.0) for lap in each[1:]]) for stage in each[-1]}
+        for name, each in stage_times.items()
+    }
+
+
+def _warm_frame(uri: str, width: int, height: int, recipe: Recipe) -> Action:
+    """A frame of a process that has drawn it small: kernels, snow, maps and sky are there."""
+    scene = open_scene(uri)
+    camera = water_camera(scene, width, height)
+    frame_of(scene, camera.scaled(SMALL), recipe)()
+    return frame_of(scene, camera, recipe)

@@ -24,6 +24,7 @@ place of rows of earlier ones, with TABLE_tiers.jpg beside; and makes docs/trade
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -44,20 +45,17 @@ from tqdm import tqdm
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
 from augment.cameras import Camera
-from augment.effects.flood.water_plane import plane_depth
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
 from augment.jobs.quality import Cost, Settings, Trial, render_trial, useful, within_flip
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import CLOSE_M, flip, ssim
-from augment.plan import make_plan
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
-from augment.views import SURFACE_ALPHA, render_buffers
+from augment.views import SURFACE_ALPHA, render_view
 from recipes.fields import changed
-from recipes.flood import Flood
 from recipes.load import load_recipe
 from recipes.schema import (
     KNOBS,
@@ -66,15 +64,12 @@ from recipes.schema import (
     Output,
     Quality,
     Recipe,
-    Smog,
     Value,
     Weather,
     as_reference,
     knobs_of,
     with_settings,
 )
-from recipes.snow import Snow
-from recipes.style import Style
 from tools.bench.harness import (
     Figures,
     Table,
@@ -91,7 +86,7 @@ from tools.bench.harness import (
     spread_ms,
     spread_ratio,
 )
-from tools.bench.scenes import front_name, scene_of_recipe
+from tools.bench.scenes import frame_of, front_name, recipe_of
 from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
 
@@ -100,6 +95,12 @@ DEPTH, JPEG = "output.depth", "output.jpeg_quality"
 REFERENCE, DEFAULTS, CLEAN = "reference", "defaults", "clean"
 TRUTH = "truth"  # what depths are compared with where the scene's surfaces are known
 PRESETS = {"smog": "brown-smog", "flood": "street-flood", "snow": "fresh-snow", "style": "evening"}
+ALL = {
+    "smog": {"visibility_m": 400.0, "scale_height_m": 120.0},
+    "flood": {"level_m": 0.15, "turbidity_ntu": 20.0},
+    "snow": {"depth_m": 0.1},
+    "style": {"preset": "overcast"},
+}
 RECIPES = (CLEAN, *PRESETS, "all")
 AT_A_TIME = 6  # settings between two frames of the reference
 DIGITS = 4  # significant ones that figures keep
@@ -149,13 +150,8 @@ class Setting:
 
 def trade_recipe(name: str) -> Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
-    if name == CLEAN:
-        recipe = Recipe(name=CLEAN)
-    elif name == "all":
-        smog = Smog(visibility_m=400.0, scale_height_m=120.0)
-        flood, snow = Flood(level_m=0.15, turbidity_ntu=20.0), Snow(depth_m=0.1)
-        weather = Weather(smog=smog, flood=flood, snow=snow)
-        recipe = Recipe(name=name, weather=weather, style=Style(preset="overcast"))
+    if name in (CLEAN, "all"):
+        recipe = recipe_of(ALL if name == "all" else {}, Output()).model_copy(update={"name": name})
     else:
         loaded = load_recipe(PRESETS.get(name, name)).resolve(0)
         recipe = loaded.model_copy(update={"name": name if name in PRESETS else loaded.name})
@@ -209,18 +205,17 @@ def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
 
 
 class Stage:
-    """Renders recipes on one scene, whose snow and style maps are found once and remembered."""
+    """Renders recipes on one scene. Those of other effects have a copy of their own: it remembers
+    what is found once, and none may be found anew between two timed frames.
+    """
 
     def __init__(self, scene: Scene, backend: str) -> None:
         self._scene, self._backend = scene, backend
         self._scenes: dict[str, Scene] = {}
 
     def scene_for(self, recipe: Recipe) -> Scene:
-        snow, style, flood = recipe.weather.snow, recipe.style, recipe.weather.flood
-        key = repr((snow, style, None if snow is None or flood is None else flood.level_m))
-        if key not in self._scenes:
-            self._scenes[key] = scene_of_recipe(self._scene, recipe, self._backend)
-        return self._scenes[key]
+        effects = recipe.model_dump_json(include={"weather", "style"})
+        return self._scenes.setdefault(effects, dataclasses.replace(self._scene))
 
     def render(self, recipe: Recipe, camera: Camera) -> Trial:
         return render_trial(self.scene_for(recipe), camera, recipe, self._backend)
@@ -242,8 +237,8 @@ class Stage:
 @dataclass(frozen=True, eq=False)
 class Standard:
     """What a reference's view is compared by. first_m, alpha [H, W]: of what a ray meets first,
-    water too. surfaces, water, snow [H, W]: where there are such. true_m [H, W]: the scene's exact
-    depth, infinite in the sky; None where it is not known, or under snow.
+    water too. surfaces, water, overlay [H, W]: where there are such. true_m [H, W]: the scene's
+    exact depth, infinite in the sky; None where it is not known, or under an overlay.
     """
 
     camera: Camera
@@ -251,33 +246,33 @@ class Standard:
     alpha: np.ndarray
     surfaces: np.ndarray
     water: np.ndarray
-    snow: np.ndarray
+    overlay: np.ndarray
     true_m: np.ndarray | None = None
 
     def region(self, knob: str) -> np.ndarray:
         """Where a knob's depth errors count: on what its effect covers, else on all surfaces."""
         if knob.startswith("weather.flood."):
             return self.water & self.surfaces
-        return self.snow if knob.startswith("weather.snow.") else self.surfaces
+        return self.overlay if knob.startswith("weather.snow.") else self.surfaces
 
 
 def standard_of(
     scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None = None
 ) -> Standard:
-    """recipe: at reference."""
+    """recipe: at reference. true_m: of the scene without an overlay."""
     if recipe.output.depth == "none":
         recipe = changed(recipe, {DEPTH: "median"})
-    plan = make_plan(recipe, scene)
-    buffers = render_buffers(scene, camera, plan)
-    assert buffers.depth_m is not None and buffers.raster.alpha is not None
-    depth, alpha = buffers.depth_m, buffers.raster.alpha
+    solid = frame_of(scene, camera, recipe)()
+    depth, alpha, overlay = solid.depth_m, solid.raster.alpha, solid.raster.overlay
     surfaces, nowhere = (alpha >= SURFACE_ALPHA) & (depth > 0), torch.zeros_like(alpha) > 0
-    water = nowhere if buffers.water is None else buffers.water
-    snow = nowhere if buffers.overlay is None else buffers.overlay
-    if plan.flood is not None:
-        depth = torch.where(water, plane_depth(camera, plan.flood.level_z_m).to(depth.dtype), depth)
+    water = nowhere if solid.water is None else solid.water
+    if solid.water is not None:
+        first = render_view(scene, camera, changed(recipe, {"output.surface": "first"})).depth_m
+        depth = torch.where(water, torch.from_numpy(first).to(depth.dtype), depth)
         alpha = torch.where(water, 1.0, alpha)
-    images = (depth, alpha, surfaces, water, snow)
+    shown = nowhere if overlay is None else (overlay >= SURFACE_ALPHA) & ~water
+    images = (depth, alpha, surfaces, water, shown)
+    true_m = true_m if overlay is None else None
     return Standard(camera, *(image.numpy() for image in images), true_m)
 
 
@@ -392,8 +387,8 @@ def bench_trade(
     """
     drawn = [trade_recipe(name) for name in recipes]
     scene = open_scene(scene_uri)
-    if any(recipe.weather.flood is not None for recipe in drawn):
-        scene = dataclasses.replace(scene, ground=ground_of(scene))  # looked for once
+    with contextlib.suppress(SceneError):  # looked for once, not for every copy of the scene
+        scene = dataclasses.replace(scene, ground=ground_of(scene))
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
     machine, gpu = machine_facts(), None if backend == CPU else gpu_facts()
@@ -436,10 +431,9 @@ def measure_recipe(
     best, *others = settings_of_trade(recipe, case, wholes)
     plain = recipe.model_copy(update={"weather": Weather(), "style": None})
     clean = Setting(CLEAN, CLEAN, as_reference(plain))
-    known = None if recipe.weather.snow is not None else true_m
     standards = [
         standard_of(stage.scene_for(best.recipe), camera, best.recipe, true)
-        for camera, true in zip(cameras, known or [None] * len(cameras), strict=True)
+        for camera, true in zip(cameras, true_m or [None] * len(cameras), strict=True)
     ]
     rows: list[Row] = []
     pictures: dict[str, np.ndarray] = {}

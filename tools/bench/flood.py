@@ -1,0 +1,243 @@
+"""Floods: their cost, and how far pictures of the water and its mask are from what is known.
+
+Still, opaque water under the mirrored tier is compared with a picture made without the flood's
+own mirror: the Gaussians themselves are mirrored. Other tiers are compared with the mirrored one.
+Which pixels show water first is known on the procedural street by casting rays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from adapters.procedural import StreetTruth
+from augment.cameras import Camera
+from augment.effects.flood.water_plane import plane_depth
+from augment.metrics.image import psnr
+from augment.plan import make_plan
+from augment.render.buffers import ALPHA, RGB
+from augment.render.layout import ABOVE, BELOW, HeightClip
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians, Scene
+from recipes.schema import Output, Recipe
+from tools.bench.harness import Table
+from tools.bench.scenes import (
+    CLEAN,
+    PICTURE_ONLY,
+    WATER,
+    EffectCase,
+    cost_tables,
+    frame_of,
+    recipe_of,
+)
+
+TIERS, WAVES = ("sky", "screen_space", "mirrored"), ("still", "calm")
+OPAQUE = {"absorption_per_m": (1e6, 1e6, 1e6)}
+EDGE_PX = 3  # pixels this close to the water's border show two surfaces; splats overhang as far
+DARK, LIT = 2 / 255, 8 / 255  # a black pixel, and what it is compared with when it should not be
+BLOCK = 32
+MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def flood_recipe(
+    reflection: str = "mirrored", waves: str = "still", output: Output = PICTURE_ONLY, **given: Any
+) -> Recipe:
+    fields = {**WATER, "reflection": reflection, "waves": {"preset": waves}, **given}
+    return recipe_of({"flood": fields}, output)
+
+
+def tables(case: EffectCase, repeats: int) -> list[Table]:
+    """Costs of every tier still and with waves, as pictures only; of Schlick's formula; of depth
+    and labels as by default; and of water below everything.
+    """
+    default = Recipe()
+    costs = {f"{t}, {w}": (flood_recipe(t, w), CLEAN) for t in TIERS for w in WAVES}
+    costs["mirrored, calm, schlick"] = flood_recipe("mirrored", "calm", fresnel="schlick"), CLEAN
+    for tier in TIERS:
+        recipe = flood_recipe(tier, "calm", default.output)
+        costs[f"{tier}, calm, depth and labels"] = recipe, default
+    costs["level below everything"] = flood_recipe(level_m=-100.0), CLEAN
+    street, truth = case.open_street()
+    rows: list[Any] = []
+    for camera in case.views(street):
+        errors = {"mirrored against mirrored splats": analytic_error(street, camera)} | {
+            f"{tier}, {waves}, against mirrored": tier_error(street, camera, tier, waves)
+            for tier in TIERS[:2]
+            for waves in WAVES
+        }
+        keys = ("psnr_db", "p99", "black_share", "worst_block", "worst_at")
+        name = f"{camera.name} at {camera.timestamp_ns} ns"
+        rows += [[name, picture, *map(error.get, keys)] for picture, error in errors.items()]
+    columns = ("view", "picture", "PSNR dB", "p99", "black", f"worst {BLOCK}x{BLOCK}", "at")
+    title = f"Errors inside the water, channels in 1/255: {case.street}"
+    masks = "Masks of water against the truth: shares of pixels"
+    mask_columns = ("view", "agreeing", "away from silhouettes", "which are")
+    shares = water_masks(street, truth, case.frames, scale=case.scale / 2)
+    staged = [f"{tier}, calm" for tier in TIERS]
+    return [
+        *cost_tables(case, costs, staged, repeats),
+        Table(title, columns, rows),
+        Table(masks, mask_columns, shares),
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """rgb [H, W, 3] in [0, 1]. water [H, W]: where the view shows it first."""
+
+    rgb: np.ndarray
+    water: np.ndarray
+
+
+def draw_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:
+    buffers = frame_of(scene, camera, recipe)()
+    none = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    water = none if buffers.water is None else buffers.water
+    return Picture(buffers.rgb.clamp(0, 1).numpy(), water.numpy())
+
+
+def inside(water: np.ndarray) -> np.ndarray:
+    """The water's pixels at least EDGE_PX from its border; the image's border is none."""
+    kernel = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    return cv2.erode(water.astype(np.uint8), kernel, borderValue=1).astype(bool)
+
+
+def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict[str, Any]:
+    """The mirrored tier against mirrored Gaussians: still, opaque water."""
+    recipe = flood_recipe(fresnel=fresnel, **OPAQUE)
+    picture = draw_picture(scene, camera, recipe)
+    truth = mirrored_picture(scene, camera, recipe).clamp(0, 1).numpy()
+    return {
+        **water_error(picture, Picture(truth, picture.water)),
+        "water_share": float(picture.water.mean()),
+        "psnr_with_edges_db": psnr(picture.rgb, truth, picture.water),
+        "outside_psnr_db": psnr(picture.rgb, truth, inside(~picture.water)),
+    }
+
+
+def tier_error(scene: Scene, camera: Camera, reflection: str, waves: str) -> dict[str, Any]:
+    """A tier against the mirrored one under the same waves, inside the water."""
+    tiers = (flood_recipe(tier, waves) for tier in (reflection, "mirrored"))
+    return water_error(*(draw_picture(scene, camera, recipe) for recipe in tiers))
+
+
+def water_error(picture: Picture, truth: Picture) -> dict[str, Any]:
+    """psnr_db in the water; black_share of its pixels that are dark and should not be; worst_block:
+    mean channel error in 1/255 of the worst square of BLOCK px that is at least half water, and
+    worst_at, its column and row.
+    """
+    mask = inside(truth.water)
+    black = (picture.rgb.max(-1) < DARK) & (truth.rgb.max(-1) >= LIT) & mask
+    error = np.abs(picture.rgb - truth.rgb).mean(-1) * 255
+    worst = (0.0, 0, 0)
+    for row in range(0, error.shape[0], BLOCK):
+        for column in range(0, error.shape[1], BLOCK):
+            here = np.s_[row : row + BLOCK, column : column + BLOCK]
+            if 2 * mask[here].sum() >= BLOCK * BLOCK:
+                worst = max(worst, (float(error[here][mask[here]].mean()), column, row))
+    return {
+        "psnr_db": psnr(picture.rgb, truth.rgb, mask),
+        "black_share": float(black.sum() / mask.sum()),
+        "p99": float(np.quantile(error[mask], 0.99)),
+        "worst_block": worst[0],
+        "worst_at": f"{worst[1]}, {worst[2]}",
+    }
+
+
+def mirror_gaussians(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians mirrored in their frame's plane z = 0.
+
+    With M = diag(1, 1, -1) the axes R become M R M, a rotation again, since an ellipsoid does not
+    change when one of its axes is turned round; its axis vector is -M v. The colour seen along d
+    was that along M d: the function of band l and order m has the parity (-1)^(l + m) in z.
+    """
+    bands = range(gaussians.sh_degree + 1)
+    parity = [(-1.0) ** (band + order) for band in bands for order in range(-band, band + 1)]
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means * gaussians.means.new_tensor([1.0, 1.0, -1.0]),
+        quats=gaussians.quats * gaussians.quats.new_tensor([1.0, -1.0, -1.0, 1.0]),
+        sh=gaussians.sh * gaussians.sh.new_tensor(parity)[:, None],
+    )
+
+
+def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[PosedGaussians]:
+    """The parts mirrored in the plane z = level_z_m of the world.
+
+    A mirrored pose would be no rigid motion. Mirrored once more in the part's own frame it is one.
+    """
+    plane, identity = MIRROR.clone(), torch.eye(4, dtype=torch.float64)
+    plane[2, 3] = 2 * level_z_m
+    poses = [identity if p.world_from_part is None else p.world_from_part for p in parts]
+    return [
+        PosedGaussians(mirror_gaussians(part.gaussians), plane @ pose @ MIRROR, part.instance_id)
+        for part, pose in zip(parts, poses, strict=True)
+    ]
+
+
+def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tensor, "H W 3"]:
+    """The flooded view, not clamped, of an eye above still, opaque water."""
+    plan = make_plan(recipe, scene)
+    medium = plan.flood
+    assert medium is not None and medium.waves.is_flat
+
+    def layer(parts: Sequence[PosedGaussians], clip: HeightClip) -> tuple[Tensor, Tensor]:
+        """Premultiplied rgb [H, W, 3] and alpha [H, W, 1], float64."""
+        buffers = frozenset({RGB, ALPHA})
+        out = rasterize(parts, camera, buffers=buffers, settings=plan.settings, clip=clip)
+        return out.rgb.double(), out.alpha.double()[..., None]
+
+    parts, level_z_m = scene.parts_for(camera), medium.level_z_m
+    front, alpha_above = layer(parts, HeightClip(level_z_m, ABOVE))
+    rgb, alpha = layer(mirror_parts(parts, level_z_m), HeightClip(level_z_m, BELOW, overlaps=True))
+    rays = camera.ray_directions(torch.float64)
+    mirrored_sky = scene.sky.sample((rays * MIRROR.diagonal()[:3]).float()).double()
+    reflected = rgb + (1 - alpha) * mirrored_sky
+    cosine = (-rays[..., 2] / rays.norm(dim=-1)).clamp(0, 1).numpy()
+    share = torch.from_numpy(fresnel_by_angles(cosine, medium.refraction_index))[..., None]
+    water = share * reflected + (1 - share) * torch.tensor(medium.rgb, dtype=torch.float64)
+    behind = torch.where(rays[..., 2:] < 0, water, scene.sky.sample(rays.float()).double())
+    return (front + (1 - alpha_above) * behind).float()
+
+
+def fresnel_by_angles(cosine: np.ndarray, index: float) -> np.ndarray:
+    """Fresnel's laws of sines and tangents, from air into an index > 1; unpolarised.
+
+    Rs = (sin(i - t) / sin(i + t))^2 and Rp = (tan(i - t) / tan(i + t))^2, sin i = index sin t.
+    """
+    incident = np.arccos(np.clip(cosine, 0, 1))
+    refracted = np.arcsin(np.sin(incident) / index)
+    steep = incident < 1e-4  # both quotients are 0 / 0 at 0; the limit is right to 1e-8 here
+    incident = np.where(steep, math.pi / 4, incident)
+    less, more = incident - refracted, incident + refracted
+    share = 0.5 * ((np.sin(less) / np.sin(more)) ** 2 + (np.tan(less) / np.tan(more)) ** 2)
+    return np.where(steep, ((index - 1) / (index + 1)) ** 2, share)
+
+
+def water_masks(
+    scene: Scene, truth: StreetTruth, frames: Sequence[int], *, scale: float
+) -> list[list[str | float]]:
+    """By view: the share of its pixels whose mask of water is the true one; the same away from
+    silhouettes, beyond which splats reach a little; and how many of the pixels those are.
+    """
+    rows: list[list[str | float]] = []
+    recipe = flood_recipe("sky")
+    medium = make_plan(recipe, scene).flood
+    assert medium is not None
+    for camera in (c.scaled(scale) for n in frames for c in scene.frame(n).cameras.values()):
+        depth = plane_depth(camera, medium.level_z_m).numpy()
+        true = np.isfinite(depth) & (truth.render(camera).depth > depth)
+        same = draw_picture(scene, camera, recipe).water == true
+        clear = inside(true) | inside(~true)
+        shares = (same.mean(), same[clear].mean(), clear.mean())
+        rows.append([f"{camera.name} at {camera.timestamp_ns} ns", *map(float, shares)])
+    return rows

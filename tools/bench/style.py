@@ -1,0 +1,170 @@
+"""Styles: their cost, maps folded into SH beside mapped colours, and methods on photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from adapters.base import open_scene
+from augment.effects.style.color_maps import CLASSES, StyleMaps, style_gaussians
+from augment.effects.style.content import content_pictures, content_statistics
+from augment.effects.style.images import image_statistics, read_style_image
+from augment.effects.style.network import gscm_map, load_network, network_facts
+from augment.effects.style.scores import (
+    closed_method,
+    network_method,
+    oversaturated_share,
+    score_pairs,
+)
+from augment.effects.style.statistics import closed_maps
+from augment.effects.style.train import read_photos
+from augment.metrics.image import psnr
+from augment.render.composite import quantise
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from recipes.schema import Recipe
+from recipes.style import style_preset_names
+from tools.bench.harness import Action, Table, median_ms, rounds
+from tools.bench.scenes import (
+    CLEAN,
+    EffectCase,
+    RasterCase,
+    cost_tables,
+    frame_of,
+    front_camera,
+    random_scene,
+    recipe_of,
+)
+
+PHOTO_PX, HOLDOUT, PAIRS = 256, 8, 60
+
+
+def style_recipe(preset: str = "overcast", **given: Any) -> Recipe:
+    return recipe_of({"style": {"preset": preset, **given}})
+
+
+def tables(case: EffectCase, repeats: int) -> list[Table]:
+    costs = {
+        "one map": (style_recipe(), CLEAN),
+        "a map a region": (style_recipe(per_region=True), CLEAN),  # a preset's are the same
+        "on the picture": (style_recipe(applied_to="picture"), CLEAN),
+        "one map, folded into SH": (style_recipe(evaluated="sh"), CLEAN),
+    }
+    return [
+        _fold_table(RasterCase(case.splats, 640, 480), repeats),
+        *cost_tables(case, costs, ("one map",), repeats),
+        *(_folded_error_table(uri, case) for uri in case.scenes),
+        _map_table(open_scene(case.street), repeats),
+        *([] if case.photos is None else [_score_table(case.photos)]),
+    ]
+
+
+def fold(
+    gaussians: Gaussians, count: int, out: torch.Tensor | None, backend: str = "auto"
+) -> Action:
+    """Folds one map, or one of each class, into SH; colours stay finite however often."""
+    map_34 = 0.9 * torch.eye(3, 4)
+    maps = StyleMaps(map_34.repeat(count, 1, 1), map_34, map_34)
+    return functools.partial(style_gaussians, gaussians, maps, out=out, backend=backend)
+
+
+def _fold_table(case: RasterCase, repeats: int) -> Table:
+    """One map, and one for each class, folded into the SH of random Gaussians."""
+    gaussians, _ = random_scene(case)
+    classes = torch.arange(len(gaussians), dtype=torch.int16) % (max(SemanticClass) + 1)
+    gaussians = dataclasses.replace(gaussians, semantic=classes)
+    moved = 2 * gaussians.sh.nbytes
+    actions = {
+        f"{name}, {where}": fold(gaussians, count, out)
+        for name, count in (("one map", 1), ("a map a class", CLASSES))
+        for where, out in (("in place", gaussians.sh), ("new memory", None))
+    }
+    rows = [
+        [name, median_ms(each), min(each) * 1e3, moved / min(each) / 1e9]
+        for name, each in rounds(actions, repeats).items()
+    ]
+    title = f"Maps folded into {len(gaussians):,} Gaussians, {moved / 1e6:.0f} MB read and written"
+    return Table(title, ("map", "ms", "least", "GB/s at best"), rows)
+
+
+def _folded_error_table(uri: str, case: EffectCase) -> Table:
+    """Pictures of maps folded into SH against those of mapped colours. They differ where a splat
+    with a colour below 0 is blended, which is clamped before the map if the map is not folded.
+    """
+    scene = open_scene(uri)
+    camera, rows = front_camera(scene, case.width), []
+    for preset in case.presets or style_preset_names():
+        recipes = (style_recipe(preset, evaluated=where) for where in ("sh", "color"))
+        folded, mapped = (frame_of(scene, camera, r)().rgb.numpy() for r in recipes)
+        off = 255 * np.abs(folded - mapped).max(-1)
+        found = psnr(folded.clip(0, 1), mapped.clip(0, 1)) if off.any() else None
+        rows.append([preset, found, float(off.max()), 100 * float((off > 1).mean())])
+    columns = ("preset", "PSNR dB", "largest", "off by > 1/255, %")
+    return Table(f"Maps folded into SH against mapped colours, 1/255: {uri}", columns, rows)
+
+
+def _map_table(scene: Scene, repeats: int) -> Table:
+    """From a style image's file to the map, and what the scene's side takes once."""
+    net, rgb = load_network(None), frame_of(scene, front_camera(scene, 1920), CLEAN)().rgb
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "style.jpg"
+        cv2.imwrite(str(path), quantise(rgb * torch.tensor([1.0, 0.8, 0.6]))[..., ::-1])
+        image = read_style_image(path)
+        reading = rounds({"reading the image": lambda: read_style_image(path)}, repeats)
+    content, pictures = content_statistics(scene, per_region=True), content_pictures(scene)
+
+    def closed(method: Any, per_region: bool = False) -> object:
+        style = image_statistics(image)
+        return closed_maps(content, style, method=method, strength=1.0, per_region=per_region)
+
+    def once(find: Callable[..., object], **options: bool) -> object:
+        return find(dataclasses.replace(scene), **options)  # of a scene that remembers nothing
+
+    actions: dict[str, Action] = {
+        "mkl": lambda: closed("mkl"),
+        "mkl, per region": lambda: closed("mkl", per_region=True),
+        "reinhard": lambda: closed("reinhard"),
+        f"gscm, with {len(pictures)} pictures of the scene": lambda: gscm_map(
+            net, pictures, pictures[:1].flip(3)
+        ),
+        "once a scene: statistics": lambda: once(content_statistics, per_region=False),
+        "once a scene: of regions": lambda: once(content_statistics, per_region=True),
+        "once a scene: pictures": lambda: once(content_pictures),
+    }
+    seconds = reading | rounds(actions, repeats)
+    rows = [[name, median_ms(each), 1e3 * min(each)] for name, each in seconds.items()]
+    return Table("From a style image to its map", ("what", "ms", "least"), rows)
+
+
+def _score_table(photos: Path) -> Table:
+    """How well methods do on photographs that the network was not trained on."""
+    about = network_facts().get("about") or {}
+    names = tuple(f"/{name}" for name in about.get("data", {}).get("held_out", ()))
+    held_out = [file for file in sorted(photos.rglob("*")) if file.as_posix().endswith(names)]
+    squares = (
+        read_photos(held_out, PHOTO_PX, holdout=0).train
+        if held_out
+        else read_photos([photos], PHOTO_PX, holdout=HOLDOUT).held_out
+    )
+    pictures = squares.float() / 255
+    methods = {
+        "none": closed_method("mkl", 0.0),
+        "reinhard": closed_method("reinhard"),
+        "mkl": closed_method("mkl"),
+        "mkl, half": closed_method("mkl", 0.5),
+        "gscm": network_method(load_network(None)),
+    }
+    rows = []
+    for name, method in methods.items():
+        scores = dataclasses.astuple(score_pairs(method, pictures, repeats=1))
+        rows.append([name, *scores, oversaturated_share(method, pictures, pairs=PAIRS)])
+    columns = ("method", "same", "half", "below", "look", "oversaturated")
+    return Table(f"Methods on {len(pictures)} photos that are held out, PSNR in dB", columns, rows)
