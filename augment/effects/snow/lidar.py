@@ -14,7 +14,7 @@ import numpy as np
 
 from augment.effects.lidar.beam import Echoes
 from augment.effects.lidar.codes import MOVED
-from augment.effects.snow import lidar_kernels
+from augment.effects.snow import kernels
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.layer import find_depths, profile_on
 from augment.effects.snow.snow import PlacedSnow, placement_settings
@@ -37,7 +37,7 @@ _SAME_DRIVE_NS = 10**9  # a sweep's times are within this of its frame's
 
 @dataclass(frozen=True, eq=False)
 class SnowGrid:
-    """Snow on one part, in the part's frame: see lidar_kernels.meet_layer. radius_m: of the circle
+    """Snow on one part, in the part's frame: see kernels.meet_layer. radius_m: of the circle
     about the part's origin that holds it, seen from above.
     """
 
@@ -88,10 +88,10 @@ def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) 
     columns, rows = (int(n) for n in np.ceil(extent / cell) + 1)
     base, top = np.full((2, rows, columns), -np.inf, np.float32)
     depths = np.ascontiguousarray(depths_m, np.float32)
-    lidar_kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
+    kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
     radius = float(np.hypot(*(centers[covered, :2] + np.sign(centers[covered, :2]) * half).T).max())
     # The greatest of every block of the grid, for the march to skip.
-    block = lidar_kernels.BLOCK
+    block = kernels.BLOCK
     blocks = [-(-n // block) for n in top.shape]
     padded = np.full([n * block for n in blocks], -np.inf, np.float32)
     padded[:rows, :columns] = top
@@ -162,7 +162,7 @@ def _meet(
     part_from_world = np.eye(4)
     part_from_world[:3, :3] = world_from_part[:3, :3].T
     part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
-    lidar_kernels.meet_layer(
+    kernels.meet_layer(
         *(origins, directions, hits, part_from_world[:3].copy()),
         np.array([world_from_part[0, 3], world_from_part[1, 3], radius_m]),
         *(layer.corner, layer.cell_m, layer.base, layer.top, layer.highest, slack_m),

@@ -829,7 +829,7 @@ class _Ground:
             count += len(square.rows)
         cells = CellList.joined([square.cells for square in squares])
         light = relative_light(cells.luminance, cells.semantic)
-        return make_cells(cells, light, numbers, self._background)
+        return make_cells(cells, light, numbers.at, self._background)
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:
         """The square from above, its classes, where what is seen is of the background and no
@@ -932,4 +932,4 @@ def _heights(scene: Scene) -> tuple[float, float]:
 
 def _no_cells() -> SnowCells:
     numbers = CellNumbers(plan_tiles([], 1.0, (0.0, 0.0)))
-    return make_cells(CellList.empty(), np.zeros(0, np.float32), numbers, Gaussians.empty())
+    return make_cells(CellList.empty(), np.zeros(0, np.float32), numbers.at, Gaussians.empty())

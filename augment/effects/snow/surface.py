@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -276,23 +276,18 @@ _INLAND_M = 0.15  # but not near an open edge, where it may be a wall's top
 _SIGMAS = 1.5
 
 
-@runtime_checkable
-class NumbersCells(Protocol):
-    """Tells which cell is under a point."""
-
-    def at(self, xy: np.ndarray) -> np.ndarray:
-        """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
-        ...
+# Numbers int32 [P] of the cells under points float64 [P, 2], -1 where there is none.
+CellsUnder = Callable[[np.ndarray], np.ndarray]
 
 
 def find_buried(
-    gaussians: Gaussians, numbers: NumbersCells, cells: CellList
+    gaussians: Gaussians, cells_under: CellsUnder, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
     """buried int32 [B] and buried_by int32 [B, 5], see SnowCells; only such as can be hidden."""
     found = []
     if len(cells.sizes_m):
         parts = slices_of(len(gaussians))
-        found = in_order(lambda part: _find_part(gaussians, numbers, part, cells), parts)
+        found = in_order(lambda part: _find_part(gaussians, cells_under, part, cells), parts)
     return (
         np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in found)]),
         np.concatenate([np.zeros((0, 5), np.int32), *(by for _, by in found)]),
@@ -300,12 +295,12 @@ def find_buried(
 
 
 def _find_part(
-    gaussians: Gaussians, numbers: NumbersCells, part: slice, cells: CellList
+    gaussians: Gaussians, cells_under: CellsUnder, part: slice, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
     """As find_buried, of part of the Gaussians: of so few that what is found lies in the caches."""
     normals = cells.normals
     means = gaussians.means[part].numpy().astype(np.float64)
-    under = numbers.at(means[:, :2])
+    under = cells_under(means[:, :2])
     index = np.flatnonzero(under >= 0)
     cell = under[index]
     offset = means[index] - cells.centers_m[cell]
@@ -327,7 +322,7 @@ def _find_part(
     for axis in (2, 1):
         for sign in (1, -1):
             reach = sign * _SIGMAS * scales[:, axis, None] * axes[:, :2, axis]
-            over.append(numbers.at(means[index, :2] + reach))
+            over.append(cells_under(means[index, :2] + reach))
     buried_by = np.stack(over, 1)
     whole = (buried_by >= 0).all(1)
     return (part.start + index[whole]).astype(np.int32), buried_by[whole].astype(np.int32)
@@ -395,25 +390,26 @@ def cells_at(
     )
 
 
-def _link(cells: CellList, numbers: NumbersCells, part: slice, neighbours: np.ndarray) -> None:
+def _link(cells: CellList, cells_under: CellsUnder, part: slice, neighbours: np.ndarray) -> None:
     """Put the numbers of the cells that part of the cells are linked to into int32 [P, 4]."""
     centers_m, sizes_m, sides = cells.centers_m[part, :2], cells.sizes_m[part], cells.sides[part]
     for side, step in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
         linked = np.flatnonzero(sides[:, side] == LINK)
-        to = numbers.at(centers_m[linked] + np.array(step) * sizes_m[linked, None])
+        to = cells_under(centers_m[linked] + np.array(step) * sizes_m[linked, None])
         same = (to >= 0) & (cells.sizes_m[to] == sizes_m[linked])
         neighbours[linked, side] = np.where(same, to, FLUSH)
 
 
 def make_cells(
-    cells: CellList, light: np.ndarray, numbers: NumbersCells, gaussians: Gaussians
+    cells: CellList, light: np.ndarray, cells_under: CellsUnder, gaussians: Gaussians
 ) -> SnowCells:
     """The record: neighbours found by their places, and the Gaussians that the cells bury."""
     neighbours = cells.sides.astype(np.int32)
     in_order(
-        lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells.sizes_m))
+        lambda part: _link(cells, cells_under, part, neighbours[part]),
+        slices_of(len(cells.sizes_m)),
     )
-    buried, buried_by = find_buried(gaussians, numbers, cells)
+    buried, buried_by = find_buried(gaussians, cells_under, cells)
     kept = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
     return SnowCells(
         **{name: torch.from_numpy(getattr(cells, name)) for name in kept},
@@ -500,10 +496,10 @@ def find_actor_cells(
         return None
     grid, own_classes = surface.map, classes[chosen]
     seen = np.where(grid.ids >= 0, own_classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE)
-    numbers = GridNumbers(grid, rows, columns)
+    under = _cells_of_grid(grid, rows, columns)
     sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
     cells = cells_at(surface, rows, columns, sides=sides, classes=seen.astype(np.int16))
-    found = make_cells(cells, np.ones(len(rows), np.float32), numbers, body)
+    found = make_cells(cells, np.ones(len(rows), np.float32), under, body)
     found.buried.copy_(_index(chosen)[found.buried.long()])
     return found
 
@@ -512,20 +508,18 @@ def _index(numbers: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(numbers))
 
 
-class GridNumbers:
-    """Numbers of the cells of a single grid, see buried.NumbersCells."""
+def _cells_of_grid(grid: HeightMap, rows: np.ndarray, columns: np.ndarray) -> CellsUnder:
+    """Of a single grid that has cells at rows and columns [C]."""
+    corner = np.array([grid.left_m, grid.bottom_m])
+    numbers: np.ndarray = np.full(grid.alpha.shape, -1, np.int32)
+    numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
 
-    def __init__(self, grid: HeightMap, rows: np.ndarray, columns: np.ndarray) -> None:
-        self._corner = np.array([grid.left_m, grid.bottom_m])
-        self._cell_m = grid.cell_m
-        self._numbers: np.ndarray = np.full(grid.alpha.shape, -1, np.int32)
-        self._numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
-
-    def at(self, xy: np.ndarray) -> np.ndarray:
-        high, wide = self._numbers.shape[:2]
-        place = np.floor((xy - self._corner) / self._cell_m)
-        inside = ((place >= 0) & (place < (wide, high))).all(1)
+    def cells_under(xy: np.ndarray) -> np.ndarray:
+        place = np.floor((xy - corner) / grid.cell_m)
+        inside = ((place >= 0) & (place < numbers.shape[::-1])).all(1)
         out = np.full(len(xy), -1, np.int32)
         cell = place[inside].astype(np.int64)
-        out[inside] = self._numbers[cell[:, 1], cell[:, 0]]
+        out[inside] = numbers[cell[:, 1], cell[:, 0]]
         return out
+
+    return cells_under

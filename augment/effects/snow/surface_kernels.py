@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import prange
 
-# ---- Numba kernel: which points of the ground are seen by some camera ----------------------------
+# ---- Which points of the ground are seen by some camera ------------------------------------------
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -29,8 +29,9 @@ def _project(view, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _farthest(depths, start, width, height, column, row):
+def _farthest(depths, size, column, row):
     """The largest depth of three by three pixels."""
+    width, height, start = size
     deepest = np.float32(0)
     for k in range(max(0, row - 1), min(height, row + 2)):
         for m in range(max(0, column - 1), min(width, column + 2)):
@@ -39,9 +40,10 @@ def _farthest(depths, start, width, height, column, row):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_there(view, depths, start, width, height, x, y, z, tolerances):
+def _is_there(view, depths, size, point, tolerances):
     """1 where the view shows something solid at the point, -1 where it looks through it, else 0."""
-    u, v, depth = _project(view, x, y, z)
+    width, height, start = size
+    u, v, depth = _project(view, point[0], point[1], point[2])
     if depth == 0.0 or u < 0 or v < 0 or u >= width or v >= height:
         return 0
     column, row = math.floor(u), math.floor(v)
@@ -54,8 +56,10 @@ def _is_there(view, depths, start, width, height, x, y, z, tolerances):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_seen(view, depths, start, width, height, x, y, z, nx, ny, nz, lifts, tolerances):
+def _is_seen(view, depths, size, point, normal, lifts, tolerances):
     far_share, far_m, below_share, grazing, margin = tolerances
+    width, height, start = size
+    x, y, z = point
     for lift in lifts:
         top = z + lift
         u, v, depth = _project(view, x, y, top)
@@ -69,10 +73,9 @@ def _is_seen(view, depths, start, width, height, x, y, z, nx, ny, nz, lifts, tol
             tx, ty, tz = view[12] - x, view[13] - y, view[14] - top
         else:
             tx, ty, tz = -view[6], -view[7], -view[8]
-        facing = nx * tx + ny * ty + nz * tz
+        facing = normal[0] * tx + normal[1] * ty + normal[2] * tz
         if facing >= -grazing * math.sqrt(tx * tx + ty * ty + tz * tz):
-            deepest = _farthest(depths, start, width, height, column, row)
-            if depth <= deepest * far_share + far_m:
+            if depth <= _farthest(depths, size, column, row) * far_share + far_m:
                 return True
         elif lift > 0.0 and depth <= depths[start + row * width + column] * below_share:
             return True
@@ -92,23 +95,20 @@ def find_seen(points, normals, is_sure, views, sizes, depths, lifts, tolerances,
     behind counts as facing; the fifth, pixels beyond the image that count.
     """
     for i in prange(points.shape[0]):
-        x, y, z = points[i]
-        nx, ny, nz = normals[i]
+        point = (points[i, 0], points[i, 1], points[i, 2])
+        normal = (normals[i, 0], normals[i, 1], normals[i, 2])
         found, there = False, 0
-        for view in range(views.shape[0]):
-            width, height, start = sizes[view]
+        for v in range(views.shape[0]):
+            size = (sizes[v, 0], sizes[v, 1], sizes[v, 2])
             if not is_sure[i]:
-                there += _is_there(views[view], depths, start, width, height, x, y, z, tolerances)
-            if not found and _is_seen(
-                views[view], depths, start, width, height, x, y, z, nx, ny, nz, lifts, tolerances
-            ):
-                found = True
+                there += _is_there(views[v], depths, size, point, tolerances)
+            found = found or _is_seen(views[v], depths, size, point, normal, lifts, tolerances)
             if found and is_sure[i]:
                 break
         seen[i] = found and there >= 0
 
 
-# ---- Numba kernel: which cells around a hole lie in one plane ------------------------------------
+# ---- Which cells around a hole lie in one plane --------------------------------------------------
 
 _ROUNDS = 4
 _LINE = 1e-9  # of the extents' product: cells that spread less across are in a line
@@ -152,7 +152,7 @@ def find_plane(rows, columns, heights, first_m, alike_m, min_cells, used, fits):
     return across, along
 
 
-# ---- Numba kernel: the cells of a plan's tiles that lie under points -----------------------------
+# ---- The cells of a plan's tiles that lie under points -------------------------------------------
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
