@@ -35,7 +35,7 @@ from augment.boxes import (
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.box_tables import BoxNumbers, BoxTable
+from augment.jobs.box_tables import BoxNumbers, BoxTable, BoxWeather
 from augment.jobs.layout import BOXES_2D as BOXES_2D_NAME
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
@@ -56,10 +56,6 @@ class View(Protocol):
     # What labels are measured from, as in augment.views.
     effects: Mapping[str, Any]  # EffectView by name, of the recipe's effects
     surface: Any  # SurfaceView, None without boxes
-
-
-# By the manifest's kind of path: what is seen of a view's boxes, and what each effect does to them.
-BoxWeather = Mapping[str, BoxNumbers]
 
 
 def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:

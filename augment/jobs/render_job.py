@@ -36,10 +36,9 @@ from augment.jobs.atomic import (
     remove_temporaries,
     write_atomic,
 )
+from augment.jobs.box_tables import BoxNumbers, Item
 from augment.jobs.claims import hold
 from augment.jobs.files import (
-    BoxNumbers,
-    Item,
     SceneIndex,
     box_tables,
     calibration_bytes,
