@@ -500,12 +500,6 @@ def _kind(annotation: Any) -> tuple[Kind, tuple[str, ...]]:
 CHANNEL = _spec("channel", Unit, Field(description="One channel of a colour."))
 RATE = _spec("rate_per_m", PerMetre, Field(description="One channel of three rates."))
 ANY_NUMBER = _spec("number", Number, Field(allow_inf_nan=False))
-VARIANTS = _spec(
-    "variants",
-    Whole,
-    Field(default=1, ge=1, le=1_000_000, description="How many recipes are drawn from this file."),
-    rangeable=False,
-)
 
 
 def root() -> SectionSpec:
@@ -517,7 +511,9 @@ def root() -> SectionSpec:
 def _root(sections: tuple[tuple[str, type[BaseModel]], ...]) -> SectionSpec:
     """sections: those of Recipe at the time."""
     spec = _section("", Recipe)
-    spec.extra["variants"] = VARIANTS
+    text = "How many recipes are drawn from this file."
+    variants = Field(default=1, ge=1, le=1_000_000, description=text)
+    spec.extra["variants"] = _spec("variants", Whole, variants, rangeable=False)
     return spec
 
 
@@ -572,11 +568,13 @@ class RecipeTemplate:
         for path, count in self.lists:
             if not path.startswith(absent):
                 _put(data, path, [{} for _ in range(count)])
+        where = f"{self.source}: variant {number}"
+        files = {f"{p}.{name}" for p, model in SECTIONS.items() for name in model.file_fields}
         for path, value in self.values:
             if not path.startswith(absent):
-                _put(data, path, value.draw(draws, path))
-        where = f"{self.source}: variant {number}"
-        self._find_files(data, where)
+                drawn = value.draw(draws, path)
+                is_file = path in files and drawn is not None
+                _put(data, path, self._file(path, str(drawn), where) if is_file else drawn)
         try:
             return with_digest(Recipe.model_validate(data))
         except ValidationError as error:
@@ -584,23 +582,14 @@ class RecipeTemplate:
         except RecipeError as error:
             raise RecipeError(f"{self.source}: {error}") from None
 
-    def _find_files(self, data: dict[str, Any], where: str) -> None:
-        """Replace the names of files by absolute paths."""
-        for path, model in SECTIONS.items():
-            section: dict[str, Any] | None = data
-            for key in path.split("."):
-                section = (section or {}).get(key)
-            for name in model.file_fields:
-                written = (section or {}).get(name)
-                if section is None or written is None:
-                    continue
-                try:
-                    if self.folder is None:
-                        raise ValueError("the recipe is in no folder to look in")
-                    section[name] = str(file_below(self.folder, written))
-                except ValueError as error:
-                    text = f"{where}: {path}.{name} = {written!r}: {error}"
-                    raise RecipeError(text) from None
+    def _file(self, path: str, written: str, where: str) -> str:
+        """The absolute path of a file that a field names."""
+        try:
+            if self.folder is None:
+                raise ValueError("the recipe is in no folder to look in")
+            return str(file_below(self.folder, written))
+        except ValueError as error:
+            raise RecipeError(f"{where}: {path} = {written!r}: {error}") from None
 
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""
