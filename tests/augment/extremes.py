@@ -20,8 +20,9 @@ from pydantic import ValidationError
 
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import remember_support, support_of
+from augment.effects.snow.support import support_of
 from augment.geometry import rigid
+from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Actor, Gaussians, Ground, Scene, Track
@@ -172,7 +173,7 @@ class Place:
         )
         for slope in SLOPES_DEG:
             settings = placement_settings(snow_model(max_slope_deg=slope))
-            remember_support(scene, settings, support_of(base, settings))
+            memo_of(scene).put(("snow support", settings), support_of(base, settings))
         return scene
 
 
@@ -493,7 +494,7 @@ def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
     for raster in rasters:
         alpha = raster.alpha
         if alpha is None:  # of a view with water, of which nothing but the picture was asked
-            assert buffers.water is not None
+            assert "water" in buffers.masks
             continue
         assert bool(((alpha >= 0) & (alpha <= 1)).all()), f"alpha {alpha.min()} to {alpha.max()}"
         for name in ("expected_depth", "median_depth", "mode_depth"):
@@ -519,16 +520,18 @@ def check_view(view: WeatheredView, scene: Scene, recipe: Recipe) -> None:
     if view.depth_m is not None:
         assert view.depth_m.dtype == np.float32 and view.depth_m.shape == size
         assert np.isfinite(view.depth_m).all() and (view.depth_m >= 0).all()
-    for mask, effect in ((view.water, recipe.weather.flood), (view.snow, recipe.weather.snow)):
-        assert (mask is None) == (effect is None)
-        if mask is not None:
-            assert mask.dtype == np.uint8 and mask.shape == size
-            assert np.isin(mask, (0, 255)).all()
-    if view.water is not None and view.snow is not None:
-        assert not (view.water & view.snow).any(), "a pixel shows snow and water first"
+    weather = {"water": recipe.weather.flood, "snow": recipe.weather.snow}
+    assert view.masks.keys() == {name for name, section in weather.items() if section is not None}
+    for mask in view.masks.values():
+        assert mask.dtype == np.uint8 and mask.shape == size
+        assert np.isin(mask, (0, 255)).all()
+    if len(view.masks) == 2:
+        assert not (view.masks["water"] & view.masks["snow"]).any(), (
+            "a pixel shows snow and water first"
+        )
     if view.semantic is not None:
         assert np.isin(view.semantic, [int(c) for c in SemanticClass]).all()
-        if view.water is not None and recipe.output.surface == "first":
-            assert ((view.semantic == SemanticClass.WATER) >= (view.water == 255)).all()
+        if view.masks.get("water") is not None and recipe.output.surface == "first":
+            assert ((view.semantic == SemanticClass.WATER) >= (view.masks["water"] == 255)).all()
     if view.instance is not None:
         assert (view.instance <= len(scene.actors)).all()

@@ -127,7 +127,7 @@ def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     smog = Smog(extinction_per_m=0.1, color=AIRLIGHT)
     labelled = dataclasses.replace(scene, labels=CarLabels())
     view, clean = view_of(labelled, smog, depth="none"), view_of(scene)
-    assert view.depth_m is None and view.smoggy.water_level_z_m is None
+    assert view.depth_m is None and view.effects["smog"].water_level_z_m is None
     instances = instances_of(labelled)
     measured = measure_boxes(CarLabels().boxes(0), instances, np.zeros(3), camera(), view)
     measured = measured["box_smog"]
@@ -139,12 +139,13 @@ def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
 
 
 def test_smog_is_named_wherever_there_is_some_and_measured_for_labels_alone(scene):
-    unlabelled = view_of(scene, Smog(visibility_m=30)).smoggy
-    assert unlabelled.medium is not None and unlabelled.surface_depth_m is None
+    unlabelled = view_of(scene, Smog(visibility_m=30)).effects["smog"]
+    assert unlabelled.placed.data is not None and unlabelled.depth_m is None
     labelled = dataclasses.replace(scene, labels=CarLabels())
-    nothing = view_of(labelled, Smog(extinction_per_m=0.0), depth="none").smoggy
-    assert nothing.medium is None and nothing.surface_depth_m is None
-    assert view_of(labelled).smoggy is None
+    nothing = view_of(labelled, Smog(extinction_per_m=0.0), depth="none")
+    nothing = nothing.effects["smog"]
+    assert nothing.placed.data is None and nothing.depth_m is None
+    assert not view_of(labelled).effects
 
 
 def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):

@@ -71,9 +71,9 @@ def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
     view = rendered(
         Place(nothing(), 3, on_street=True).scene(), camera, Recipe.model_validate(data)
     )
-    assert view.water is not None
+    assert view.masks.get("water") is not None
     if float(camera.centre[2]) <= 0.2:
-        assert (view.water == 255).all()
+        assert (view.masks["water"] == 255).all()
 
 
 @pytest.mark.long

@@ -100,8 +100,8 @@ def test_higher_water_never_uncovers(place: Place, camera: Camera, levels: list[
         flood = {"level_m": level, "reference": "absolute", "reflection": "sky"}
         data = {"weather": {"flood": flood}, "output": {"depth": "none"}}
         view = render_view(scene, camera, Recipe.model_validate(data))
-        assert view.water is not None
-        masks.append(view.water == 255)
+        assert view.masks.get("water") is not None
+        masks.append(view.masks["water"] == 255)
     for low, high in itertools.pairwise(masks):
         assert (high >= low).all(), f"{int((low & ~high).sum())} pixels dried as the water rose"
 

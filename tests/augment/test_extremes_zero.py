@@ -85,7 +85,7 @@ def test_effects_without_strength_change_no_bit(
     zero = with_effects(recipe, {name: data.draw(ZEROS[name]) for name in sorted(names)})
     view = render_view(scene, camera, zero)
     assert_same_bits(view, render_view(scene, camera, recipe))
-    assert view.snow is None or not view.snow.any()
+    assert view.masks.get("snow") is None or not view.masks["snow"].any()
 
 
 @pytest.mark.long

@@ -125,8 +125,8 @@ def test_water_stands_at_its_level_and_hides_nothing_in_front_of_it(scene, refle
     dry, wet = view_of(scene, None), view_of(scene, flood(reflection=reflection))
     edge = row_at(ROAD_Z + 0.4, 12.0, view)  # where the water meets the wall
     left = slice(0, 20)  # no car there
-    assert not wet.water[: int(edge) - 1, left].any()
-    assert (wet.water[int(edge) + 2 :, left] == 255).all()
+    assert not wet.masks["water"][: int(edge) - 1, left].any()
+    assert (wet.masks["water"][int(edge) + 2 :, left] == 255).all()
     # Through the wall, opaque to some per cent (see HIDDEN_COVER), shines sky or water.
     above = (slice(None, int(edge) - 2), left)
     assert np.abs(wet.rgb[above].astype(int) - dry.rgb[above]).max() <= 4
@@ -134,7 +134,10 @@ def test_water_stands_at_its_level_and_hides_nothing_in_front_of_it(scene, refle
     line = row_at(ROAD_Z + 0.4, 6.0, view)
     column = int(view.cx + view.fx * 1.5 / 6.0)
     assert np.abs(wet.rgb[int(line) - 3, column].astype(int) - np.array([26, 204, 26])).max() <= 12
-    assert wet.water[int(line) - 2, column] == 0 and wet.water[int(line) + 2, column] == 255
+    assert (
+        wet.masks["water"][int(line) - 2, column] == 0
+        and wet.masks["water"][int(line) + 2, column] == 255
+    )
 
 
 @pytest.mark.parametrize("reflection", ["screen_space", "mirrored"])
@@ -191,7 +194,7 @@ def test_one_colour_everywhere_stays_that_colour():
         for waves in (STILL, Waves(preset="wind")):
             water = flood(color=(0.5, 0.5, 0.5), reflection=reflection, waves=waves)
             view = view_of(plain, water, smog=smog)
-            assert view.water.any()
+            assert view.masks["water"].any()
             assert np.abs(view.rgb.astype(int) - 128).max() <= 1, (reflection, waves.preset)
 
 
@@ -210,7 +213,7 @@ def test_kernels_match_the_definition(scene, reflection):
     assert float((error > 2 / 255).float().mean()) < (
         0.05 if reflection == "screen_space" else 0.01
     )
-    assert bool((fast.water == slow.water).float().mean() > 0.999)
+    assert bool((fast.masks["water"] == slow.masks["water"]).float().mean() > 0.999)
 
 
 @pytest.mark.gpu
@@ -226,7 +229,7 @@ def test_a_gpu_shows_the_cpu_s_picture(scene, reflection):
     # The screen's march interpolates on the CPU, and traces all pixels on the GPU.
     budget = 0.05 if reflection == "screen_space" else 0.001
     assert float((error > 1e-3).float().mean()) < budget
-    assert bool((there.water.cpu() == here.water).float().mean() > 0.999)
+    assert bool((there.masks["water"].cpu() == here.masks["water"]).float().mean() > 0.999)
 
 
 def test_deferred_smog_reaches_every_layer(scene):
@@ -247,7 +250,7 @@ def test_no_water_in_view_is_the_clean_frame_to_the_bit(scene):
     for water, view in ((flood(), up), (flood(-3.5), camera())):
         dry, wet = view_of(scene, None, view), view_of(scene, water, view)
         assert np.array_equal(dry.rgb, wet.rgb) and np.array_equal(dry.depth_m, wet.depth_m)
-        assert not wet.water.any()
+        assert not wet.masks["water"].any()
 
 
 # ---- what is written beside the picture --------------------------------------------------------
@@ -260,7 +263,7 @@ def test_depth_and_classes_of_the_scene_or_of_the_first_surface(scene):
     under = view_of(scene, flood(), view, **images)
     first = view_of(scene, flood(), view, surface="first", **images)
     mask = under.water == 255
-    assert mask.sum() > 1000 and np.array_equal(under.water, first.water)
+    assert mask.sum() > 1000 and np.array_equal(under.water, first.masks["water"])
     road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
     assert np.abs(under.depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
     assert (under.semantic == dry.semantic).mean() > 0.99
@@ -286,13 +289,16 @@ def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene):
     labelled = dataclasses.replace(scene, labels=NoBoxes())
     view = camera()
     wet = view_of(labelled, flood(), view, depth="none")
-    assert wet.depth_m is None and wet.flood.level_z_m == pytest.approx(ROAD_Z + 0.4)
+    assert wet.depth_m is None
+    seen = wet.effects["flood"]
+    assert seen.placed.water_level_z_m == pytest.approx(ROAD_Z + 0.4)
     road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
-    assert np.abs(wet.flood.scene_depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
+    assert np.abs(seen.depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
     up = view_of(labelled, flood(), camera(pitch=-1.0), depth="none")
-    assert up.flood.level_z_m == wet.flood.level_z_m and up.flood.scene_depth_m is None
+    assert up.effects["flood"].placed.water_level_z_m == seen.placed.water_level_z_m
+    assert up.effects["flood"].depth_m is None
     unlabelled = view_of(scene, flood(), view, depth="none")
-    assert unlabelled.flood.scene_depth_m is None
+    assert unlabelled.effects["flood"].depth_m is None
 
 
 # ---- extremes ----------------------------------------------------------------------------------
@@ -341,7 +347,9 @@ def test_extremes_give_finite_pictures(scene, name):
 def test_infinite_extinction_shows_water_alone(scene, level_m):
     """No recipe can say it, a medium can: the bed is gone, and 0 times infinity is no NaN."""
     plan = make_plan(recipe_of(flood(level_m, refraction_index=1.0)), scene)
-    medium = dataclasses.replace(plan.flood, extinction_per_m=(np.inf, np.inf, np.inf))
+    medium = dataclasses.replace(
+        plan.placed["flood"].data, extinction_per_m=(np.inf, np.inf, np.inf)
+    )
     view = camera()
     renderer = LayerRenderer(scene.parts_for(view), scene.sky, None, False, plan.settings, "auto")
     got = render_flooded(renderer, view, medium, plan.buffers)

@@ -66,8 +66,8 @@ def heights_of(view) -> np.ndarray:
 
 def test_snow_lies_on_the_road_the_roof_and_the_car(scene):
     clean, white = view_of(scene, instance=True), view_of(scene, snow(), instance=True)
-    lies = white.snow == 255
-    assert set(np.unique(white.snow)) == {0, 255}
+    lies = white.masks["snow"] == 255
+    assert set(np.unique(white.masks["snow"])) == {0, 255}
     for kind in (ROAD, CAR):
         seen = clean.semantic == kind
         assert seen.sum() > 50
@@ -83,7 +83,7 @@ def test_snow_lies_on_the_road_the_roof_and_the_car(scene):
 
 def test_depth_is_that_of_the_snow(scene):
     bare, white = view_of(scene), view_of(scene, snow())
-    near = (bare.semantic == ROAD) & (white.snow == 255) & (bare.depth_m < 12)
+    near = (bare.semantic == ROAD) & (white.masks["snow"] == 255) & (bare.depth_m < 12)
     assert near.sum() > 1000
     rise = (heights_of(white) - heights_of(bare))[near]
     assert np.median(rise) == pytest.approx(DEPTH_M, abs=0.02)
@@ -92,7 +92,7 @@ def test_depth_is_that_of_the_snow(scene):
 def test_the_cars_snow_drives_with_it(scene):
     for frame in (0, 1):
         view = view_of(scene, snow(), frame=frame, instance=True, surface="solid")
-        on_car = (view.snow == 255) & (view.instance == 1)
+        on_car = (view.masks["snow"] == 255) & (view.instance == 1)
         x = float(view.camera.centre[0]) + view.depth_m[on_car]
         rear = 8.0 - 1.5 + 3.0 * frame
         assert on_car.sum() > 10
@@ -106,9 +106,8 @@ def test_snow_of_no_depth_is_the_clean_view_to_the_bit(scene, nothing):
     clean, white = view_of(scene, instance=True), view_of(scene, snow(**nothing), instance=True)
     for name in ("rgb", "depth_m", "semantic", "instance"):
         assert np.array_equal(getattr(clean, name), getattr(white, name))
-    assert white.snow is not None and not white.snow.any()
-    assert white.snowy is not None and white.snowy.surface_depth_m is None
-    assert clean.snow is None and clean.snowy is None
+    assert not white.masks["snow"].any() and white.effects["snow"].depth_m is None
+    assert not clean.masks and not clean.effects
 
 
 def test_images_of_the_bare_surface_are_those_of_the_clean_scene(scene):
@@ -116,21 +115,25 @@ def test_images_of_the_bare_surface_are_those_of_the_clean_scene(scene):
     white = view_of(scene, snow(), instance=True, surface="scene")
     for name in ("depth_m", "semantic", "instance"):
         assert np.array_equal(getattr(clean, name), getattr(white, name))
-    assert white.snow.any() and not np.array_equal(clean.rgb, white.rgb)
+    assert white.masks["snow"].any() and not np.array_equal(clean.rgb, white.rgb)
     solid = view_of(scene, snow(), instance=True)
-    assert np.array_equal(solid.rgb, white.rgb) and np.array_equal(solid.snow, white.snow)
-    lies = white.snow == 255
-    off = np.abs(white.snowy.surface_depth_m - solid.depth_m)[lies] / solid.depth_m[lies]
+    assert np.array_equal(solid.rgb, white.rgb) and np.array_equal(
+        solid.masks["snow"], white.masks["snow"]
+    )
+    lies = white.masks["snow"] == 255
+    off = np.abs(white.effects["snow"].depth_m - solid.depth_m)[lies] / solid.depth_m[lies]
     assert np.quantile(off, 0.9) < 0.05  # expected depth for the labels, median in the image
 
 
 def test_what_else_is_asked_for_does_not_change_the_picture(scene):
     poor = view_of(scene, snow(), semantic=False, depth="none", labels=False)
-    assert poor.depth_m is None and poor.semantic is None and poor.snowy.surface_depth_m is None
+    assert poor.depth_m is None and poor.semantic is None and poor.effects["snow"].depth_m is None
     for asked in ({"instance": True}, {"semantic": False, "depth": "mode"}):
         rich = view_of(scene, snow(), **asked)
-        assert np.array_equal(rich.rgb, poor.rgb) and np.array_equal(rich.snow, poor.snow)
-        assert rich.depth_m is not None and rich.snowy.surface_depth_m is not None
+        assert np.array_equal(rich.rgb, poor.rgb) and np.array_equal(
+            rich.masks["snow"], poor.masks["snow"]
+        )
+        assert rich.depth_m is not None and rich.effects["snow"].depth_m is not None
 
 
 @pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
@@ -143,7 +146,7 @@ def test_both_backends_show_the_same_snow(scene, shading):
     difference = (fast.rgb - slow.rgb).abs().amax(-1)
     # The sums of some hundred splats in another order; a flip at a cut-off is 1/255 at most.
     assert float(difference.quantile(0.99)) < 1e-3 and float(difference.max()) < 2e-2
-    assert float((fast.snow != slow.snow).float().mean()) < 1e-3
+    assert float((fast.masks["snow"] != slow.masks["snow"]).float().mean()) < 1e-3
 
 
 def test_the_two_shadings_agree_on_how_bright_snow_is(scene):
@@ -160,8 +163,8 @@ def test_fog_lies_over_the_snow(scene, model):
     fog = Smog(extinction_per_m=0.2, color=(0.5, 0.5, 0.5), model=model)
     clear = view_of(scene, snow())
     foggy = view_of(scene, snow(), smog=fog, semantic=False, depth="none")
-    assert np.array_equal(clear.snow, foggy.snow)
-    lies = (clear.snow == 255) & (clear.depth_m > 3)
+    assert np.array_equal(clear.masks["snow"], foggy.masks["snow"])
+    lies = (clear.masks["snow"] == 255) & (clear.depth_m > 3)
     t = np.exp(-0.2 * clear.depth_m * view_lengths(clear))[..., None]
     expected = t * clear.rgb + (1 - t) * 0.5 * 255
     assert np.median(np.abs(foggy.rgb - expected)[lies]) < 3
@@ -174,7 +177,7 @@ def view_lengths(view) -> np.ndarray:
 def test_water_melts_the_snow_it_reaches_and_mirrors_the_rest(scene):
     flood = Flood(level_m=0.3, reference="absolute", waves=Waves(preset="still"))
     wet = view_of(scene, snow(), flood=flood, surface="first")
-    water, lies = wet.water == 255, wet.snow == 255
+    water, lies = wet.masks["water"] == 255, wet.masks["snow"] == 255
     assert water.any() and lies.any()
     assert not (water & lies).any()
     assert (wet.semantic[water] == SemanticClass.WATER).all()
@@ -184,7 +187,7 @@ def test_water_melts_the_snow_it_reaches_and_mirrors_the_rest(scene):
     plain = view_of(scene, snow(), surface="first")
     covered = plain.semantic != SemanticClass.SKY  # beyond the sheets the water shows
     assert np.median(np.abs(dry.rgb.astype(int) - plain.rgb)[covered]) == 0
-    assert (dry.snow != plain.snow).mean() < 0.005
+    assert (dry.masks["snow"] != plain.masks["snow"]).mean() < 0.005
 
 
 def test_the_plan_names_what_runs_and_what_does_not(scene):

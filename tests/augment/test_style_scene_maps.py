@@ -9,7 +9,6 @@ import torch
 from fitted_scenes import fitted_scene
 from snow_scenes import drive, sheet, wall
 
-from augment.effects.style import content
 from augment.effects.style import network as checkpoint
 from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import CLASSES, StyleMaps, styled_scene
@@ -17,8 +16,9 @@ from augment.effects.style.content import content_pictures, content_statistics
 from augment.effects.style.images import StyleImage, image_statistics, read_style_image
 from augment.effects.style.network import Gscm
 from augment.effects.style.statistics import LAND, SKY
-from augment.effects.style.style import remember_maps, style_maps
+from augment.effects.style.style import style_maps
 from augment.errors import StyleError
+from augment.memo import memo_of
 from recipes.style import Style
 
 
@@ -102,7 +102,7 @@ def test_remembered_for_the_scene_the_style_and_the_cameras(photo, monkeypatch):
             with pytest.raises(TypeError):
                 style_maps(wanted, style, **options)
         given = StyleMaps(torch.eye(3, 4)[None] / 2, maps.sky, maps.picture)
-        remember_maps(scene, style, given)
+        memo_of(scene).put(("style maps", style), given, shared=True)
         assert style_maps(scene, style) is given
         assert style_maps(scene, style, cameras=cameras) is given
         with pytest.raises(TypeError):
@@ -175,17 +175,6 @@ def test_a_network_without_a_finite_map_says_so(photo, network, monkeypatch):
     style = Style(image=str(photo), method="gscm", checkpoint=str(network))
     with pytest.raises(StyleError, match=r"no finite map.*use another checkpoint"):
         style_maps(colourful(), style)
-
-
-def test_few_styles_are_remembered(photo):
-    scene = colourful()
-    for number in range(2 * scene_maps.MAX_REMEMBERED):
-        style = Style(image=str(photo), strength=1 - number / 100)
-        style_maps(scene, style)
-        remember_maps(scene, style, IDENTITY_MAPS)
-    assert len(scene_maps._remembered[scene]) == scene_maps.MAX_REMEMBERED
-    assert len(scene_maps._given[scene]) == scene_maps.MAX_REMEMBERED
-    assert len(content._remembered[scene]) == 1
 
 
 def test_the_network_sees_what_counts_of_the_image():

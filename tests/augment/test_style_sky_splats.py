@@ -16,7 +16,8 @@ from augment.effects.style.color_maps import (
     style_gaussians,
     styled_scene,
 )
-from augment.effects.style.style import remember_maps, scene_style_of
+from augment.effects.style.style import scene_style_of
+from augment.memo import memo_of
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
@@ -103,7 +104,7 @@ def test_rows_lead_from_the_class_to_the_sky(count):
 
 def test_the_halo_changes_with_the_sky_in_pictures_and_in_styled_scenes():
     scene = scene_of(ball((30.0, 0.0, 12.0)), ball((30.0, 4.0, 12.0), (0.5, 0.3, 0.2)))
-    remember_maps(scene, STYLE, maps())
+    memo_of(scene).put(("style maps", STYLE), maps(), shared=True)
     camera = scene.frames[0].cameras["ahead"]
     look = scene_style_of(scene, STYLE)
     rows = look.on(scene.parts_for(camera))[0].color_rows

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from augment.dataset import SceneDataset
-from augment.effects.snow.snow import snow_layers_of
+from augment.effects.snow.effect import snow_layers_of
 from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import CLASSES, StyleMaps
-from augment.effects.style.style import SceneStyle, remember_maps, scene_style_of, style_maps
+from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
+from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
@@ -52,7 +53,7 @@ def gentle(seed: int, spread: float = 0.3) -> torch.Tensor:
 def known_maps(scene: Scene, style: Style = STYLE) -> StyleMaps:
     """Maps that the scene takes for its style's from now on."""
     maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
-    remember_maps(scene, style, maps)
+    memo_of(scene).put(("style maps", style), maps, shared=True)
     return maps
 
 
@@ -93,7 +94,8 @@ def test_splats_and_sky_are_mapped_each_by_its_own(scene, backend):
 def test_every_class_takes_its_map(scene):
     splats = torch.eye(3, 4).repeat(CLASSES, 1, 1)
     splats[CAR] = gentle(5)
-    remember_maps(scene, STYLE, StyleMaps(splats, torch.eye(3, 4), gentle(3)))
+    maps = StyleMaps(splats, torch.eye(3, 4), gentle(3))
+    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
     clean = render_view(scene, camera_of(scene), recipe_of(None))
     styled = render_view(scene, camera_of(scene), recipe_of())
     changed = (styled.rgb.astype(int) != clean.rgb).any(-1)
@@ -144,7 +146,8 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
     plan = make_plan(recipe, scene)
     look = scene_style_of(scene, STYLE)
-    styled, plain = snow_layers_of(scene, plan.snow, look), snow_layers_of(scene, plan.snow)
+    snow = plan.placed["snow"].data
+    styled, plain = (snow_layers_of(scene, snow, light) for light in (look.lighting_scene, None))
     parts = look.on(styled.parts_for(scene, camera_of(scene)))
     assert any(part.is_overlay for part in parts)
     assert all((part.color_maps is None) == part.is_overlay for part in parts)
@@ -167,12 +170,12 @@ def test_covers_of_two_styles_are_kept_beside_each_other(scene):
     other = Style(preset="dusk", strength=0.5)
     for style in (STYLE, other):
         known_maps(scene, style)
-    placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).snow
-    first = snow_layers_of(scene, placed, scene_style_of(scene, STYLE))
-    second = snow_layers_of(scene, placed, scene_style_of(scene, other))
+    placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).placed["snow"].data
+    first = snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene)
+    second = snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene)
     assert first is not second
-    assert snow_layers_of(scene, placed, scene_style_of(scene, STYLE)) is first
-    assert snow_layers_of(scene, placed, scene_style_of(scene, other)) is second
+    assert snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene) is first
+    assert snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene) is second
 
 
 def test_water_mirrors_the_styled_sky(scene):
@@ -180,14 +183,14 @@ def test_water_mirrors_the_styled_sky(scene):
     maps = StyleMaps(
         unchanged, torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]]), gentle(3)
     )
-    remember_maps(scene, STYLE, maps)
+    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
     deep = {"flood": Flood(level_m=0.5, reference="absolute", waves=STILL, reflection="sky",
                            turbidity_ntu=1000)}  # fmt: skip
     clean, styled = (
         render_view(scene, camera_of(scene), recipe_of(s, classes=False, **deep))
         for s in (None, STYLE)
     )
-    far = (clean.water == 255) & (np.arange(90)[:, None] < 55)
+    far = (clean.masks["water"] == 255) & (np.arange(90)[:, None] < 55)
     assert far.sum() > 100
     redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
     assert redder[0] > 5 and redder[2] < -5

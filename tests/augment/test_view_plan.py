@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from augment import views as apply
+from augment.bounds import Bounds, bound, bound_chunks, may_show
 from augment.cameras import Camera
+from augment.effects.flood.effect import layer_cameras
 from augment.effects.flood.flood_view import _bed_margins, _mirror_margins
 from augment.geometry import rigid, rotmat_from_quat
-from augment.plan import Bounds, ViewPlan, bound, bound_chunks, make_plan, may_show, plan_view
+from augment.plan import ViewPlan, make_plan, plan_view
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
@@ -57,9 +59,8 @@ def around(camera: Camera) -> list[Camera]:
 def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
-    snowy = () if plan.snow is None else (0, *actors)
-    water = plan.flood is not None
-    return ViewPlan(actors, snowy, water, plan.buffers, plan.bare_buffers, plan.steps)
+    active = tuple(dataclasses.replace(own, seen=(0, *actors)) for own in plan.active(scene))
+    return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 
 
 WEATHERS = {
@@ -82,14 +83,16 @@ def test_what_is_left_out_changes_no_bit(scene, monkeypatch, name):
     left_out = 0
     for camera in cameras:
         view = plan_view(plan, scene, camera)
-        left_out += len(scene.actors) - len(view.actors) + (plan.snow is not None and not view.snow)
+        left_out += (
+            len(scene.actors) - len(view.actors) + (name == "snow" and "snow" not in view.names)
+        )
         lean = render_view(scene, camera, recipe)
         with monkeypatch.context() as patched:
             patched.setattr(apply, "plan_view", everything)
             full = render_view(scene, camera, recipe)
-        for field in ("rgb", "depth_m", "snow", "water"):
-            got, want = getattr(lean, field), getattr(full, field)
-            assert (got is None) == (want is None) and (got is None or np.array_equal(got, want))
+        assert np.array_equal(lean.rgb, full.rgb) and np.array_equal(lean.depth_m, full.depth_m)
+        assert lean.masks.keys() == full.masks.keys()
+        assert all(np.array_equal(lean.masks[n], full.masks[n]) for n in full.masks)
     assert left_out > len(cameras)
 
 
@@ -99,8 +102,8 @@ def test_actors_keep_their_numbers(scene):
     front, back = (camera_ahead(80, 46, 40.0, position=(0, 0, 1.5), yaw=yaw) for yaw in (0, np.pi))
     assert plan_view(plan, scene, front).actors == (1,)
     view = render_buffers(scene, back, plan)
-    assert view.view.actors == (2,) and [part.instance_id for part in view.parts] == [0, 2]
-    [step] = [s for s in view.view.steps if s.name == "rasterise"]
+    assert view.plan.actors == (2,) and [part.instance_id for part in view.parts] == [0, 2]
+    [step] = [s for s in view.plan.steps if s.name == "rasterise"]
     assert "1 of 4 actors (0 absent at this time, 3 out of view)" in step.why
 
 
@@ -116,7 +119,7 @@ def test_reasons_are_the_cameras(scene):
     plan = make_plan(recipe, scene)
     up = around(cameras_of(scene)[0])
     views = [plan_view(plan, scene, camera) for camera in up]
-    away = [view for view in views if not view.water and not view.snow]
+    away = [view for view in views if not view.names]
     assert away and len(away) < len(views)
     for view in away:
         assert {s.name for s in view.steps if s.runs} == {"rasterise", "sky", "depth image"}
@@ -124,7 +127,7 @@ def test_reasons_are_the_cameras(scene):
     reasons = {s.name: s.why for s in away[0].steps}
     assert reasons["flood: bed"] == "no ray of this camera meets the water's plane"
     assert "can be in view" in reasons["snow: placement and layer"]
-    assert views[0].water and views[0].snowy
+    assert views[0].names == ("snow", "flood")
 
 
 def test_what_the_front_hides_is_recorded(scene):
@@ -133,20 +136,17 @@ def test_what_the_front_hides_is_recorded(scene):
     near = dataclasses.replace(near, ground=scene.ground, ground_z_m=0.0)
     plan = make_plan(Recipe(weather=WEATHERS["flood"], output=Output(depth="none")), near)
     camera = cameras_of(near)[0]
-    before, after = plan_view(plan, near, camera), render_buffers(near, camera, plan).view
-    assert before.water and {s.name for s in before.steps if s.runs} > {"flood: bed"}
+    before, after = plan_view(plan, near, camera), render_buffers(near, camera, plan).plan
+    assert before.names and {s.name for s in before.steps if s.runs} > {"flood: bed"}
     assert not any(s.runs for s in after.steps if s.name.startswith("flood"))
     assert any("hides all of it" in s.why for s in after.steps)
 
 
 def test_margins_of_the_water_are_within_those_that_views_are_planned_with(scene):
-    from augment.plan import _layer_cameras
-
-    plan = make_plan(Recipe(weather=WEATHERS["flood"]), scene)
-    assert plan.flood is not None
+    medium = make_plan(Recipe(weather=WEATHERS["flood"]), scene).placed["flood"].data
     for camera in around(cameras_of(scene)[0]):
-        wide, mirror = _layer_cameras(plan, camera)
-        bed, other = _bed_margins(camera, plan.flood), _mirror_margins(camera, plan.flood)
+        wide, mirror = layer_cameras(medium, camera)
+        bed, other = _bed_margins(camera, medium), _mirror_margins(camera, medium)
         assert max(bed.left, bed.top, bed.right, bed.bottom) <= wide.cx - camera.cx
         assert max(other.left, other.top, other.right, other.bottom) + 8 <= mirror.cx - camera.cx
 

@@ -78,7 +78,7 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
 
 def test_without_times_no_snow_is_laid(scene, monkeypatch, tmp_path):
     recipe = "weather: {snow: {depth_m: 0.1}}\n"
-    monkeypatch.setattr("augment.plan.snow_layers_of", None)  # not called
+    monkeypatch.setattr("augment.effects.snow.effect.snow_layers_of", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["views"]["snow"] is None and "snow can be" not in page
 
