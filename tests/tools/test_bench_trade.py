@@ -108,7 +108,7 @@ WALL = Camera("wall", 40, 30, 30.0, 30.0, 20.0, 15.0, torch.eye(4, dtype=torch.f
 
 def standard(depth_m=10.0):
     depth, alpha = np.full((30, 40), depth_m, np.float32), np.ones((30, 40), np.float32)
-    return Standard(WALL, depth, alpha, alpha > 0, alpha < 0, alpha < 0)
+    return Standard(WALL, depth, alpha, alpha > 0)
 
 
 def trials(*errors):
