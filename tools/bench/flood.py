@@ -101,7 +101,7 @@ class Picture:
 def draw_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:
     buffers = frame_of(scene, camera, recipe)()
     none = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    water = none if buffers.water is None else buffers.water
+    water = buffers.masks.get("water", none)
     return Picture(buffers.rgb.clamp(0, 1).numpy(), water.numpy())
 
 
@@ -187,8 +187,8 @@ def mirror_parts(parts: Sequence[PosedGaussians], level_z_m: float) -> list[Pose
 def mirrored_picture(scene: Scene, camera: Camera, recipe: Recipe) -> Float[Tensor, "H W 3"]:
     """The flooded view, not clamped, of an eye above still, opaque water."""
     plan = make_plan(recipe, scene)
-    medium = plan.flood
-    assert medium is not None and medium.waves.is_flat
+    medium = plan.placed["flood"].data
+    assert medium.waves.is_flat
 
     def layer(parts: Sequence[PosedGaussians], clip: HeightClip) -> tuple[Tensor, Tensor]:
         """Premultiplied rgb [H, W, 3] and alpha [H, W, 1], float64."""
@@ -231,10 +231,9 @@ def water_masks(
     """
     rows: list[list[str | float]] = []
     recipe = flood_recipe("sky")
-    medium = make_plan(recipe, scene).flood
-    assert medium is not None
+    level_z_m = make_plan(recipe, scene).water_level_z_m
     for camera in (c.scaled(scale) for n in frames for c in scene.frame(n).cameras.values()):
-        depth = plane_depth(camera, medium.level_z_m).numpy()
+        depth = plane_depth(camera, level_z_m).numpy()
         true = np.isfinite(depth) & (truth.render(camera).depth > depth)
         same = draw_picture(scene, camera, recipe).water == true
         clear = inside(true) | inside(~true)

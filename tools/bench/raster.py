@@ -81,9 +81,8 @@ def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = N
 
 
 def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
-    """stages_ms, ms, smog_ms: spreads, the frame's from call to images. visible: splats that touch
-    a tile which nearer ones have not filled. pairs: of splats and 16x16 tiles that their boxes
-    touch; listed_pairs: those of open tiles, which were blended.
+    """visible: splats that touch a tile which nearer ones have not filled. pairs: of splats and
+    tiles that their boxes touch; listed_pairs: those of open tiles, which were blended.
     """
     frame_mib = peak_mib_in_subprocess(frame_of, (case,)) if memory else None
     gaussians, camera = random_scene(case)
@@ -131,7 +130,5 @@ def _beside_reference(case: RasterCase, repeats: int) -> Figures:
 
     seconds = rounds({"reference": reference, "cpu": lambda: _draw(parts, camera)}, repeats)
     reference_ms, cpu_ms = median_ms(seconds["reference"]), median_ms(seconds["cpu"])
-    actual, expected = _draw(parts, camera).rgb, reference().rgb
-    assert actual is not None and expected is not None
     times = {"reference_ms": reference_ms, "cpu_ms": cpu_ms, "speed_up": reference_ms / cpu_ms}
-    return {**times, **image_difference(actual, expected)}
+    return {**times, **image_difference(_draw(parts, camera).rgb, reference().rgb)}

@@ -123,7 +123,7 @@ def water_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
         )
         size = {"width": width, "height": height, "cx": cx, "cy": cy}
         camera = dataclasses.replace(own, fx=own.fx * scale, fy=own.fy * scale, **size)
-        water = frame_of(scene, camera.scaled(SMALL), recipe, backend)().water
+        water = frame_of(scene, camera.scaled(SMALL), recipe, backend)().masks.get("water")
         off = abs((0.0 if water is None else float(water.float().mean())) - 1 / 3)
         if off <= NEAR_SHARE:
             return camera

@@ -78,8 +78,7 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
-    fog, camera = make_plan(recipe, scene).smog, view.camera
-    assert fog is not None
+    fog, camera = make_plan(recipe, scene).placed["smog"].data.fog, view.camera
     fogged = frame_of(scene, camera, recipe)().rgb
     z = torch.from_numpy(np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0))
     rays, eye_z = camera.ray_directions(torch.float64), float(camera.centre[2])

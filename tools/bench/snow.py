@@ -36,7 +36,6 @@ from augment.render.layout import UNCUT
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
-from augment.views import SURFACE_ALPHA
 from recipes.schema import Output, Recipe
 from tools.bench.harness import Action, Cell, Table, peak_mib_in_subprocess, rounds
 from tools.bench.scenes import (
@@ -421,8 +420,7 @@ def snow_masks(
     def seen(camera: Camera) -> tuple[DepthView, np.ndarray]:
         buffers = frame_of(scene, camera, recipe)()
         images = buffers.rgb.clamp(0, 1), buffers.raster.expected_depth, buffers.raster.alpha
-        mask = buffers.raster.overlay >= SURFACE_ALPHA
-        return DepthView(camera, *(image.numpy() for image in images)), mask.numpy()
+        return DepthView(camera, *(i.numpy() for i in images)), buffers.masks["snow"].numpy()
 
     return mask_agreement(view_pairs(scene, frames, scale), seen)
 

@@ -44,6 +44,7 @@ from tqdm import tqdm
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
+from augment import effects
 from augment.cameras import Camera
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
@@ -54,7 +55,8 @@ from augment.metrics.image import CLOSE_M, flip, ssim
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
-from augment.views import SURFACE_ALPHA, render_view
+from augment.view_images import SURFACE_ALPHA
+from augment.views import render_view
 from recipes.fields import changed
 from recipes.load import load_recipe
 from recipes.schema import (
@@ -93,6 +95,7 @@ from tools.render import warm_up
 WHOLE = "whole"  # stands for a knob where several are set
 DEPTH, JPEG = "output.depth", "output.jpeg_quality"
 REFERENCE, DEFAULTS, CLEAN = "reference", "defaults", "clean"
+WATER = "water"  # the mask of what a ray meets before the scene
 TRUTH = "truth"  # what depths are compared with where the scene's surfaces are known
 PRESETS = {"smog": "brown-smog", "flood": "street-flood", "snow": "fresh-snow", "style": "evening"}
 ALL = {
@@ -214,8 +217,8 @@ class Stage:
         self._scenes: dict[str, Scene] = {}
 
     def scene_for(self, recipe: Recipe) -> Scene:
-        effects = recipe.model_dump_json(include={"weather", "style"})
-        return self._scenes.setdefault(effects, dataclasses.replace(self._scene))
+        key = recipe.model_dump_json(exclude={"name", "render", "output", "quality"})
+        return self._scenes.setdefault(key, dataclasses.replace(self._scene))
 
     def render(self, recipe: Recipe, camera: Camera) -> Trial:
         return render_trial(self.scene_for(recipe), camera, recipe, self._backend)
@@ -237,43 +240,43 @@ class Stage:
 @dataclass(frozen=True, eq=False)
 class Standard:
     """What a reference's view is compared by. first_m, alpha [H, W]: of what a ray meets first,
-    water too. surfaces, water, overlay [H, W]: where there are such. true_m [H, W]: the scene's
-    exact depth, infinite in the sky; None where it is not known, or under an overlay.
+    water too. surfaces [H, W]: where there are such. masks [H, W]: where an effect is what a pixel
+    shows, by name. true_m [H, W]: the scene's exact depth, infinite in the sky; None where it is
+    not known, or something lies on it.
     """
 
     camera: Camera
     first_m: np.ndarray
     alpha: np.ndarray
     surfaces: np.ndarray
-    water: np.ndarray
-    overlay: np.ndarray
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     true_m: np.ndarray | None = None
 
     def region(self, knob: str) -> np.ndarray:
         """Where a knob's depth errors count: on what its effect covers, else on all surfaces."""
-        if knob.startswith("weather.flood."):
-            return self.water & self.surfaces
-        return self.overlay if knob.startswith("weather.snow.") else self.surfaces
+        own = next((e for e in effects.EFFECTS if knob.startswith(f"{e.section}.")), None)
+        if own is None or own.mask is None:
+            return self.surfaces
+        covered = self.masks.get(own.mask, np.zeros_like(self.surfaces))
+        return covered if own.lies_on_scene else covered & self.surfaces
 
 
 def standard_of(
     scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None = None
 ) -> Standard:
-    """recipe: at reference. true_m: of the scene without an overlay."""
+    """recipe: at reference. true_m: of the scene without what lies on it."""
     if recipe.output.depth == "none":
         recipe = changed(recipe, {DEPTH: "median"})
     solid = frame_of(scene, camera, recipe)()
-    depth, alpha, overlay = solid.depth_m, solid.raster.alpha, solid.raster.overlay
-    surfaces, nowhere = (alpha >= SURFACE_ALPHA) & (depth > 0), torch.zeros_like(alpha) > 0
-    water = nowhere if solid.water is None else solid.water
-    if solid.water is not None:
+    depth, alpha = solid.depth_m, solid.raster.alpha
+    surfaces = (alpha >= SURFACE_ALPHA) & (depth > 0)
+    if WATER in solid.masks:
         first = render_view(scene, camera, changed(recipe, {"output.surface": "first"})).depth_m
-        depth = torch.where(water, torch.from_numpy(first).to(depth.dtype), depth)
-        alpha = torch.where(water, 1.0, alpha)
-    shown = nowhere if overlay is None else (overlay >= SURFACE_ALPHA) & ~water
-    images = (depth, alpha, surfaces, water, shown)
-    true_m = true_m if overlay is None else None
-    return Standard(camera, *(image.numpy() for image in images), true_m)
+        depth = torch.where(solid.masks[WATER], torch.from_numpy(first).to(depth.dtype), depth)
+        alpha = torch.where(solid.masks[WATER], 1.0, alpha)
+    masks = {name: mask.numpy() for name, mask in solid.masks.items()}
+    true_m = true_m if solid.raster.overlay is None else None
+    return Standard(camera, depth.numpy(), alpha.numpy(), surfaces.numpy(), masks, true_m)
 
 
 @dataclass(frozen=True)
