@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.effects.lidar import MOVED, UNCHANGED
-from augment.effects.lidar.beam import weathered_sweep
+from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.effect import snow_layers_of
 from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
-from augment.effects.snow.snow import PlacedSnow, placement_settings, snow_layers_of
-from augment.effects.snow.support import remember_support
+from augment.effects.snow.snow import PlacedSnow, placement_settings
+from augment.memo import memo_of
 from recipes.snow import Snow
 from tests.lidar_sweeps import (
     SENSOR_M,
@@ -36,13 +37,12 @@ FLAT = cells_on_grid(np.zeros((200, 60)), 0.1, corner_m=(0.0, -3.0))
 
 @pytest.fixture(scope="module")
 def scene():
-    """A street whose bed is known: no test here draws it from above."""
+    """A street whose support is known: no test here draws it from above."""
     car = box_car(start=(4.0, 3.0), moved_m=3.0)
     opened = street(actors=(car,))
     roof = cells_on_grid(np.full((40, 18), 0.75), 0.1, corner_m=(-2.0, -0.9))
-    remember_support(
-        opened, placement_settings(SNOW), SnowSupport(ground=FLAT, actors={"car": roof})
-    )
+    support = SnowSupport(ground=FLAT, actors={"car": roof})
+    memo_of(opened).put(("snow support", placement_settings(SNOW)), support)
     return opened
 
 

@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from batch_scenes import ORIGIN_M
 from box_views import (
     CAR_M,
     UPRIGHT,
@@ -15,11 +14,12 @@ from box_views import (
     count_by_hand,
     make_boxes,
     make_camera,
+    placed,
     plane_depth,
 )
 
 from augment.boxes import SIDES_M
-from augment.effects.flood.flood import hidden_pixels
+from augment.effects.flood.effect import hidden_pixels
 from augment.effects.snow.snow import snow_pixels
 from augment.labels import Boxes
 
@@ -39,7 +39,7 @@ def test_pixels_are_those_counted_one_by_one(thickness_m: float) -> None:
         low[2] = -size[2] / 2 + bottom
         high[2] = size[2] / 2 + max(0.10, 1.5 * thickness_m + 0.05)
         extents.append((low, high))
-    got = snow_pixels(boxes, ORIGIN_M, camera, depth, snow, thickness_m)
+    got = snow_pixels(placed(boxes), camera, depth, snow, thickness_m)
     pixels, marked = count_by_hand(boxes, extents, camera, depth, snow)
     assert sum(p > 0 for p in pixels) > 30 and sum(marked) > 0
     np.testing.assert_array_equal(got.pixels, pixels)
@@ -53,8 +53,8 @@ def test_boxes_without_snow_own_what_they_own_in_a_flood() -> None:
         (rng.uniform((2, -8, 0), (25, 8, 2)), rng.uniform(0.4, 5, 3), rng.normal(size=4))
         for _ in range(20)
     ])  # fmt: skip
-    bare = snow_pixels(boxes, ORIGIN_M, camera, depth, ALL, 0.0)
-    flooded = hidden_pixels(boxes, ORIGIN_M, camera, depth, ALL)
+    bare = snow_pixels(placed(boxes), camera, depth, ALL, 0.0)
+    flooded = hidden_pixels(placed(boxes), camera, depth, ALL)
     assert bare.pixels.sum() > 0
     np.testing.assert_array_equal(bare.pixels, flooded.pixels)
 
@@ -64,13 +64,13 @@ def test_snow_on_the_roof_is_the_cars_and_snow_around_its_wheels_is_not(thicknes
     boxes = make_boxes(((8, 0, 0.75), CAR_M, UPRIGHT))  # from the road to 1.5 m
     high = dataclasses.replace(make_camera(pitch=0.5), camera_from_world=raised(4.0, 0.5))
     roof = plane_depth(high, 1.5 + thickness_m)
-    got = snow_pixels(boxes, ORIGIN_M, high, roof, ALL, thickness_m)
+    got = snow_pixels(placed(boxes), high, roof, ALL, thickness_m)
     assert got.pixels[0] == got.marked[0] > 300
     # Drifts on the roof are half as deep again.
     drift = plane_depth(high, 1.5 + 1.5 * thickness_m)
-    assert snow_pixels(boxes, ORIGIN_M, high, drift, ALL, thickness_m).pixels[0] > 300
+    assert snow_pixels(placed(boxes), high, drift, ALL, thickness_m).pixels[0] > 300
     ground = plane_depth(high, thickness_m)
-    assert snow_pixels(boxes, ORIGIN_M, high, ground, ALL, thickness_m).pixels[0] == 0
+    assert snow_pixels(placed(boxes), high, ground, ALL, thickness_m).pixels[0] == 0
 
 
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 2.0])
@@ -82,7 +82,7 @@ def test_the_snowy_part_is_that_of_the_cap(resolution: float) -> None:
     z = 1.6 + 9.5 * rays[..., 2]
     depth = np.where(z < 2.4, 9.5, 0).astype(np.float32)  # the snow's top, and sky
     snow = np.where(z > 2.0, 255, 0).astype(np.uint8)
-    got = snow_pixels(boxes, ORIGIN_M, camera, depth, snow, 0.4)
+    got = snow_pixels(placed(boxes), camera, depth, snow, 0.4)
     expected = 0.4 / (2.4 - 0.45)  # the lowest 45 cm stand in snow
     # Each edge is off by half a pixel, of the 20 that the face has at resolution 1.
     assert got.marked[0] / got.pixels[0] == pytest.approx(expected, abs=1 / 20 / resolution)
@@ -94,16 +94,16 @@ def test_a_low_box_keeps_its_top_quarter_in_any_snow() -> None:
     camera = make_camera(pitch=0.2)
     for height_m, owned in {0.29: False, 0.31: True, 1.0: True}.items():
         depth = plane_depth(camera, height_m)
-        got = snow_pixels(boxes, ORIGIN_M, camera, depth, ALL, 10.0)
+        got = snow_pixels(placed(boxes), camera, depth, ALL, 10.0)
         assert (got.pixels[0] > 0) == owned, height_m
 
 
 def test_boxes_of_no_number_and_no_boxes() -> None:
     camera, depth = make_camera(), np.full((106, 160), 5.0, np.float32)
     boxes = make_boxes(((np.nan, 0, 0.5), CAR_M, UPRIGHT), ((5, 0, 1.6), CAR_M, UPRIGHT))
-    got = snow_pixels(boxes, ORIGIN_M, camera, depth, ALL, 0.1)
+    got = snow_pixels(placed(boxes), camera, depth, ALL, 0.1)
     assert got.pixels[0] == got.marked[0] == 0 < got.pixels[1]
-    none = snow_pixels(Boxes.empty(), ORIGIN_M, camera, depth, ALL, 0.1)
+    none = snow_pixels(placed(Boxes.empty()), camera, depth, ALL, 0.1)
     assert none.pixels.shape == none.marked.shape == (0,)
 
 

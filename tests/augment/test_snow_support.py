@@ -1,4 +1,4 @@
-"""Beds kept: keys by content, files that are whole or refused, and what is remembered."""
+"""Snow supports kept: keys by content, files that are whole or refused, and what is remembered."""
 
 from __future__ import annotations
 
@@ -13,18 +13,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow import support as beds
+from augment.effects.snow import support as supports
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
-from augment.effects.snow.support import (
-    FORMAT,
-    load_support,
-    remember_support,
-    save_support,
-    support_key,
-    support_of,
-)
+from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
 from augment.errors import OutputError, SceneError
+from augment.memo import memo_of
 from augment.scene import Scene, Track
 from tests.snow_scenes import box_car, cameras_of, drive, sheet
 
@@ -38,7 +32,7 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def bed(scene: Scene) -> SnowSupport:
+def support(scene: Scene) -> SnowSupport:
     found = place_snow_support(scene, cameras_of(scene), SETTINGS)
     assert len(found.ground) > 500 and set(found.actors) == {"car", "täxi/2"}
     return found
@@ -52,23 +46,23 @@ def assert_equal(a: SnowSupport, b: SnowSupport) -> None:
             assert x.dtype == y.dtype and torch.equal(x, y), field.name
 
 
-def test_a_file_gives_back_the_bed_to_the_bit(bed: SnowSupport, tmp_path: Path) -> None:
+def test_a_file_gives_back_the_support_to_the_bit(support: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "new" / "snow.safetensors"
-    save_support(path, bed, "a key")
-    assert_equal(load_support(path, "a key"), bed)
+    save_support(path, support, "a key")
+    assert_equal(load_support(path, "a key"), support)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
-    save_support(path, dataclasses.replace(bed, actors={}), "another")
+    save_support(path, dataclasses.replace(support, actors={}), "another")
     assert load_support(path, "another").actors == {}
 
 
-def test_the_same_bed_is_the_same_bytes(bed: SnowSupport, tmp_path: Path) -> None:
+def test_the_same_support_is_the_same_bytes(support: SnowSupport, tmp_path: Path) -> None:
     for name in "ab":
-        save_support(tmp_path / name, bed, "k")
+        save_support(tmp_path / name, support, "k")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    ground = dataclasses.replace(bed.ground, light=bed.ground.tracks)
-    shared = SnowSupport(ground, {"a": bed.actors["car"], "b": bed.actors["car"]})
-    save_support(tmp_path / "bed", shared, "k")
-    assert_equal(load_support(tmp_path / "bed", "k"), shared)
+    ground = dataclasses.replace(support.ground, light=support.ground.tracks)
+    shared = SnowSupport(ground, {"a": support.actors["car"], "b": support.actors["car"]})
+    save_support(tmp_path / "support", shared, "k")
+    assert_equal(load_support(tmp_path / "support", "k"), shared)
     empty = place_snow_support(drive(sheet((-2, 14), (-6, 6))), [], SETTINGS)
     save_support(tmp_path / "b", empty, "k")
     assert_equal(load_support(tmp_path / "b", "k"), empty)
@@ -132,11 +126,11 @@ def test_directions_of_colour_do_not_change_a_key(scene: Scene) -> None:
     assert support_key(other, cameras, SETTINGS) == support_key(scene, cameras, SETTINGS)
 
 
-def test_files_of_something_else_are_refused(bed: SnowSupport, tmp_path: Path) -> None:
+def test_files_of_something_else_are_refused(support: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
     with pytest.raises(SceneError, match="no such file"):
         load_support(path, "k")
-    save_support(path, bed, "k")
+    save_support(path, support, "k")
     with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
         load_support(path, "other")
     save_file({"x": torch.zeros(3)}, path)
@@ -149,9 +143,9 @@ def test_files_of_something_else_are_refused(bed: SnowSupport, tmp_path: Path) -
         load_support(tmp_path, "k")
 
 
-def test_cut_files_are_refused(bed: SnowSupport, tmp_path: Path) -> None:
+def test_cut_files_are_refused(support: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
-    save_support(path, bed, "k")
+    save_support(path, support, "k")
     data = path.read_bytes()
     for length in (0, 1, 7, 100, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
@@ -159,16 +153,16 @@ def test_cut_files_are_refused(bed: SnowSupport, tmp_path: Path) -> None:
             load_support(path, "k")
 
 
-def test_contents_that_do_not_fit_are_refused(bed: SnowSupport, tmp_path: Path) -> None:
+def test_contents_that_do_not_fit_are_refused(support: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
-    save_support(path, bed, "k")
+    save_support(path, support, "k")
     whole = load_file(path)
-    ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(bed.actors)}
+    ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
     short = whole["ground.light"][1:].clone()
     neighbours, buried_by, buried = (
         whole[f"ground.{name}"].clone() for name in ("neighbours", "buried_by", "buried")
     )
-    neighbours[0, 0], buried_by[0, 0], buried[0] = -3, len(bed.ground), -1
+    neighbours[0, 0], buried_by[0, 0], buried[0] = -3, len(support.ground), -1
     missing = {name: tensor for name, tensor in whole.items() if name != "actors.1.banks"}
     for tensors, about in (
         (whole | {"ground.light": short}, ids),
@@ -184,14 +178,14 @@ def test_contents_that_do_not_fit_are_refused(bed: SnowSupport, tmp_path: Path) 
             load_support(path, "k")
 
 
-def test_a_bed_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, caplog) -> None:
+def test_a_support_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, caplog) -> None:
     calls = []
 
     def counted(*arguments, **options) -> SnowSupport:
         calls.append(arguments)
         return place_snow_support(*arguments, **options)
 
-    monkeypatch.setattr(beds, "place_snow_support", counted)
+    monkeypatch.setattr(supports, "place_snow_support", counted)
     own = dataclasses.replace(scene)
     first = support_of(own, SETTINGS, folder=tmp_path)
     assert support_of(own, SETTINGS, folder=tmp_path) is first
@@ -213,10 +207,10 @@ def test_a_bed_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, caplog) 
     assert len(calls) == 3
 
 
-def test_what_is_remembered_is_what_is_given(scene: Scene, bed: SnowSupport) -> None:
+def test_what_is_remembered_is_what_is_given(scene: Scene, support: SnowSupport) -> None:
     own = dataclasses.replace(scene)
-    remember_support(own, SETTINGS, bed)
-    assert support_of(own, SETTINGS) is bed
+    memo_of(own).put(("snow support", SETTINGS), support)
+    assert support_of(own, SETTINGS) is support
     gone = weakref.ref(own)
     del own
     gc.collect()
