@@ -381,7 +381,7 @@ class BlockWorker:
         else:
             with times.spent("open"):
                 scene = self._scene_of(block.uri, task.name)
-            with times.spent("place"):
+            with times.spent("prepare"):
                 self._share(block, scene)
         self._enter(block)
         folder = staging_folder(self._store, self._setup.scratch, block)

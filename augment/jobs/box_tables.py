@@ -59,7 +59,7 @@ class BoxTable:
     columns: Mapping[str, type]
     sampled: tuple[str, ...]
     derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
-    visible: Callable[[Mapping[str, Any]], np.ndarray] | None = None
+    visible: Callable[[BoxNumbers], np.ndarray] | None = None
 
     @property
     def stored(self) -> tuple[str, ...]:

@@ -148,7 +148,7 @@ def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
     """
     tables = box_tables()
     factors = [
-        tables[name].visible(numbers) for name, numbers in weather.items() if tables[name].visible
+        visible(numbers) for name, numbers in weather.items() if (visible := tables[name].visible)
     ]
     left = [np.where(np.isnan(factor), 1.0, factor) for factor in (np.ones(count), *factors)]
     return np.prod(left, axis=0)
@@ -537,7 +537,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     expected = {effect.name for effect in effects.EFFECTS if effect.of(recipe) is not None}
     if set(view.effects) != expected:
         raise ValueError(
-            f"the renderer returned what labels of {', '.join(view.effects) or 'no effect'} "
+            f"the renderer returned what labels of {', '.join(sorted(view.effects)) or 'no effect'} "
             f"are measured from, for a recipe with {', '.join(sorted(expected)) or 'no effect'}"
         )
     output, masks = recipe.output, {e.mask for e in effects.EFFECTS if e.name in expected}
@@ -550,7 +550,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     }
     requested |= dict.fromkeys(set(view.masks) - masks, False)
     for name, needed in requested.items():
-        buffer = view.masks.get(name, getattr(view, name, None))
+        buffer: Any = view.masks.get(name, getattr(view, name, None))
         if (buffer is not None) != needed:
             raise ValueError(
                 f"the renderer returned {'no' if needed else 'a'} {name} buffer, which the "
