@@ -239,7 +239,7 @@ class Views:
                 depth_m,
                 (depth_m > 0).astype(np.float32),
             ),
-            None if pixels.water is None else pixels.water > 0,
+            pixels.masks[WATER] > 0 if WATER in pixels.masks else None,
             None if pixels.instance is None else pixels.instance > 0,
         )
 

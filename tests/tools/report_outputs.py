@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.jobs.files import TABLES, encode_depth, encode_ids, encode_image
-from augment.jobs.layout import PATH_KINDS
+from augment.jobs.files import box_tables, encode_depth, encode_ids, encode_image
+from augment.jobs.layout import path_kinds
 from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.tables import FrameBoxes, boxes_bytes, parquet_bytes
 from augment.labels import Boxes
@@ -31,7 +31,7 @@ def make_row(
     **changes: Any,
 ) -> dict[str, Any]:
     """A row without weather, whose image is not there yet."""
-    paths = {f"{kind}_path": None for kind in PATH_KINDS}
+    paths = {f"{kind}_path": None for kind in path_kinds()}
     row: dict[str, Any] = {"scene": scene, "source": f"procedural:{scene}", **paths}
     row |= {"variant": f"{recipe}-{variant:03d}", "frame": frame, "camera": camera}
     row |= {"timestamp_ns": frame, "width": WIDTH, "height": HEIGHT, "surface": "solid"}
@@ -106,7 +106,7 @@ def _box_weather(row: dict[str, Any], base: str) -> dict[str, tuple[str, bytes]]
         stored["water"] = [ids, [0.5, 0.0, 0.0], shown, [50, 0, 0]]
     if not math.isnan(row["snow_depth_m"]):
         stored["snow"] = [ids, shown, [50, 50, 0]]
-    tables = {name: TABLES[f"box_{name}"] for name in stored}
+    tables = {name: box_tables()[f"box_{name}"] for name in stored}
     return {
         f"box_{n}": (f"{base}/labels/{n}.parquet", t.to_bytes({item: t.from_json(stored[n])}))
         for n, t in tables.items()

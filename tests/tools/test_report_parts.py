@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from augment.jobs.files import TABLES, visibility
+from augment.jobs.files import box_tables, visibility
 from augment.jobs.manifest import rows_to_table
 from augment.jobs.store import LocalStore, StoredFile
 from tests.tools.report_outputs import make_row, street_rows, write_output
@@ -202,8 +202,8 @@ def test_visibility_is_that_of_the_labels(tmp_path) -> None:
     rows[0]["smog_extinction_per_m"] = 0.01
     write_output(tmp_path, rows)
     shares = report.share_visible(as_table(rows), ["wet"], files_of(tmp_path))
-    paths = {kind: rows[0][f"{kind}_path"] for kind in TABLES if kind != "box_2d"}
-    weather = {k: TABLES[k].read(tmp_path / path)[0, "front"] for k, path in paths.items()}
+    paths = {kind: rows[0][f"{kind}_path"] for kind in box_tables() if kind != "box_2d"}
+    weather = {k: box_tables()[k].read(tmp_path / path)[0, "front"] for k, path in paths.items()}
     expected = visibility(weather, 3)[:2]  # no pixel shows the third box
     assert expected.tolist() == pytest.approx([0.9 * 0.5 * 0.5, 0.0])
     assert shares is not None and shares.rows == [("wet", [1, 0, 1, 0, 0, 0])]
