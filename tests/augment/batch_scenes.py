@@ -9,15 +9,18 @@ import hashlib
 import os
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
+from augment.effects.effect import EffectView, Placed
+from augment.effects.smog import PlacedSmog
 from augment.effects.snow.cells import OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings
+from augment.effects.snow.snow import PlacedSnow
 from augment.effects.snow.support import support_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
@@ -78,35 +81,13 @@ class FakeLabels:
 
 
 @dataclass(frozen=True)
-class FakeFlood:
-    level_z_m: float
-    scene_depth_m: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class FakeSnowy:
-    surface_depth_m: np.ndarray | None
-    thickness_m: float
-
-
-@dataclass(frozen=True)
-class FakeSmoggy:
-    medium: Fog | None
-    surface_depth_m: np.ndarray | None
-    water_level_z_m: float | None
-
-
-@dataclass(frozen=True)
 class FakeView:
     rgb: np.ndarray
-    depth_m: np.ndarray | None
-    semantic: np.ndarray | None
-    instance: np.ndarray | None
-    water: np.ndarray | None = None
-    flood: FakeFlood | None = None
-    snow: np.ndarray | None = None
-    snowy: FakeSnowy | None = None
-    smoggy: FakeSmoggy | None = None
+    depth_m: np.ndarray | None = None
+    semantic: np.ndarray | None = None
+    instance: np.ndarray | None = None
+    masks: dict[str, np.ndarray] = field(default_factory=dict)
+    effects: dict[str, EffectView] = field(default_factory=dict)
     surface: SurfaceView | None = None
 
 
@@ -185,15 +166,19 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
     shape = (camera.height, camera.width)
     output = recipe.output
     depth = rng.uniform(-10, 300, shape).astype(np.float32)
-    weather = recipe.weather
-    return FakeView(
+    view = FakeView(
         rgb=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
         depth_m=None if output.depth == "none" else depth,
         semantic=rng.integers(0, 15, shape, dtype=np.uint8) if output.semantic else None,
         instance=rng.integers(0, 600, shape).astype(np.uint16) if output.instance else None,
-        **(fake_flood(camera, rng) if weather.flood is not None else {}),
-        **(fake_snow(camera, rng) if weather.snow is not None else {}),
-        **(fake_smog(camera, rng, weather.smog) if weather.smog is not None else {}),
+    )
+    effects = fake_effects(camera, recipe, rng)
+    masks = {"water": effects.get("flood"), "snow": effects.get("snow")}
+    nowhere = np.zeros(shape, np.uint8)
+    return replace(
+        view,
+        masks={n: nowhere if e.mask is None else e.mask for n, e in masks.items() if e},
+        effects=effects,
         surface=None if scene.labels is None else fake_surface(rng, shape),
     )
 
@@ -202,36 +187,36 @@ def fake_surface(rng: np.random.Generator, shape: tuple[int, int]) -> SurfaceVie
     """Surfaces where the boxes are, of classes that none is of."""
     depth = rng.uniform(0, 4, shape).astype(np.float32)
     classes = np.full(shape, SemanticClass.ROAD, np.uint8)
-    return SurfaceView(depth, 0.0, None, depth, classes, 0.0)
+    return SurfaceView(depth, None, depth, classes, False)
 
 
-def fake_flood(camera: Camera, rng: np.random.Generator) -> dict:
-    """Water on a third of the pixels, none in view of one image; surfaces where the boxes are."""
-    shape = (camera.height, camera.width)
-    if camera.timestamp_ns == DRY_NS:
-        return {"water": np.zeros(shape, np.uint8), "flood": FakeFlood(LEVEL_Z_M, None)}
-    return {
-        "water": np.where(rng.random(shape) < 1 / 3, 255, 0).astype(np.uint8),
-        "flood": FakeFlood(LEVEL_Z_M, rng.uniform(0, 4, shape).astype(np.float32)),
-    }
+def fake_effects(camera: Camera, recipe: Recipe, rng: np.random.Generator) -> dict[str, EffectView]:
+    """Water on a third of the pixels and snow on half of them, but none in view of one image;
+    surfaces where the boxes are.
+    """
+    weather, shape = recipe.weather, (camera.height, camera.width)
 
+    def seen(placed: Placed, share: float | None = None) -> EffectView:
+        mask = None
+        if share is not None:
+            if camera.timestamp_ns == DRY_NS:
+                return EffectView(placed, None, None, None)
+            mask = np.where(rng.random(shape) < share, 255, 0).astype(np.uint8)
+        return EffectView(placed, rng.uniform(0, 4, shape).astype(np.float32), mask, None)
 
-def fake_snow(camera: Camera, rng: np.random.Generator) -> dict:
-    """Snow on half of the pixels, as `fake_flood` has water."""
-    shape = (camera.height, camera.width)
-    if camera.timestamp_ns == DRY_NS:
-        return {"snow": np.zeros(shape, np.uint8), "snowy": FakeSnowy(None, THICKNESS_M)}
-    return {
-        "snow": np.where(rng.random(shape) < 1 / 2, 255, 0).astype(np.uint8),
-        "snowy": FakeSnowy(rng.uniform(0, 4, shape).astype(np.float32), THICKNESS_M),
-    }
-
-
-def fake_smog(camera: Camera, rng: np.random.Generator, smog: Smog) -> dict:
-    """Surfaces where the boxes are."""
-    depth = rng.uniform(0, 4, (camera.height, camera.width)).astype(np.float32)
-    medium = Fog(smog.sigma_per_m, smog.color) if smog.sigma_per_m else None
-    return {"smoggy": FakeSmoggy(medium, depth, None)}
+    effects = {}
+    if weather.flood is not None:
+        effects["flood"] = seen(Placed(None, (), water_level_z_m=LEVEL_Z_M), 1 / 3)
+    if weather.snow is not None:
+        snow = PlacedSnow(weather.snow.model_copy(update={"depth_m": THICKNESS_M}), 0)
+        effects["snow"] = seen(Placed(snow, ()), 1 / 2)
+    if weather.smog is not None:
+        smog = weather.smog
+        fog = PlacedSmog(Fog(smog.sigma_per_m, smog.color), False) if smog.sigma_per_m else None
+        effects["smog"] = seen(Placed(fog, ()))
+    if recipe.style is not None:
+        effects["style"] = EffectView(Placed(None, ()), None, None, None)
+    return effects
 
 
 def make_bed(x_m: float) -> SnowSupport:

@@ -27,12 +27,13 @@ from batch_scenes import (
     tree_digest,
 )
 
+from augment.boxes import PlacedBoxes
 from augment.cameras import Camera, Frame
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
-from augment.effects.flood.flood import hidden_pixels, submerged_fraction
+from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import snow_pixels
-from augment.jobs.files import TABLES, visibility
+from augment.jobs.files import box_tables, visibility
 from augment.jobs.manifest import later_columns, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.labels import Boxes
@@ -91,43 +92,40 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe, kind: str) ->
     for row in rows_of(whole):
         mask = cv2.imread(str(whole / row[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
         assert mask.dtype == np.uint8
-        np.testing.assert_array_equal(mask, getattr(camera_and_view(row, recipe)[1], kind))
+        np.testing.assert_array_equal(mask, camera_and_view(row, recipe)[1].masks[kind])
         assert (row["snow_depth_m"], row["surface"]) == (0.0, "solid")
 
 
-def water_numbers(boxes: Boxes, camera: Camera, view: FakeView) -> dict[str, np.ndarray]:
-    found = {"submerged_fraction": submerged_fraction(boxes, ORIGIN_M, LEVEL_Z_M)}
-    depth = view.flood.scene_depth_m
-    if depth is not None:
-        counted = hidden_pixels(boxes, ORIGIN_M, camera, depth, view.water)
+def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) -> dict:
+    """Of what the file has of each box, without what follows from it."""
+    placed = PlacedBoxes.of(boxes, ORIGIN_M)
+    if kind == "smog":
+        seen = view.effects["smog"]
+        found = box_transmittance(placed, camera, seen.placed.data.fog, seen.depth_m)
+        return {"transmittance": found.transmittance, "pixels": found.pixels}
+    seen = view.effects["flood" if kind == "water" else kind]
+    if kind == "snow":
+        if seen.depth_m is None:
+            return {}
+        counted = snow_pixels(placed, camera, seen.depth_m, view.masks["snow"], THICKNESS_M)
+        return {"pixels": counted.pixels, "snow_pixels": counted.marked}
+    found = {"submerged_fraction": submerged_fraction(placed, LEVEL_Z_M)}
+    if seen.depth_m is not None:
+        counted = hidden_pixels(placed, camera, seen.depth_m, view.masks["water"])
         found |= {"pixels": counted.pixels, "hidden_pixels": counted.marked}
     return found
 
 
-def snow_numbers(boxes: Boxes, camera: Camera, view: FakeView) -> dict[str, np.ndarray]:
-    depth = view.snowy.surface_depth_m
-    if depth is None:
-        return {}
-    counted = snow_pixels(boxes, ORIGIN_M, camera, depth, view.snow, THICKNESS_M)
-    return {"pixels": counted.pixels, "snow_pixels": counted.marked}
-
-
-def smog_numbers(boxes: Boxes, camera: Camera, view: FakeView) -> dict[str, np.ndarray]:
-    smoggy = view.smoggy
-    found = box_transmittance(boxes, ORIGIN_M, camera, smoggy.medium, smoggy.surface_depth_m)
-    return {"transmittance": found.transmittance, "pixels": found.pixels}
-
-
 @pytest.mark.parametrize(
-    ("kind", "numbers", "marked", "fraction"),
+    ("kind", "marked", "fraction"),
     [
-        ("water", water_numbers, "hidden_pixels", "hidden_fraction"),
-        ("snow", snow_numbers, "snow_pixels", "snow_fraction"),
-        ("smog", smog_numbers, None, None),
+        ("water", "hidden_pixels", "hidden_fraction"),
+        ("snow", "snow_pixels", "snow_fraction"),
+        ("smog", None, None),
     ],
 )
 def test_boxes_have_their_numbers_beside_the_labels(
-    whole: Path, recipe: Recipe, kind, numbers, marked, fraction
+    whole: Path, recipe: Recipe, kind, marked, fraction
 ) -> None:
     """Read with any Parquet reader, a row per frame, camera and box."""
     path = whole / LABELS / f"{kind}.parquet"
@@ -141,7 +139,7 @@ def test_boxes_have_their_numbers_beside_the_labels(
     for row in rows:
         boxes, k = FakeLabels().boxes(row["frame"]), row["box"]
         assert row["track_id"] == boxes.track_ids[k]
-        expected = numbers(boxes, *camera_and_view(row, recipe))
+        expected = expected_numbers(kind, boxes, *camera_and_view(row, recipe))
         assert {name: row[name] for name in expected} == {n: v[k] for n, v in expected.items()}
         if "pixels" not in expected:  # none of it is in view
             assert (row["frame"], row["camera"]) == (3, "rear/left")
@@ -174,7 +172,7 @@ def test_a_clear_day_has_the_same_labels_and_no_tables(whole: Path, tmp_path: Pa
 
 
 def test_images_without_boxes_are_listed(whole: Path) -> None:
-    water = TABLES["box_water"].read(whole / LABELS / "water.parquet")
+    water = box_tables()["box_water"].read(whole / LABELS / "water.parquet")
     assert {(f, len(numbers.track_ids)) for (f, _), numbers in water.items()} == {
         (number, number) for number in range(4)
     }
@@ -190,7 +188,7 @@ def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Reci
     job = RenderJob("fake:street", [recipe], tmp_path, camera_path=path)
     assert run(job).written == 2
     assert [row["box_water_path"] is None for row in rows_of(tmp_path)] == [False, True]
-    water = TABLES["box_water"].read(tmp_path / LABELS / "water.parquet")
+    water = box_tables()["box_water"].read(tmp_path / LABELS / "water.parquet")
     assert list(water) == [(1, "front")]
     assert run(job, must_not_render).skipped == 2
 
@@ -208,49 +206,52 @@ def test_without_labels_there_are_only_the_masks(tmp_path: Path, uri: str, outpu
     assert run(job).failed == 0
     rows = rows_of(tmp_path)
     assert all(row["snow_path"] and row["water_path"] for row in rows)
-    assert {row[f"{kind}_path"] for row in rows for kind in TABLES} == {None}
+    assert {row[f"{kind}_path"] for row in rows for kind in box_tables()} == {None}
     assert not (tmp_path / LABELS).exists()
     assert run(job, must_not_render).skipped == 8
 
 
+def without(name: str):
+    return lambda images: {key: image for key, image in images.items() if key != name}
+
+
 def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked) -> None:
     small, ones = np.zeros((8, 12), np.uint8), np.ones((16, 24), np.uint8)
-    for number, (change, message) in enumerate([
-        ({"rgb": np.zeros((16, 24, 3), np.float32)}, "rgb must be uint8"),
-        ({"rgb": np.zeros((8, 12, 3), np.uint8)}, r"rgb of \[8, 12, 3\].*16 rows of 24 pixels"),
-        ({"depth_m": None}, "returned no depth_m buffer"),
-        ({"water": None}, "returned no water buffer"),
-        ({"water": small}, r"water of \[8, 12\].*16 rows of 24 pixels"),
-        ({"water": ones}, r"mask must hold 0 and 255 only; got \[1\]"),
-        ({"water": np.zeros((16, 24), bool)}, "mask must be uint8"),
-        ({"flood": None}, "returned no water level for a recipe with a flood"),
-        ({"snow": None}, "returned no snow buffer"),
-        ({"snowy": None}, "returned no snow depth for a recipe with snow"),
+    for number, (field, change, message) in enumerate([
+        ("rgb", lambda _: np.zeros((16, 24, 3), np.float32), "rgb must be uint8"),
+        ("rgb", lambda rgb: rgb[:8, :12], r"rgb of \[8, 12, 3\].*16 rows of 24 pixels"),
+        ("depth_m", lambda _: None, "returned no depth_m buffer"),
+        ("masks", without("water"), "returned no water buffer"),
+        ("masks", lambda m: m | {"water": small}, r"water of \[8, 12\].*16 rows of 24 pixels"),
+        ("masks", lambda m: m | {"water": ones}, r"mask must hold 0 and 255 only; got \[1\]"),
+        ("masks", lambda m: m | {"water": ones > 1}, "mask must be uint8"),
+        ("masks", lambda m: m | {"rain": ones}, "a rain buffer, which the recipe does not ask for"),
+        ("effects", without("flood"), "labels of smog, snow are .* recipe with flood, smog, snow"),
     ]):  # fmt: skip
 
-        def render(scene, camera, recipe, *, backend, change=change):
+        def render(scene, camera, recipe, *, backend, field=field, change=change):
             view = fake_render(scene, camera, recipe, backend=backend)
-            return FakeView(**{**vars(view), **change})
+            return dataclasses.replace(view, **{field: change(getattr(view, field))})
 
         out = tmp_path / str(number)
         result = run(RenderJob("fake:s", [recipe], out, frames=[1], cameras=["front"]), render)
-        assert result.failed == 1 and re.search(message, result.failures[0])
+        assert result.failed == 1 and re.search(message, result.failures[0]), result.failures
         for kind in ("water", "snow"):
-            assert not TABLES[f"box_{kind}"].read(out / "s/fog-000/labels" / f"{kind}.parquet")
+            table = box_tables()[f"box_{kind}"]
+            assert not table.read(out / "s/fog-000/labels" / f"{kind}.parquet")
 
 
 def test_what_a_recipe_does_not_ask_for_is_recorded(tmp_path: Path) -> None:
-    for more, message in (
-        ({"flood": FLOOD}, "a water level for a recipe without a flood"),
-        ({"snow": SNOW}, "a snow depth for a recipe without snow"),
+    for number, (more, message) in enumerate((
+        ({"flood": FLOOD}, "labels of flood, smog are measured from, for a recipe with smog"),
         ({"instance": True}, "a instance buffer, which the recipe does not ask for"),
-    ):
+    )):  # fmt: skip
 
         def render(scene, camera, recipe, *, backend, more=more):
             given = make_recipe(**{"instance": False, **more})
             return fake_render(scene, camera, given, backend=backend)
 
-        job = RenderJob("fake:s", [make_recipe(instance=False)], tmp_path / message, frames=[1])
+        job = RenderJob("fake:s", [make_recipe(instance=False)], tmp_path / str(number), frames=[1])
         result = run(job, render)
         assert result.failed == 2 and message in result.failures[0]
 
@@ -281,7 +282,7 @@ def test_a_damaged_table_counts_as_lost(whole: Path, recipe, copied: Path, caplo
 
 def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
-    assert len(TABLES["box_snow"].read(tmp_path / LABELS / "snow.parquet")) == 2
+    assert len(box_tables()["box_snow"].read(tmp_path / LABELS / "snow.parquet")) == 2
     run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
     assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
     assert tree_digest(tmp_path) == tree_digest(whole)
@@ -310,7 +311,7 @@ def test_an_image_that_fails_later_loses_its_rows(whole: Path, recipe, copied: P
         raise RuntimeError("no such luck")
 
     assert run(RenderJob("fake:street", [recipe], copied), fails).failed == 1
-    assert (3, "front") not in TABLES["box_water"].read(copied / LABELS / "water.parquet")
+    assert (3, "front") not in box_tables()["box_water"].read(copied / LABELS / "water.parquet")
     assert run(RenderJob("fake:street", [recipe], copied)).written == 1
     assert tree_digest(copied) == tree_digest(whole)
 
@@ -429,7 +430,7 @@ def test_new_images_of_an_older_folder_have_their_numbers(whole, recipe, older: 
         (older / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
     job, path = RenderJob("fake:street", [recipe], older), LABELS / "smog.parquet"
     assert run(job).written == 2
-    table, expected = (TABLES["box_smog"].read(out / path) for out in (older, whole))
+    table, expected = (box_tables()["box_smog"].read(out / path) for out in (older, whole))
     assert set(table) == {(0, "front"), (2, "front")}
     item = 2, "front"
     np.testing.assert_array_equal(table[item]["transmittance"], expected[item]["transmittance"])
@@ -445,10 +446,11 @@ def test_samples_hold_them_read_or_rendered(whole: Path, recipe: Recipe) -> None
     sample, view = files[0], camera_and_view(row, recipe)[1]
     live = SceneDataset(open_fake("fake:street"), recipe, renderer=fake_render)[4]
     assert (live["frame"], live["camera"]["name"]) == (2, "front")
-    np.testing.assert_array_equal(sample["snow"].numpy(), view.snow > 0)
+    np.testing.assert_array_equal(sample["snow"].numpy(), view.masks["snow"] > 0)
     np.testing.assert_array_equal(live["snow"], sample["snow"])
     for kind, name in (("snow", "snow_fraction"), ("smog", "transmittance")):
-        numbers = TABLES[f"box_{kind}"].read(whole / LABELS / f"{kind}.parquet")[2, "front"][name]
+        table = box_tables()[f"box_{kind}"].read(whole / LABELS / f"{kind}.parquet")
+        numbers = table[2, "front"][name]
         np.testing.assert_array_equal(sample["boxes"][name], numbers)
         np.testing.assert_array_equal(live["boxes"][name], numbers)
     assert sample["paths"]["snow"].endswith("snow/front/000002.png")
@@ -465,11 +467,11 @@ def test_all_comes_through_smog_without_density(tmp_path: Path) -> None:
 
 def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
     names = ("a", "b", "c", "d")
-    smog = TABLES["box_smog"].from_json([names, [0.5, 0.25, 1.0, np.nan], [9, 0, 9, -1]])
-    water = TABLES["box_water"].from_json([names, [0.0] * 4, [10, 0, 4, 0], [5, 0, 4, 0]])
-    snow = TABLES["box_snow"].from_json([names, [-1, -1, 8, -1], [0, 0, 2, 0]])
+    smog = box_tables()["box_smog"].from_json([names, [0.5, 0.25, 1.0, np.nan], [9, 0, 9, -1]])
+    water = box_tables()["box_water"].from_json([names, [0.0] * 4, [10, 0, 4, 0], [5, 0, 4, 0]])
+    snow = box_tables()["box_snow"].from_json([names, [-1, -1, 8, -1], [0, 0, 2, 0]])
     everything = {"box_smog": smog, "box_water": water, "box_snow": snow}
-    assert everything.keys() == TABLES.keys() - {"box_2d"}  # which is not of the weather
+    assert everything.keys() == box_tables().keys() - {"box_2d"}  # which is not of the weather
     for effects, expected in (
         ({}, [1, 1, 1, 1]),
         ({"box_smog": smog}, [0.5, 0.25, 1, 1]),
@@ -479,7 +481,7 @@ def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
     ):
         np.testing.assert_array_equal(visibility(effects, 4), expected)
     assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64
-    tables = {f"box_{k}": TABLES[f"box_{k}"].read(whole / LABELS / f"{k}.parquet")
+    tables = {f"box_{k}": box_tables()[f"box_{k}"].read(whole / LABELS / f"{k}.parquet")
               for k in ("smog", "water", "snow")}  # fmt: skip
     for item, numbers in tables["box_smog"].items():
         left = visibility({k: table[item] for k, table in tables.items()}, len(numbers.track_ids))

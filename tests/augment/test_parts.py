@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError
-from augment.jobs.layout import PATH_KINDS
+from augment.jobs.layout import path_kinds
 from augment.jobs.manifest import (
     FAILED,
     OK,
@@ -33,7 +33,7 @@ from augment.jobs.store import Store, open_store
 
 RECIPE = make_recipe()
 IDENTITY = Identity("fake:a", RECIPE.hash, "recorded", "1", "cpu")
-PATHS = {f"{kind}_path": "a.png" if kind == "image" else None for kind in PATH_KINDS}
+PATHS = {f"{kind}_path": "a.png" if kind == "image" else None for kind in path_kinds()}
 
 
 def table(frames: dict[int, bool], message: str = "", scene: str = "a") -> pa.Table:
