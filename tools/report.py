@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -26,7 +26,8 @@ from markupsafe import Markup
 from augment.effects.lidar import codes
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import STATE_FOLDER, folder_name
+from augment.jobs.files import box_tables
+from augment.jobs.layout import STATE_FOLDER, folder_name, path_kinds
 from augment.jobs.manifest import OK, read_finished
 from augment.jobs.store import Store, StoredFile, open_store
 from tools.report_numbers import (
@@ -76,22 +77,13 @@ _UNUSED = [
     "settings",
 ]
 # Of a variant's folder; what else lies there, such as its recipe, is small.
-_KINDS = (
-    "images", "depth", "semantic", "instance", "water", "snow", "lidar", "labels", "calibration",
-)  # fmt: skip
 OTHER, STATE = "other", "state of jobs"
 MAX_BOX_FILES = 40
 MAX_TABLES = 6  # of each recipe
 MAX_SWEEPS = 3  # of each recipe
 VISIBILITY_STEPS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95)  # lower bounds of the bins; the last is open
-# What of a box an effect leaves, from its column, by the manifest's kind of path.
-_LEFT: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
-    "box_smog": ("transmittance", lambda value: value),
-    "box_water": ("hidden_fraction", lambda value: 1 - value),
-    "box_snow": ("snow_fraction", lambda value: 1 - value),
-}
 _BOX = ("frame", "camera", "box")
-_TYPES = [pa.int64(), pa.string(), pa.int64(), pa.int64(), pa.float64()]  # and pixels and a share
+_BOX_TYPES = [pa.int64(), pa.string(), pa.int64()]
 _CODES = {
     codes.UNCHANGED: "unchanged",
     codes.ATTENUATED: "weaker",
@@ -334,7 +326,8 @@ def _kind_of(path: str) -> str:
     folder = parts[2] if len(parts) > 3 else parts[-1].partition(".")[0]
     if folder == "manifest":
         return "manifest"
-    return folder if folder in _KINDS and len(parts) > 2 else OTHER
+    known = {"images", *path_kinds()}
+    return folder if folder in known and len(parts) > 2 else OTHER
 
 
 def sample_text(files: int, of: int) -> str:
@@ -398,10 +391,10 @@ def count_classes(table: pa.Table, files: ReportFiles) -> Classes | None:
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars | None:
     """How much the weather leaves of each box that an image shows, in VISIBILITY_STEPS.
 
-    Transmittance of smog, times what water does not hide, times what snow does not cover, as
-    `augment.jobs.files.visibility` has it.
+    The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
     """
-    columns = [f"{kind}_path" for kind in _LEFT if f"{kind}_path" in table.column_names]
+    says = (kind for kind, of_boxes in box_tables().items() if of_boxes.visible or of_boxes.hidden)
+    columns = [f"{kind}_path" for kind in says if f"{kind}_path" in table.column_names]
     rows, read, there = [], 0, 0
     for recipe in recipes:
         own = table.filter(pc.equal(table["recipe"], recipe))
@@ -459,16 +452,19 @@ def _visible(paths: dict[str, str | None], files: ReportFiles) -> np.ndarray | N
     for column, path in paths.items():
         if path is None:
             continue
-        name, left = _LEFT[column.removesuffix("_path")]
-        found = files.read_columns(path, (*_BOX, "pixels", name))
+        kind = box_tables()[column.removesuffix("_path")]
+        name, counted = kind.visible or kind.hidden, [n for n in ("pixels",) if n in kind.columns]
+        found = files.read_columns(path, (*_BOX, *counted, name))
         if found is None:
             return None
-        if found.num_columns < 5:  # `pixels` of smog are younger than its transmittance
+        if found.num_columns < len(_BOX) + len(counted) + 1:  # of an output older than `pixels`
             continue
-        if found.schema.types != _TYPES:
+        if found.schema.types != [*_BOX_TYPES, *(pa.int64() for _ in counted), pa.float64()]:
             return files.note(path, "its columns are not of the types that a job writes")
-        value = left(np.asarray(pc.fill_null(found[name], np.nan), np.float64))
-        shown = pc.fill_null(pc.greater(found["pixels"], 0), False).cast(pa.int8())
+        value = kind.left({name: np.asarray(pc.fill_null(found[name], np.nan), np.float64)})
+        shown = pa.array(np.ones(found.num_rows, np.int8))
+        if counted:
+            shown = pc.fill_null(pc.greater(found["pixels"], 0), False).cast(pa.int8())
         part = found.select(list(_BOX))
         part = part.append_column("left", pa.array(np.where(np.isfinite(value), value, 1.0)))
         parts.append(part.append_column("shown", shown))

@@ -23,6 +23,7 @@ from markupsafe import Markup
 from augment.errors import OutputError
 from augment.files.image_size import image_header
 from augment.jobs.files import decode_image, decode_png, depth_in_metres
+from augment.jobs.layout import mask_names
 from augment.jobs.store import Store, StoredFile, StoredFileMissing
 from augment.jobs.tables import read_table
 from augment.semantics import SemanticClass
@@ -399,11 +400,11 @@ def read_buffers(row: dict[str, Any], files: ReportFiles, width: int, most: int)
         for known, color in CLASS_COLORS.items():
             palette[known] = color
         found.append(figure(palette[small], "Semantic classes", keys=keys))
-    for kind, title in (("water", "Water mask"), ("snow", "Snow mask")):
+    for kind in mask_names():
         if (mask := read(kind, np.uint8)) is not None:
             note = f"{100 * float((mask > 0).mean()):.0f} % of pixels"
             rgb = cv2.cvtColor(_shrunk(mask, width), cv2.COLOR_GRAY2RGB)
-            found.append(figure(rgb, title, note))
+            found.append(figure(rgb, f"{kind.capitalize()} mask", note))
     return found
 
 

@@ -55,7 +55,7 @@ class SmogEffect(Effect):
         kind="box smog",
         columns={"transmittance": np.float64, "pixels": np.int64},
         sampled=("transmittance",),
-        visible=lambda numbers: numbers["transmittance"],
+        visible="transmittance",
     )
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:

@@ -49,8 +49,9 @@ class BoxTable:
     """How the numbers of one kind are stored. name: as of the manifest's column of paths, without
     `_path`. file: inside a variant's folder. kind: what the file says that it holds. columns: the
     file's, with their types. derived: what follows from the others; those that are columns are
-    there for other readers. sampled: those that samples of the datasets have. visible: how much of
-    each box the effect leaves to be seen, float64 [B], 0 to 1, NaN where it says nothing.
+    there for other readers. sampled: those that samples of the datasets have. visible, hidden: the
+    column that says how much of a box the effect leaves to be seen, or takes; 0 to 1, NaN where it
+    says nothing.
     """
 
     name: str
@@ -59,11 +60,18 @@ class BoxTable:
     columns: Mapping[str, type]
     sampled: tuple[str, ...]
     derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
-    visible: Callable[[BoxNumbers], np.ndarray] | None = None
+    visible: str = ""
+    hidden: str = ""
 
     @property
     def stored(self) -> tuple[str, ...]:
         return tuple(name for name in self.columns if name not in self.derived)
+
+    def left(self, columns: Any) -> np.ndarray | None:
+        """What the effect leaves of each box, float64 [B]; None where the table does not say."""
+        if self.hidden:
+            return 1 - columns[self.hidden]
+        return columns[self.visible] if self.visible else None
 
     def numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
         """The numbers of an image, with what follows from them."""

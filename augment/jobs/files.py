@@ -147,11 +147,8 @@ def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
     in view, or behind another, is told by `pixels` of the tables.
     """
     tables = box_tables()
-    factors = [
-        visible(numbers) for name, numbers in weather.items() if (visible := tables[name].visible)
-    ]
-    left = [np.where(np.isnan(factor), 1.0, factor) for factor in (np.ones(count), *factors)]
-    return np.prod(left, axis=0)
+    factors = [np.ones(count), *(tables[name].left(numbers) for name, numbers in weather.items())]
+    return np.prod([np.where(np.isnan(f), 1.0, f) for f in factors if f is not None], axis=0)
 
 
 # ---- What a job renders: a scene as it is known without its Gaussians, and the images wanted -----

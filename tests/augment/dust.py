@@ -55,7 +55,7 @@ class DustEffect(Effect):
         kind="box dust",
         columns={"clear_fraction": np.float64},
         sampled=("clear_fraction",),
-        visible=lambda numbers: numbers["clear_fraction"],
+        visible="clear_fraction",
     )
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:

@@ -262,8 +262,8 @@ def test_depth_and_classes_of_the_scene_or_of_the_first_surface(scene):
     dry = view_of(scene, None, view, **images)
     under = view_of(scene, flood(), view, **images)
     first = view_of(scene, flood(), view, surface="first", **images)
-    mask = under.water == 255
-    assert mask.sum() > 1000 and np.array_equal(under.water, first.masks["water"])
+    mask = under.masks["water"] == 255
+    assert mask.sum() > 1000 and np.array_equal(under.masks["water"], first.masks["water"])
     road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
     assert np.abs(under.depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
     assert (under.semantic == dry.semantic).mean() > 0.99

@@ -116,7 +116,7 @@ def test_only_colours_change(scene):
 def test_no_strength_is_no_style_to_the_bit(scene, weather):
     none = Style(preset="dusk", strength=0)
     plan = make_plan(recipe_of(none, **weather), scene)
-    assert plan.style is None
+    assert plan.placed["style"].data is None
     assert not any(runs for name, runs in ran(scene, recipe_of(none)).items() if "style" in name)
     clean, same = (render_view(scene, camera_of(scene), recipe_of(s, **weather))
                    for s in (None, none))  # fmt: skip

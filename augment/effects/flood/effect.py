@@ -62,7 +62,7 @@ class FloodEffect(Effect):
         },
         sampled=("submerged_fraction", "hidden_fraction"),
         derived={"hidden_fraction": share_of_pixels("hidden_pixels")},
-        visible=lambda numbers: 1 - numbers["hidden_fraction"],
+        hidden="hidden_fraction",
     )
 
     def kernels(self, section: Flood) -> Hashable:

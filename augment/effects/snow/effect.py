@@ -66,7 +66,7 @@ class SnowEffect(Effect):
         columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
         sampled=("snow_fraction",),
         derived={"snow_fraction": share_of_pixels("snow_pixels")},
-        visible=lambda numbers: 1 - numbers["snow_fraction"],
+        hidden="snow_fraction",
     )
 
     def kernels(self, section: Snow) -> Hashable:
