@@ -70,11 +70,8 @@ def trace(
                 continue
             for entry in range(node_first[node], node_first[node] + count):
                 p = order[entry]
-                px, py, pz = (
-                    ox - shape_origin[p, 0],
-                    oy - shape_origin[p, 1],
-                    oz - shape_origin[p, 2],
-                )
+                at = shape_origin[p]
+                px, py, pz = ox - at[0], oy - at[1], oz - at[2]
                 m = inverse[p]
                 a = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz
                 b = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz

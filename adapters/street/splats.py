@@ -492,9 +492,9 @@ def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
     # Under the ground the second layer may run on past an edge; behind a wall's it would be seen.
     upright = plan.shapes.semantic == SemanticClass.BUILDING
     below = make_cells(plan.shapes, backing, upright & (backing[:, 0] > 0))
-    if not len(below.shape):
-        return first
     count = len(below.shape)
+    if count == 0:
+        return first
     share = np.full((count, 2), SIGMA_PER_SIDE)
     return join_gaussians([first, _gaussians(plan, below, share, np.ones(count))])
 

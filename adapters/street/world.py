@@ -169,16 +169,14 @@ def door(opening: Rectangle, facade: Facade) -> Shapes:
     frames, edges = cut(opening, [leaf, light])
     stiles, stile_edges = cut(leaf, fields)
     dark = facade.accent.tinted(np.array(facade.accent.rgb) * 0.7)
-    return join(
-        [
-            panels(frames, REVEAL_M - 0.02, facade.frame, edges),
-            panels(stiles, REVEAL_M, facade.accent, stile_edges),
-            panels(np.array(fields), REVEAL_M + 0.015, dark),
-            panels(np.array([light]), REVEAL_M, GLASS),
-            reveals(opening, REVEAL_M, facade.wall),
-            boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), facade.base),
-        ]
-    )
+    return join([
+        panels(frames, REVEAL_M - 0.02, facade.frame, edges),
+        panels(stiles, REVEAL_M, facade.accent, stile_edges),
+        panels(np.array(fields), REVEAL_M + 0.015, dark),
+        panels(np.array([light]), REVEAL_M, GLASS),
+        reveals(opening, REVEAL_M, facade.wall),
+        boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), facade.base),
+    ])  # fmt: skip
 
 
 def shop_front(opening: Rectangle, facade: Facade, awning: bool) -> Shapes:
@@ -243,13 +241,9 @@ WALLS = (
     *[((0.30, 0.19, 0.15), Material.BRICK), ((0.55, 0.49, 0.39), Material.STONE)],
 )
 ACCENTS = (
-    (0.05, 0.13, 0.10),
-    (0.24, 0.03, 0.03),
-    (0.04, 0.07, 0.18),
-    (0.10, 0.055, 0.03),
-    (0.03, 0.03, 0.035),
-    (0.30, 0.17, 0.03),
-)
+    (0.05, 0.13, 0.10), (0.24, 0.03, 0.03), (0.04, 0.07, 0.18),
+    (0.10, 0.055, 0.03), (0.03, 0.03, 0.035), (0.30, 0.17, 0.03),
+)  # fmt: skip
 _PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)
 _LEDGE = ("-y", "+z", "-z", "+x", "-x")
 ROOFS = ((0.24, 0.10, 0.065), (0.13, 0.12, 0.125), (0.19, 0.09, 0.06))
@@ -324,10 +318,8 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
         places.append((x, 0.0, z))
     parts.append(window(facade.window_m, facade, fine).repeated(np.array(places)))
 
-    for z0, z1, reach in (
-        (facade.ground_m + 0.12, facade.ground_m + 0.3, 0.09),
-        (eaves - 0.32, eaves, 0.28),
-    ):
+    ledge = (facade.ground_m + 0.12, facade.ground_m + 0.3, 0.09)
+    for z0, z1, reach in (ledge, (eaves - 0.32, eaves, 0.28)):
         holes.append((0.0, z0, width, z1))
         parts.append(boxes((0.0, -reach, z0), (width, 0.0, z1), facade.trim, faces=_LEDGE))
     holes.append((0.0, BASE_M, width, 0.5))
@@ -355,8 +347,7 @@ def _ground_floor(
         return shop_front(opening, facade, bool(rng.random() < 0.45))
     pitch = width / count
     entry = int(rng.integers(count))
-    parts = []
-    places = []
+    parts, places = [], []
     for i in range(count):
         middle = (i + 0.5) * pitch
         if i == entry:
@@ -376,8 +367,7 @@ def _ground_floor(
 def _back(facade: Facade, width: float, eaves: float) -> Shapes:
     """Side and back walls, plain."""
     wall = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material, spacing=1.6)
-    low, high = (0.0, 0.0, BASE_M), (width, DEPTH_M, eaves)
-    return boxes(low, high, wall, faces=("+x", "-x", "+y"))
+    return boxes((0.0, 0.0, BASE_M), (width, DEPTH_M, eaves), wall, faces=("+x", "-x", "+y"))
 
 
 def _roof(rng: np.random.Generator, facade: Facade, width: float, eaves: float) -> Shapes:
@@ -414,13 +404,11 @@ def _flat_roof(facade: Facade, width: float, eaves: float) -> Shapes:
     top = eaves + 0.75
     gravel = Look((0.30, 0.29, 0.27), Class.BUILDING, Material.ASPHALT, spacing=1.6)
     parapet = Look(facade.wall.rgb, Class.BUILDING, facade.wall.material)
-    return join(
-        [
-            parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel),
-            boxes((0, 0, eaves), (width, 0.3, top), parapet, faces=("-y", "+y", "+x", "-x")),
-            boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), facade.trim, faces=_LEDGE),
-        ]
-    )
+    return join([
+        parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel),
+        boxes((0, 0, eaves), (width, 0.3, top), parapet, faces=("-y", "+y", "+x", "-x")),
+        boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), facade.trim, faces=_LEDGE),
+    ])  # fmt: skip
 
 
 def _garden(width: float) -> Shapes:
@@ -428,13 +416,11 @@ def _garden(width: float) -> Shapes:
     brick = Look((0.34, 0.17, 0.12), Class.BARRIER, Material.BRICK)
     hedge = Look((0.075, 0.13, 0.03), Class.VEGETATION, Material.LEAVES)
     stone = Look((0.52, 0.50, 0.46), Class.BARRIER)
-    return join(
-        [
-            boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=("-y", "+y", "+x", "-x")),
-            boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE),
-            boxes((0.05, 0.5, 0.0), (width - 0.05, 1.5, 1.75), hedge, edges=0),
-        ]
-    )
+    return join([
+        boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=("-y", "+y", "+x", "-x")),
+        boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE),
+        boxes((0.05, 0.5, 0.0), (width - 0.05, 1.5, 1.75), hedge, edges=0),
+    ])  # fmt: skip
 
 
 def _second_row(layout: Layout) -> Shapes:
@@ -451,15 +437,13 @@ def _second_row(layout: Layout) -> Shapes:
             columns = np.arange(1.2, width - 1.6, 2.6)
             holes = [(w, z, w + 1.2, z + 1.5) for z in (1.2, 4.2) for w in columns]
             front, edges = cut((0.0, BASE_M, width, height), holes)
-            built = join(
-                [
-                    panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
-                    panels(np.array(holes), 0.1, _PANE),
-                    *[reveals(h, 0.1, wall) for h in holes],
-                    _back(facade, width, height),
-                    _roof(rng, facade, width, height),
-                ]
-            )
+            built = join([
+                panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
+                panels(np.array(holes), 0.1, _PANE),
+                *[reveals(h, 0.1, wall) for h in holes],
+                _back(facade, width, height),
+                _roof(rng, facade, width, height),
+            ])  # fmt: skip
             corner = (x if side > 0 else x + width, y, 0.0)
             parts.append(built.moved(corner, 0.0 if side > 0 else np.pi))
             x += width + rng.uniform(4, 12)
@@ -482,9 +466,8 @@ ZEBRA_CLEAR_M = 3.6  # of a zebra crossing's middle, where no other mark may lie
 
 def build_ground(layout: Layout) -> Shapes:
     """Everything that lies on the ground."""
-    return join(
-        [*_carriageway(layout), *_pavements(layout), *_cross_streets(layout), _land(layout)]
-    )
+    parts = [*_carriageway(layout), *_pavements(layout), *_cross_streets(layout)]
+    return join([*parts, _land(layout)])
 
 
 def _sloped(
@@ -616,8 +599,7 @@ def _land(layout: Layout) -> Shapes:
     outer = (west - reach, -reach, east + reach, reach)
     pieces, edges = cut(outer, holes)
     # Only the rims that border something else need to be crisp.
-    edges &= np.uint8(V0 | V1)
-    return _sloped(pieces, 0.0, TERRAIN_Z_M, GRASS, edges)
+    return _sloped(pieces, 0.0, TERRAIN_Z_M, GRASS, edges & np.uint8(V0 | V1))
 
 
 # ---- A person in mid-stride: tubes and ellipsoids, one rigid body --------------------------------
@@ -780,16 +762,10 @@ def _woods(rng: np.random.Generator, layout: Layout) -> Shapes:
 # Car frame: x forward, y left, z up, origin on the ground under the middle.
 
 PAINTS = (
-    (0.42, 0.42, 0.43),
-    (0.05, 0.055, 0.06),
-    (0.62, 0.62, 0.61),
-    (0.30, 0.02, 0.02),
-    (0.03, 0.07, 0.20),
-    (0.16, 0.17, 0.18),
-    (0.05, 0.13, 0.09),
-    (0.36, 0.26, 0.06),
-    (0.20, 0.29, 0.36),
-)
+    (0.42, 0.42, 0.43), (0.05, 0.055, 0.06), (0.62, 0.62, 0.61),
+    (0.30, 0.02, 0.02), (0.03, 0.07, 0.20), (0.16, 0.17, 0.18),
+    (0.05, 0.13, 0.09), (0.36, 0.26, 0.06), (0.20, 0.29, 0.36),
+)  # fmt: skip
 CAR_SPACING = 0.6  # cars draw the eye
 CAR_GLASS = Look((0.012, 0.014, 0.016), Class.VEHICLE, Material.PAINT, 0.8, CAR_SPACING)
 TYRE = Look((0.022, 0.022, 0.023), Class.VEHICLE, spacing=CAR_SPACING)
