@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,11 +23,12 @@ from batch_scenes import (
 
 from augment.cameras import Frame
 from augment.dataset import SceneDataset
+from augment.effects import share_effects
 from augment.effects.snow import support as beds
 from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
-from augment.jobs.prepare import store_snow_supports
 from augment.jobs.render_job import JobResult, RenderJob, run_job
+from augment.memo import memo_of
 from recipes.schema import Recipe
 from recipes.snow import Snow
 
@@ -71,7 +73,7 @@ def test_a_bed_is_found_for_all_cameras_before_any_file(placements, tmp_path: Pa
     placements.before = lambda: placements.append(files_of(tmp_path))
     job = RenderJob("fake:street", [snowy()], tmp_path, frames=[1], cameras=["front"])
     result = run(job)
-    assert result.written == 1 and result.timings["place"] > 0
+    assert result.written == 1 and result.timings["prepare"] > 0
     before, (settings, cameras) = placements
     assert before == []
     assert settings == PlacementSettings(cell_m=0.05, max_slope_deg=50.0)
@@ -145,13 +147,14 @@ def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
 
 def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path) -> None:
     """One scene object, two output folders: workers of the second job need a file there."""
-    scene = open_fake("fake:street")
+    scene, key = open_fake("fake:street"), ("snow support", PlacementSettings())
     for name in "ab":
-        (bed,) = store_snow_supports(scene, [snowy()], tmp_path / name)
-        assert Path(bed.path).parent == tmp_path / name and Path(bed.path).is_file()
+        share_effects(scene, [snowy()], folder=tmp_path / name)
+        stored = memo_of(scene).shared()[key]
+        assert Path(stored.path).parent == tmp_path / name and Path(stored.path).is_file()
     assert len(placements) == 1
     other = open_fake("fake:street")
-    bed.take_over(other)
+    memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
     placements.before = pytest.fail
     same, again = (beds.support_of(s, PlacementSettings()) for s in (scene, other))
     assert torch.equal(same.ground.centers_m, again.ground.centers_m)
@@ -160,7 +163,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
 def test_a_folder_that_cannot_be_written_is_named(placements, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        store_snow_supports(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
+        share_effects(open_fake("fake:street"), [snowy()], folder=tmp_path / "file" / "state")
 
 
 def test_live_samples_share_one_search(placements) -> None:

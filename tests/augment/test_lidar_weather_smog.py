@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from augment.effects.lidar import ATTENUATED, LOST, SCATTERED, UNCHANGED
-from augment.effects.lidar.beam import (
-    LidarModel,
-    scatter_before,
-    soft_echo,
-    soft_response,
-    wavelength_factor,
-    weathered_sweep,
-)
+from augment.effects.lidar.beam import LidarModel
+from augment.effects.lidar.sweep import weathered_sweep
+from augment.effects.smog import scatter_before, soft_echo, soft_response, wavelength_factor
 from augment.render.fog import Fog, optical_depth_of_arrays
 from recipes.schema import Smog
 from recipes.smog import KOSCHMIEDER

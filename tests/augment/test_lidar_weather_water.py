@@ -10,14 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water, water_reflectance
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import LOST, MOVED, SCATTERED, UNCHANGED
-from augment.effects.lidar.beam import (
-    ABSORPTION_905_PER_M,
-    meet_water,
-    water_reflectance,
-    weathered_sweep,
-)
+from augment.effects.lidar.sweep import weathered_sweep
 from recipes.flood import Flood, Waves
 from tests.lidar_sweeps import beams, ground_points, recipe, some_points, street, sweep_of
 

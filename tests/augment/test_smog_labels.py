@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 from batch_scenes import ORIGIN_M
-from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera
+from box_views import CAR_M, UPRIGHT, boxes_at_random, make_boxes, make_camera, placed
 
 from augment.boxes import BOTTOM_M, NOT_COUNTED, SIDES_M
-from augment.effects import smog
 from augment.effects.smog import box_transmittance
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
-from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth, optical_depth_of_arrays
 
 GREY = (0.7, 0.7, 0.7)
 THICK = Fog(0.05, GREY)
@@ -32,7 +31,7 @@ def wall(depth_m: float) -> np.ndarray:
 
 
 def measure(boxes: Boxes, medium=THICK, depth_m=None, camera=None, **options):
-    return box_transmittance(boxes, ORIGIN_M, camera or make_camera(), medium, depth_m, **options)
+    return box_transmittance(placed(boxes), camera or make_camera(), medium, depth_m, **options)
 
 
 def test_a_box_at_a_known_distance() -> None:
@@ -62,7 +61,7 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None
     rays = camera.ray_directions(torch.float64)
     z = torch.from_numpy(depth).double()
     distance, height = z * rays.norm(dim=-1), EYE_Z_M + z * rays[..., 2]
-    through = torch.exp(-smog.optical_depth(medium, distance, EYE_Z_M, height)).numpy()
+    through = torch.exp(-optical_depth(medium, distance, EYE_Z_M, height)).numpy()
     for k, size in enumerate(boxes.sizes_m):
         low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
         low[2] = -size[2] / 2 + min(BOTTOM_M, size[2] / 4)
@@ -78,7 +77,7 @@ def test_the_mean_is_that_over_the_pixels_that_show_the_box(medium: Fog) -> None
         corners = (signs * size) @ rotation.T + boxes.centers_m[k] - ORIGIN_M
         points = np.concatenate([corners, boxes.centers_m[k : k + 1] - ORIGIN_M])
         distance = np.linalg.norm(points - camera.centre.numpy(), axis=1)
-        tau = smog.optical_depth(
+        tau = optical_depth(
             medium, torch.from_numpy(distance), EYE_Z_M, torch.from_numpy(points[:, 2].copy())
         )
         # The origin costs 5e-10 m, as above.
@@ -93,7 +92,7 @@ def test_the_optical_depth_is_that_of_the_image(medium: Fog) -> None:
     z[:3] = EYE_Z_M, EYE_Z_M + 1e-9, EYE_Z_M - 3e-5
     got = optical_depth_of_arrays(medium, distance, EYE_Z_M, z)
     tensors = torch.from_numpy(distance), torch.from_numpy(z)
-    expected = smog.optical_depth(medium, tensors[0], EYE_Z_M, tensors[1]).numpy()
+    expected = optical_depth(medium, tensors[0], EYE_Z_M, tensors[1]).numpy()
     # The image's takes a straight line below 1e-4, which float32 does not tell from the curve.
     np.testing.assert_allclose(got, expected, rtol=2e-9)
 
