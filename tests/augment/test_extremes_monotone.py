@@ -21,8 +21,7 @@ from hypothesis import strategies as st
 
 from augment.cameras import Camera
 from augment.effects.snow.cells import SnowCells
-from augment.effects.snow.layer import find_depths, surface_heights
-from augment.effects.snow.profile import profile_of
+from augment.effects.snow.layer import find_depths, profile_of, surface_heights
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import support_of
 from augment.plan import make_plan

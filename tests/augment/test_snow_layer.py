@@ -10,10 +10,17 @@ import pytest
 import torch
 
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.layer import OPACITY, build_snow_layer, find_depths
+from augment.effects.snow.kernels import BARE_M, FILM_M
+from augment.effects.snow.layer import (
+    OPACITY,
+    PRESSED,
+    build_snow_layer,
+    find_depths,
+    profile_of,
+    share_covered,
+)
 from augment.effects.snow.light import Illumination
 from augment.effects.snow.near_camera import SnowLayers
-from augment.effects.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize

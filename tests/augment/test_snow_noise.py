@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.snow.layer import find_depths
-from augment.effects.snow.profile import (
+from augment.effects.snow.layer import (
     field_of,
+    find_depths,
     gradient_noise,
     heights_of,
     mottle_of,

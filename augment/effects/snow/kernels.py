@@ -15,23 +15,34 @@ import numpy as np
 from numba import prange
 
 from augment.effects.snow.cells import OPEN_EDGE
-from augment.effects.snow.profile import (
-    BARE_M,
-    CRUMBLED,
-    DEVIATION,
-    FILM_M,
-    MIX_A,
-    MIX_B,
-    PILED,
-    SCOURED,
-    SHELTER,
-    STEEPEST,
-    STEP_X,
-    STEP_Y,
-    WATER_RIM_M,
-)
 from augment.render.cpu.jit import inner, kernel
 from augment.render.sh import SH_C0
+
+# ---- Noise ---------------------------------------------------------------------------------------
+
+# Standard deviation of the noise over the plane where the gradients' components are uniform in
+# [-1, 1]: the mean over a square of 4 w^2 (x^2 + y^2) / 3, w the blend of a corner at (0, 0).
+DEVIATION = 0.17612713
+MIX_A, MIX_B = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # splitmix64 (Steele et al. 2014)
+STEP_X, STEP_Y = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F  # odd, far apart in all their bits
+_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
+_LOW, _UNIT = np.uint64(0xFFFFFFFF), 2.0**-53
+_S11, _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (11, 27, 30, 31, 32))
+
+
+@inner()
+def _mix(bits):
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    return bits ^ (bits >> _S31)
+
+
+@inner()
+def _uniform(bits, number):
+    """The number-th random number of these bits, in [-1, 1)."""
+    bits = _mix(bits + np.uint64(number + 1) * _X)
+    return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
+
 
 # ---- Discs of snow on cells ----------------------------------------------------------------------
 
@@ -56,23 +67,6 @@ SHADED_HOLLOW, MAX_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, a
 THIN_M, THIN_LOSS = 0.005, 0.42  # depth through which the ground darkens snow, and how much
 PACKED_SHARE = 0.6  # brightness of packed snow, of fresh snow's
 DARKEST, BRIGHTEST = 0.35, 0.8  # light on the bare surface where the sun is out of sight, and full
-_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
-_LOW, _UNIT = np.uint64(0xFFFFFFFF), 2.0**-53
-_S11, _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (11, 27, 30, 31, 32))
-
-
-@inner()
-def _mix(bits):
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    return bits ^ (bits >> _S31)
-
-
-@inner()
-def _uniform(bits, number):
-    """The number-th random number of these bits, in [-1, 1)."""
-    bits = _mix(bits + np.uint64(number + 1) * _X)
-    return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
 
 
 @kernel
@@ -492,7 +486,15 @@ def split(chosen, splits, firsts, view, noise, discs, fine):
                 s += 1
 
 
-# ---- The snow's depth, as `profile` defines it ---------------------------------------------------
+# ---- The snow's depth, as `layer.heights_of` defines it ------------------------------------------
+
+BARE_M = 0.002  # less snow than this is none
+FILM_M = 0.004  # what wheels leave at least
+CRUMBLED = 0.8  # of the mottling noise, by which a track's sides are uneven
+WATER_MARGIN_M, WATER_RIM_M = 0.005, 0.02  # bare above the water, and thinner above that
+SHELTER = 0.4  # what the foot of an obstacle adds to the noise of the patches, which it keeps
+PILED, SCOURED = 0.8, 0.4  # by wind that blows at an obstacle, and off one
+STEEPEST = 1.4  # of the logarithm of the drift: within four times the depth, or a quarter of it
 
 
 @inner()
