@@ -24,11 +24,12 @@ from batch_scenes import (
 )
 
 from augment.cameras import Frame
+from augment.effects import share_effects
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
 from augment.jobs.manifest import read_manifest
-from augment.jobs.prepare import store_maps, style_to_apply
 from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
+from augment.memo import memo_of
 from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.load import load_recipe
@@ -94,7 +95,7 @@ def test_maps_are_found_once_for_all_images_before_any_file(searches, tmp_path: 
     recipes = [styled(0.5), styled(0.5, 1), styled(0.25, 2), make_recipe("clear")]
     job = RenderJob("fake:street", recipes, tmp_path, frames=[1], cameras=["front"])
     result = run(job)
-    assert result.written == 4 and result.timings["style"] > 0
+    assert result.written == 4 and result.timings["prepare"] > 0
     before, (first, cameras), _, (second, _) = searches
     assert before == [] and (first, second) == (recipes[0].style, recipes[2].style)
     assert cameras is None, "a selection does not count"
@@ -109,16 +110,15 @@ def test_maps_are_found_once_for_all_images_before_any_file(searches, tmp_path: 
 def test_a_style_that_changes_nothing_needs_no_maps(searches, tmp_path: Path, style) -> None:
     searches.before = pytest.fail
     result = run(RenderJob("fake:street", [make_recipe(style=style)], tmp_path))
-    assert result.written == 8 and "style" not in result.timings
-    assert style_to_apply(make_recipe(style=style)) is None
+    assert result.written == 8
 
 
-def test_a_camera_path_has_maps_of_its_own_however_many_styles(searches, tmp_path: Path) -> None:
-    """More than a scene remembers; and the caller's scene goes on with its own cameras'."""
+def test_a_camera_path_has_maps_of_its_own(searches, tmp_path: Path) -> None:
+    """And the caller's scene goes on with its own cameras'."""
     scene, recorded = open_fake("fake:street"), make_frame(1)
     cameras = {"front": make_camera("front", recorded.timestamp_ns, 0.5)}
     path = [Frame(1, recorded.timestamp_ns, recorded.world_from_ego, cameras)]
-    count = scene_maps.MAX_REMEMBERED + 3
+    count = 9
     recipes = [styled(0.1 * (k + 1), k) for k in range(count)]
     load = {"scene_loader": lambda _uri: scene}
     run(RenderJob("fake:street", recipes, tmp_path / "path", camera_path=path), **load)
@@ -129,17 +129,15 @@ def test_a_camera_path_has_maps_of_its_own_however_many_styles(searches, tmp_pat
 
 
 def test_maps_travel_with_all_their_bits(searches, tmp_path: Path) -> None:
-    (stored,) = store_maps(open_fake("fake:street"), [styled(1 / 3)])
-    stored = pickle.loads(pickle.dumps(stored))
-    other = open_fake("fake:street")
-    stored.take_over(other)
+    scene, other, recipe = *(open_fake("fake:street") for _ in range(2)), styled(1 / 3)
+    share_effects(scene, [recipe])
+    memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
     searches.before = pytest.fail
-    again = scene_maps.style_maps(other, stored.style)
+    again = scene_maps.style_maps(other, recipe.style)
     expected = make_maps(1 / 3)
     for name in ("splats", "sky", "picture"):
         assert torch.equal(getattr(again, name), getattr(expected, name))
-    stored.take_over(other)
-    assert scene_maps.style_maps(other, stored.style) is again, "what is made of it can be kept"
+    assert scene_maps.style_maps(other, recipe.style) is again, "what is made of it can be kept"
 
 
 def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Path) -> None:
@@ -230,17 +228,22 @@ def test_files_keep_their_names_but_for_collisions() -> None:
             ["x", "mask-x", "checkpoint-mask-x"],
         ),
     ):
-        assert list(stored_names(Style(**files)).values()) == [f"style/{name}" for name in names]
+        assert list(stored_names(Recipe(style=Style(**files))).values()) == [
+            f"style/{name}" for name in names
+        ]
 
 
 def test_unsafe_names_become_safe_ones_and_then_stay() -> None:
+    def stored(image: str) -> str:
+        return stored_names(Recipe(style=Style(image=image)))["style.image"]
+
     for name in ("été 3.JPG", "..png", "-x.png", "a.b c", "a" * 200, "b" * 200 + ".png"):
-        first = stored_names(Style(image=f"/photos/{name}"))["image"]
+        first = stored(f"/photos/{name}")
         assert first != f"style/{name}" and first.isascii() and " " not in first
         assert first.endswith((".JPG", ".png")) == name.endswith((".JPG", ".png"))
         assert len(first) < 140
-        assert stored_names(Style(image=f"/out/{first}"))["image"] == first
-        assert stored_names(Style(image=f"/photos/x{name}"))["image"] != first
+        assert stored(f"/out/{first}") == first
+        assert stored(f"/photos/x{name}") != first
 
 
 def test_a_picture_under_another_name_is_the_same_style(searches, tmp_path: Path) -> None:

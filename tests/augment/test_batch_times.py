@@ -28,9 +28,7 @@ def test_who_is_busiest_bounds_the_job() -> None:
     assert bound(render=4.0, held=6.0, encode=15.0, write=4.0).bound_by == "encoding"
     assert bound(render=4.0, held=6.0, encode=5.0, write=14.0).bound_by == "writing to disk"
     assert bound(render=4.0, held=6.0, lidar=19.0).bound_by == "LiDAR"
-    assert bound(render=2.0, held=0.0, open=1.0, place=6.0).bound_by == (
-        "looking where snow can lie"
-    )
+    assert bound(render=2.0, held=0.0, open=1.0, prepare=6.0).bound_by == "preparing effects"
     # Nothing of the job's own explains where four fifths went.
     assert (
         bound(render=2.0, held=0.0, open=1.0).bound_by == "workers that start or have nothing to do"
