@@ -534,8 +534,8 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     expected = {effect.name for effect in effects.EFFECTS if effect.of(recipe) is not None}
     if set(view.effects) != expected:
         raise ValueError(
-            f"the renderer returned what labels of {', '.join(sorted(view.effects)) or 'no effect'} "
-            f"are measured from, for a recipe with {', '.join(sorted(expected)) or 'no effect'}"
+            f"the renderer returned the labels of {', '.join(view.effects) or 'no effect'} for a "
+            f"recipe with {', '.join(sorted(expected)) or 'no effect'}"
         )
     output, masks = recipe.output, {e.mask for e in effects.EFFECTS if e.name in expected}
     requested = {

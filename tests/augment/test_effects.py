@@ -124,7 +124,7 @@ def test_jobs_datasets_and_reports_have_its_columns_masks_and_labels(job, tmp_pa
     assert (boxes["visibility"] <= boxes["clear_fraction"] + 1e-9).all()
     assert sample["paths"]["box_dust"].endswith("labels/dust.parquet")
     page = write_report(job, tmp_path / "report.html").path.read_text()
-    assert "Half tinted at" in page
+    assert "dust 25 m" in page and "Dust mask" in page
 
 
 def test_a_sweep_loses_light_to_it(job):
