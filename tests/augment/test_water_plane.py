@@ -16,6 +16,7 @@ from augment.effects.flood.water_plane import (
     mirrored_window,
     plane_depth,
     plane_window,
+    ray_z,
 )
 from augment.geometry import rigid, rotmat_from_quat
 from tests.scenes import camera_ahead
@@ -42,6 +43,12 @@ def test_the_window_is_the_least_that_holds_all_rays_that_meet_the_plane():
             first, last = (int(columns.min()), int(rows.min())), (columns.max(), rows.max())
             expected = Window(*first, int(last[0]) + 1, int(last[1]) + 1)
         assert plane_window(camera, level_z_m) == expected
+
+
+def test_a_ray_s_fall_is_its_direction_s_to_the_bit():
+    for seed in range(6):
+        camera = turned_camera(seed, position=(3.0, -2.0, 5.0))
+        assert torch.equal(ray_z(camera), camera.ray_directions(torch.float64)[..., 2])
 
 
 def test_depths_reach_the_plane():

@@ -40,7 +40,7 @@ COVERED, THICKNESS_M, THICKNESS = map(
 HIDDEN_PX, NEAR_M = float(kernels.HIDDEN_PX), float(kernels.NEAR_M)
 AGREEING, EDGE = float(kernels.AGREEING), float(kernels.EDGE)
 
-SAMPLES = 1 << 22  # that the definition looks at at a time; rays go on by at least MIN_PX
+SAMPLES = 1 << 23  # that the definition looks at at a time; rays go on by at least MIN_PX
 MIN_PX = 16
 ROWS = 4  # rows of rays a thread takes at a time
 
@@ -215,7 +215,7 @@ def _march(rays: _Rays, solid: Tensor) -> tuple[Tensor, Tensor]:
     clean = torch.ones_like(rays.to_sky)  # never was behind anything
     going, first = torch.arange(len(rays.x), device=solid.device), 1
     while len(going):
-        count = max(SAMPLES // len(going), MIN_PX)
+        count = min(max(SAMPLES // len(going), MIN_PX), max(width, height) + 2)
         r = rays.select(going[:, None])
         step = torch.arange(first, first + count, device=solid.device)  # pixels' centres
         over = step - 0.5 >= r.end

@@ -523,22 +523,21 @@ def _run_kernel(water: Water) -> Tensor:
     front, distance, weight = None, water.cover, water.cover
     if screen is not None:
         front, distance, weight = screen.layer, screen.distance, screen.weight
+    x, y, variance = map(_array, (field.normal_x, field.normal_y, field.slope_variance))
+    pixels = kernels.Pixels(
+        *image_coordinates(camera),
+        axes,
+        _array(water.cover),
+        *window_offset(water.bed.camera, camera),
+    )
     out = np.empty((camera.height, camera.width, 3), np.float32)
     with kernel_threads(ROWS):
         kernels.shade(
-            kernels.Pixels(
-                *image_coordinates(camera),
-                axes,
-                _array(water.cover),
-                *window_offset(water.bed.camera, camera),
-            ),
-            kernels.Normals(
-                *(_array(part) for part in (field.normal_x, field.normal_y, field.slope_variance)),
-                np.float32(limit),
-            ),
+            pixels,
+            kernels.Normals(x, y, variance, np.float32(limit)),
             _image(water.bed),
             _image(water.mirror),
-            _mips(water.mirror, bool((field.slope_variance >= limit).any())),
+            _mips(water.mirror, bool((variance >= limit).any())),
             _image(front),
             kernels.Rays(_array(distance), _array(weight)),
             kernels.Faces(texels.numpy(), np.uint64(size)),

@@ -676,11 +676,10 @@ class Faces(NamedTuple):
     size: np.uint64
 
 
-@kernel
-def shade(pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out):
-    """Water of the pixels of a camera into out [H, W, 3]. front: what `rays` run through; only one
-    that is not empty counts, as of the mirror. water: numbers of `Medium`.
-    """
+@inner()
+def _shade_row(
+    i, pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out
+):
     u, v, axes, cover, left, top = pixels
     normal_x, normal_y, variance, smooth_variance = normals
     bed_view, bed_rgb, bed_alpha, bed_depth = bed_image
@@ -690,187 +689,196 @@ def shade(pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky
     front_distance, front_weight = rays
     faces, size = sky
     has_mirror, has_front = mirror_alpha.size > 0, front_alpha.size > 0
-    height, width = cover.shape
-    for i in prange(height):
-        bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
-        medium = _medium(water)
-        q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
-        places, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
-        starts = np.zeros(16, np.int64)
-        smooth_count, rough_count, j = U(0), U(0), 0
-        bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
-        own_row = i + top
-        row_inside = own_row >= 0 and own_row < np.int64(bed.height)
-        far = np.float64(F(FARTHEST))
-        while True:
-            while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
-                # The order of these sums is that of Camera.ray_directions: the sign has to agree.
-                fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
-                if not (fall < 0.0 and cover[i, j] <= F(HIDDEN_COVER)):
-                    plain = medium.airlight if medium.fog_per_m > ZERO else medium.rgb
-                    met = ONE if fall < 0.0 else ZERO
-                    for c in range(3):
-                        out[i, j, c] = met * plain[c]
-                    j += 1
-                    continue
-                spread = variance[i, j]
-                if spread >= smooth_variance:
-                    n, p = LIST + rough_count, U(STRIP) + rough_count
-                    rough_count += U(1)
-                else:
-                    n = p = smooth_count
-                    smooth_count += U(1)
-                q[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
-                q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
-                q[DZ + n] = F(fall)
-                q[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
-                q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
-                q[OWN_DEPTH + n] = -ONE
-                own[p] = 0
-                column = j + left
-                if row_inside and column >= 0 and column < np.int64(bed.width):
-                    pixel = U(own_row) * bed.width + U(column)
-                    if bed_alpha[pixel] >= SOLID:
-                        own[p] = np.int64(pixel)
-                        q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
-                if has_front:
-                    d = front_distance[i, j]
-                    q[DISTANCE + n] = d if d < F(np.inf) else -ONE
-                    q[TRUST + n] = front_weight[i, j]
-                places[p] = j
+    width = cover.shape[1]
+    bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
+    medium = _medium(water)
+    q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
+    places, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+    starts = np.zeros(16, np.int64)
+    smooth_count, rough_count, j = U(0), U(0), 0
+    bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
+    own_row = i + top
+    row_inside = own_row >= 0 and own_row < np.int64(bed.height)
+    far = np.float64(F(FARTHEST))
+    while True:
+        while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
+            # The order of these sums is that of Camera.ray_directions: the sign has to agree.
+            fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
+            if not (fall < 0.0 and cover[i, j] <= F(HIDDEN_COVER)):
+                plain = medium.airlight if medium.fog_per_m > ZERO else medium.rgb
+                met = ONE if fall < 0.0 else ZERO
+                for c in range(3):
+                    out[i, j, c] = met * plain[c]
                 j += 1
-            # The fuller list first, so that lists are short at a row's end only.
-            rough = rough_count > smooth_count
-            n = rough_count if rough else smooth_count
-            if n == U(0):
-                break
-            base, start, taps = U(0), U(0), U(1)
-            if rough:
-                base, start, taps = LIST, U(STRIP), U(3)
-                rough_count = U(0)
+                continue
+            spread = variance[i, j]
+            if spread >= smooth_variance:
+                n, p = LIST + rough_count, U(STRIP) + rough_count
+                rough_count += U(1)
             else:
-                smooth_count = U(0)
-            for last in range(n, (n + U(7)) & EIGHTS):  # the last pixel again in lanes left over
-                own[start + last] = own[start + n - U(1)]
-                for line in range(U(10)):
-                    at = base + line * U(STRIP)
-                    q[at + last] = q[at + n - U(1)]
-            for first in range(U(0), n, LANES):
-                at = base + first
-                one, zero = v8.splat(ONE), v8.splat(ZERO)
-                dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
-                along = v8.load(q, ALONG + at)
-                px, py = along * dx, along * dy
-                length = _norm(dx, dy, dz)
-                inverse = one / length
-                vx, vy = v8.negate(dx) * inverse, v8.negate(dy) * inverse
-                view = vx, vy, v8.negate(dz) * inverse
-                near = v8.splat(medium.fog_per_m) * along * length
-                nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
-                upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(F(STEEPEST)))
-                upright = one / v8.sqrt(upright)
-                sx, sy = nx * upright, ny * upright
-                normal, c, inside, share, ray = _facet(sx, sy, view, medium)
-                # Through the surface.
-                deep = _splat3(medium.rgb)
-                if medium.fog_per_m > ZERO:
-                    deep = _blend3(_exponential(near), deep, _splat3(medium.airlight))
-                below = deep
-                own_depth = v8.load(q, OWN_DEPTH + at)
-                bends = medium.index != ONE
-                tx, ty, steep = zero, zero, one / view[2]
+                n = p = smooth_count
+                smooth_count += U(1)
+            q[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
+            q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
+            q[DZ + n] = F(fall)
+            q[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
+            q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
+            q[OWN_DEPTH + n] = -ONE
+            own[p] = 0
+            column = j + left
+            if row_inside and column >= 0 and column < np.int64(bed.width):
+                pixel = U(own_row) * bed.width + U(column)
+                if bed_alpha[pixel] >= SOLID:
+                    own[p] = np.int64(pixel)
+                    q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
+            if has_front:
+                d = front_distance[i, j]
+                q[DISTANCE + n] = d if d < F(np.inf) else -ONE
+                q[TRUST + n] = front_weight[i, j]
+            places[p] = j
+            j += 1
+        # The fuller list first, so that lists are short at a row's end only.
+        rough = rough_count > smooth_count
+        n = rough_count if rough else smooth_count
+        if n == U(0):
+            break
+        base, start, taps = U(0), U(0), U(1)
+        if rough:
+            base, start, taps = LIST, U(STRIP), U(3)
+            rough_count = U(0)
+        else:
+            smooth_count = U(0)
+        for last in range(n, (n + U(7)) & EIGHTS):  # the last pixel again in lanes left over
+            own[start + last] = own[start + n - U(1)]
+            for line in range(U(10)):
+                at = base + line * U(STRIP)
+                q[at + last] = q[at + n - U(1)]
+        for first in range(U(0), n, LANES):
+            at = base + first
+            one, zero = v8.splat(ONE), v8.splat(ZERO)
+            dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
+            along = v8.load(q, ALONG + at)
+            px, py = along * dx, along * dy
+            length = _norm(dx, dy, dz)
+            inverse = one / length
+            vx, vy = v8.negate(dx) * inverse, v8.negate(dy) * inverse
+            view = vx, vy, v8.negate(dz) * inverse
+            near = v8.splat(medium.fog_per_m) * along * length
+            nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
+            upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(F(STEEPEST)))
+            upright = one / v8.sqrt(upright)
+            sx, sy = nx * upright, ny * upright
+            normal, c, inside, share, ray = _facet(sx, sy, view, medium)
+            # Through the surface.
+            deep = _splat3(medium.rgb)
+            if medium.fog_per_m > ZERO:
+                deep = _blend3(_exponential(near), deep, _splat3(medium.airlight))
+            below = deep
+            own_depth = v8.load(q, OWN_DEPTH + at)
+            bends = medium.index != ONE
+            tx, ty, steep = zero, zero, one / view[2]
+            if bends:
+                tx, ty, steep = _refract(normal, c, inside, view, medium)
+            thick = own_depth * steep * v8.splat(medium.least_extinction)
+            clear = v8.both(
+                v8.at_least(own_depth, zero), v8.greater(v8.splat(F(MAX_OPTICAL_DEPTH)), thick)
+            )
+            if _any(clear):
+                found = v8.select(clear, one, zero)
+                v8.store(s, FOUND, zero)
+                depth = own_depth
                 if bends:
-                    tx, ty, steep = _refract(normal, c, inside, view, medium)
-                thick = own_depth * steep * v8.splat(medium.least_extinction)
-                clear = v8.both(
-                    v8.at_least(own_depth, zero), v8.greater(v8.splat(F(MAX_OPTICAL_DEPTH)), thick)
-                )
-                if _any(clear):
-                    found = v8.select(clear, one, zero)
-                    v8.store(s, FOUND, zero)
-                    depth = own_depth
-                    if bends:
-                        depth = _search_bed(
-                            s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium
-                        )
-                    depth = _fetch_bed(s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed)
-                    r, g, b, a = _fetched(s)
-                    way = depth * steep
-                    absorbed = (
-                        _absorb(r, a, deep[0], way, medium.extinction[0]),
-                        _absorb(g, a, deep[1], way, medium.extinction[1]),
-                        _absorb(b, a, deep[2], way, medium.extinction[2]),
+                    depth = _search_bed(
+                        s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium
                     )
-                    below = _select3(clear, absorbed, deep)
-                sum_r, sum_g, sum_b = below
-                if bends:
-                    # Mirrored rays and shares of the slopes.
-                    if rough:
-                        share = v8.splat(F(2 / 3)) * share
-                    _store_tap(s, U(0), share, ray)
-                    if rough:
-                        flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
-                        spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
-                        for tap in range(U(1), U(3)):
-                            sign = ONE if tap == U(1) else -ONE
-                            offset8 = v8.splat(sign) * spread8
-                            _, _, _, share, ray = _facet(
-                                sx + offset8 * vx, sy + offset8 * vy, view, medium
-                            )
-                            _store_tap(s, tap, v8.splat(F(1 / 6)) * share, ray)
-                    # What stands above the water, where the image shows it.
-                    image, weight = (zero, zero, zero, zero), zero
-                    needs_mirror = has_mirror
-                    if has_front and not rough:
-                        column, row, weight = _find_in_image(
-                            s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
-                            front_alpha, front_depth, front, medium,
-                        )  # fmt: skip
-                        if _any(v8.greater(weight, zero)):
-                            image = _fetch(s, column, row, front_rgb, front_alpha, front)
-                        rest = _any(v8.greater(one - weight, v8.splat(TINY)))
-                        needs_mirror = has_mirror and rest
-                    if needs_mirror:
-                        _find_in_mirror(
-                            s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror, medium
+                depth = _fetch_bed(s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed)
+                r, g, b, a = _fetched(s)
+                way = depth * steep
+                absorbed = (
+                    _absorb(r, a, deep[0], way, medium.extinction[0]),
+                    _absorb(g, a, deep[1], way, medium.extinction[1]),
+                    _absorb(b, a, deep[2], way, medium.extinction[2]),
+                )
+                below = _select3(clear, absorbed, deep)
+            sum_r, sum_g, sum_b = below
+            if bends:
+                # Mirrored rays and shares of the slopes.
+                if rough:
+                    share = v8.splat(F(2 / 3)) * share
+                _store_tap(s, U(0), share, ray)
+                if rough:
+                    flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
+                    spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
+                    for tap in range(U(1), U(3)):
+                        sign = ONE if tap == U(1) else -ONE
+                        offset8 = v8.splat(sign) * spread8
+                        _, _, _, share, ray = _facet(
+                            sx + offset8 * vx, sy + offset8 * vy, view, medium
                         )
-                    if needs_mirror and rough:
-                        _choose_levels(s, starts, _level(s, mirror_sizes), mirror_sizes)
-                    for tap in range(taps):
-                        t8 = tap * LANES
-                        seen = zero, zero, zero, zero
-                        if needs_mirror:
-                            column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
-                            if rough:
-                                lower = _fetch_level(s, starts, U(0), column, row, mirror_mips)
-                                upper = _fetch_level(s, starts, LANES, column, row, mirror_mips)
-                                seen = _blend4(v8.load(s, SHARE_ABOVE), upper, lower)
-                            else:
-                                seen = _fetch(s, column, row, mirror_rgb, mirror_alpha, mirror)
-                        if has_front:
-                            seen = _blend4(weight, image, seen)
-                        r, g, b, a = seen
-                        transmittance = one - a
-                        shines = v8.greater(transmittance, v8.splat(F(FAINT)))
-                        whole = one / v8.maximum(a, v8.splat(HALF))
-                        color = r * whole, g * whole, b * whole
-                        if _any(shines):
-                            rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)
-                            behind = _sky(s, faces, size, rx, ry, rz, near, medium)
-                            before = (
-                                r + transmittance * behind[0],
-                                g + transmittance * behind[1],
-                                b + transmittance * behind[2],
-                            )
-                            color = _select3(shines, before, color)
-                        share = v8.load(s, SHARE + t8)
-                        sum_r = sum_r + share * (color[0] - below[0])
-                        sum_g = sum_g + share * (color[1] - below[1])
-                        sum_b = sum_b + share * (color[2] - below[2])
-                v8.store(s, R, sum_r)
-                v8.store(s, G, sum_g)
-                v8.store(s, B, sum_b)
-                for k in range(min(LANES, n - first)):
-                    pixel = places[start + first + k]
-                    out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
-                    out[i, pixel, 2] = s[B + k]
+                        _store_tap(s, tap, v8.splat(F(1 / 6)) * share, ray)
+                # What stands above the water, where the image shows it.
+                image, weight = (zero, zero, zero, zero), zero
+                needs_mirror = has_mirror
+                if has_front and not rough:
+                    column, row, weight = _find_in_image(
+                        s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
+                        front_alpha, front_depth, front, medium,
+                    )  # fmt: skip
+                    if _any(v8.greater(weight, zero)):
+                        image = _fetch(s, column, row, front_rgb, front_alpha, front)
+                    rest = _any(v8.greater(one - weight, v8.splat(TINY)))
+                    needs_mirror = has_mirror and rest
+                if needs_mirror:
+                    _find_in_mirror(
+                        s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror, medium
+                    )
+                if needs_mirror and rough:
+                    _choose_levels(s, starts, _level(s, mirror_sizes), mirror_sizes)
+                for tap in range(taps):
+                    t8 = tap * LANES
+                    seen = zero, zero, zero, zero
+                    if needs_mirror:
+                        column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
+                        if rough:
+                            lower = _fetch_level(s, starts, U(0), column, row, mirror_mips)
+                            upper = _fetch_level(s, starts, LANES, column, row, mirror_mips)
+                            seen = _blend4(v8.load(s, SHARE_ABOVE), upper, lower)
+                        else:
+                            seen = _fetch(s, column, row, mirror_rgb, mirror_alpha, mirror)
+                    if has_front:
+                        seen = _blend4(weight, image, seen)
+                    r, g, b, a = seen
+                    transmittance = one - a
+                    shines = v8.greater(transmittance, v8.splat(F(FAINT)))
+                    whole = one / v8.maximum(a, v8.splat(HALF))
+                    color = r * whole, g * whole, b * whole
+                    if _any(shines):
+                        rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)
+                        behind = _sky(s, faces, size, rx, ry, rz, near, medium)
+                        before = (
+                            r + transmittance * behind[0],
+                            g + transmittance * behind[1],
+                            b + transmittance * behind[2],
+                        )
+                        color = _select3(shines, before, color)
+                    share = v8.load(s, SHARE + t8)
+                    sum_r = sum_r + share * (color[0] - below[0])
+                    sum_g = sum_g + share * (color[1] - below[1])
+                    sum_b = sum_b + share * (color[2] - below[2])
+            v8.store(s, R, sum_r)
+            v8.store(s, G, sum_g)
+            v8.store(s, B, sum_b)
+            for k in range(min(LANES, n - first)):
+                pixel = places[start + first + k]
+                out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
+                out[i, pixel, 2] = s[B + k]
+
+
+@kernel
+def shade(pixels, normals, bed, mirror, mips, front, rays, sky, water, out):
+    """Water of the pixels of a camera into out [H, W, 3]. front: what `rays` run through; only one
+    that is not empty counts, as of the mirror. water: numbers of `Medium`.
+    """
+    for i in prange(out.shape[0]):
+        # A function of its own: numba compiles what stands in a parallel loop many times over.
+        _shade_row(np.int64(i), pixels, normals, bed, mirror, mips, front, rays, sky, water, out)
