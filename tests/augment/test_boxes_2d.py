@@ -16,7 +16,8 @@ from augment.boxes import MAX_INSTANCE, Instances, instances_of
 from augment.cameras import Camera
 from augment.dataset import SceneDataset, WeatherDataset, boxes_2d, torchvision_sample
 from augment.errors import AdapterError
-from augment.jobs.files import TABLES, BoxNumbers, label_view, measure_boxes
+from augment.jobs.box_tables import BoxNumbers
+from augment.jobs.files import box_tables, label_view, measure_boxes
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes
@@ -232,7 +233,7 @@ def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
     snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.3)), output=output)
     numbers, image = measure(scene, camera, snowy)
     assert numbers["visible_fraction"][0] == pytest.approx(clear["visible_fraction"][0], abs=0.05)
-    covered = render_view(scene, camera, snowy, backend="cpu").snow == 255
+    covered = render_view(scene, camera, snowy, backend="cpu").masks["snow"] == 255
     eye, rays = camera.centre.numpy(), camera.ray_directions(torch.float64).numpy()
     on_top = np.abs(eye + (1.5 - eye[2]) / rays[..., 2:] * rays - PARKED) < SIZE / 2 - 0.3
     on_roof = on_top[..., 0] & on_top[..., 1] & (rays[..., 2] < 0)
@@ -251,7 +252,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
     boxes = read_boxes(whole / FOLDER / "labels" / "boxes.parquet")
-    measured = TABLES["box_2d"].read(whole / FOLDER / "labels" / "boxes_2d.parquet")
+    measured = box_tables()["box_2d"].read(whole / FOLDER / "labels" / "boxes_2d.parquet")
     ids = {
         t: int(n)
         for f in boxes.values()
@@ -325,7 +326,7 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
     ],
 )
 def test_numbers_survive_progress_log_and_file_to_the_bit(kind, stored, tmp_path: Path) -> None:
-    table = TABLES[kind]
+    table = box_tables()[kind]
     if stored is None:
         stored = table.to_json(measure(street(), street().frames[0].cameras["ahead"])[0])
     numbers = table.from_json(json.loads(json.dumps(stored)))

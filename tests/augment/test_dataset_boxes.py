@@ -12,7 +12,8 @@ import torch
 from augment.dataset import box_masks, boxes_2d, torchvision_sample
 from augment.dataset.samples import BOX_FRAMES, box_tensors
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
-from augment.jobs.files import TABLES, BoxWeather
+from augment.jobs.box_tables import BoxWeather
+from augment.jobs.files import box_tables
 from augment.labels import Boxes
 from augment.semantics import SemanticClass
 
@@ -162,7 +163,7 @@ TWO = boxes_at([[0, 0, 5], [0, 0, 9], [0, 0, -5]], [[1, 1, 1], [6, 1, 3], [1, 1,
 def smog_of(*transmittance: float) -> BoxWeather:
     names = tuple(map(str, range(len(transmittance))))
     stored = [names, transmittance, [1] * len(names)]
-    return {"box_smog": TABLES["box_smog"].from_json(stored)}
+    return {"box_smog": box_tables()["box_smog"].from_json(stored)}
 
 
 def depth_of_two() -> torch.Tensor:

@@ -13,7 +13,8 @@ from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 
 from augment.cameras import Camera
 from augment.effects.lidar import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
-from augment.effects.lidar.beam import origins_of, weathered_sweep
+from augment.effects.lidar.beam import origins_of
+from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import OutputError
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
@@ -145,7 +146,8 @@ def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarS
     column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     seen = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     at = row[seen].astype(int), column[seen].astype(int)
-    return np.abs(z[seen] - view.depth_m[at])[(view.snow[at] == 255) & (view.depth_m[at] > 0)]
+    shown, is_snow = view.depth_m[at], view.masks["snow"][at] == 255
+    return np.abs(z[seen] - shown)[is_snow & (shown > 0)]
 
 
 @pytest.mark.long

@@ -69,7 +69,7 @@ class Workbench:
         shade = 60 + 2 * x / settings.scale + 3 * y / settings.scale + 10 * (camera.name == "front")
         shade = shade + (12 if settings.sh_degree == 0 else 0)
         rgb = np.repeat(shade[..., None], 3, axis=2).clip(0, 255).astype(np.uint8)
-        return FakeView(rgb, None, None, None)
+        return FakeView(rgb)
 
 
 def _mean_error(picture: np.ndarray, truth: np.ndarray) -> float:
@@ -155,7 +155,7 @@ def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
         assert recipe.weather.snow is not None
         if recipe.weather.snow.cell_m < 0.1:
             raise SceneError("too many cells")
-        return FakeView(np.full((16, 24, 3), 99, np.uint8), None, None, None)
+        return FakeView(np.full((16, 24, 3), 99, np.uint8))
 
     recipe = open_recipe("budget_ms: 1e6", "weather: {snow: {depth_m: 0}}\nrender: {scale: 1}\n")
     settled = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
@@ -353,7 +353,7 @@ def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
     scene = open_fake("fake:a")
 
     def render(scene, camera, recipe, *, backend: str) -> FakeView:
-        return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32), None, None)
+        return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32))
 
     trial = render_trial(
         scene, make_camera("front", 0, 0.0), Recipe(), renderer=render, size=(4, 4)
