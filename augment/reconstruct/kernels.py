@@ -5,6 +5,7 @@ on the splats that a view touched, and the forces on whole parts.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -323,18 +324,16 @@ def _mapped(planes, at, plane, color_map, channel):
 
 
 @kernel
-def compare(
-    rgb, alpha, sky, color_map, recorded, weight, is_sky, size, behind, pairs, weights, sums,
-    covered,
-):  # fmt: skip
+def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written):
     """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
 
     recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
-    Written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
+    written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
     [H + 2 PAD, stride], red, green, blue of x + y, then of x - y; weights, a flat plane [H,
     stride]; sums, flat [H, 2, LANES]: of weight |x - y| and of weight; covered, float64 [H]: of
     alpha in the sky. Where the weight is 0, y is x.
     """
+    behind, pairs, weights, sums, covered = written
     height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
     plane = U(size[0] + 2 * PAD) * stride
     to_unit = v8.splat(np.float32(1 / 255))
@@ -596,19 +595,38 @@ def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
     return (1 / (1 - np.array([beta1, beta2]) ** n)).astype(np.float32)
 
 
+class GradientRows(NamedTuple):
+    """What project_backward wrote, flat."""
+
+    rows: np.ndarray
+    ids: np.ndarray
+    counts: np.ndarray
+
+
+class AdamState(NamedTuple):
+    """Arrays of `Splats`, flat."""
+
+    geometry_m: np.ndarray
+    geometry_v: np.ndarray
+    sh_m: np.ndarray
+    sh_v: np.ndarray
+    age: np.ndarray
+    grads: np.ndarray
+
+
 @kernel
 def update_splats(
-    addresses, sizes, views, blocks, firsts, rows, ids, counts, functions, rates, corrections,
-    geometry_m, geometry_v, sh_m, sh_v, age, grads,
-):  # fmt: skip
+    addresses, sizes, views, blocks, firsts, gradients, functions, rates, corrections, state
+):
     """One step of Adam for every row of gradients; a splat whose row is not finite stays as it is.
 
     addresses, sizes, views, blocks: as in project; the splats are changed in place. firsts:
-    int64 [P], index of each part's first splat in the arrays of moments. rows, ids, counts: what
-    project_backward wrote. functions: SH functions that are learnt by now. rates: float32
-    [RATES]. corrections: as `bias_corrections` gives them, flat. geometry_m to grads: flat arrays
-    of `Splats`.
+    int64 [P], index of each part's first splat in the arrays of moments. gradients: GradientRows.
+    functions: SH functions that are learnt by now. rates: float32 [RATES]. corrections: as
+    `bias_corrections` gives them, flat. state: AdamState.
     """
+    rows, ids, counts = gradients.rows, gradients.ids, gradients.counts
+    age, grads = state.age, state.grads
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
         count, total = sizes[part]
@@ -637,13 +655,13 @@ def update_splats(
                 n = U(min(age[one], CORRECTED))
                 first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
                 _update_geometry(
-                    means, quats, scales, opacities, splat, rows, row,
-                    basis[U(_FUNCTIONS * LANES) + lane], rates, first, second,
-                    geometry_m, geometry_v, one * U(GEOMETRY), work,
+                    (means, quats, scales, opacities), splat, rows, row,
+                    basis[U(_FUNCTIONS * LANES) + lane], rates, (first, second),
+                    (state.geometry_m, state.geometry_v), one * U(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
-                    sh, U(total), splat, rows, row, basis, lane, U(functions), rates, first,
-                    second, sh_m, sh_v, one * U(total) * U(3), work,
+                    sh, splat * U(total) * U(3), rows, row, basis, lane, U(functions), rates,
+                    (first, second), (state.sh_m, state.sh_v), one * U(total) * U(3), work,
                 )  # fmt: skip
 
 
@@ -685,10 +703,9 @@ def _adam8(g, rates, first, second, m, m_at, v, v_at):
 
 
 @inner()
-def _update_geometry(
-    means, quats, scales, opacities, splat, rows, row, pixel_m, rates, first, second, m, v, at,
-    work,
-):  # fmt: skip
+def _update_geometry(splats, splat, rows, row, pixel_m, rates, bias, moments, at, work):
+    means, quats, scales, opacities = splats
+    (first, second), (m, v) = bias, moments
     one = np.float32(1)
     o = min(max(opacities[splat], _FAINTEST), _FULLEST)
     for i in range(U(3)):
@@ -718,9 +735,8 @@ def _update_geometry(
 
 
 @inner()
-def _update_sh(
-    sh, total, splat, rows, row, basis, lane, functions, rates, first, second, m, v, at, work
-):
+def _update_sh(sh, start, rows, row, basis, lane, functions, rates, bias, moments, at, work):
+    (first, second), (m, v) = bias, moments
     red, green = rows[row + U(G_COLOR)], rows[row + U(G_COLOR + 1)]
     blue = rows[row + U(G_COLOR + 2)]
     count = U(3) * functions
@@ -741,7 +757,6 @@ def _update_sh(
     for i in range(count):
         m[at + i] = work[U(_WORK) + i]
         v[at + i] = work[U(2 * _WORK) + i]
-    start = splat * total * U(3)
     for i in range(U(3)):
         sh[start + i] -= rates[R_SH_DC] * work[U(3 * _WORK) + i]
     for i in range(U(3), count):

@@ -219,7 +219,7 @@ def _compare(
     pairs, slopes, kept = buffers.pairs, buffers.slopes, buffers.weights
     kernels.compare(
         rgb.reshape(-1), alpha.reshape(-1), sky, mapping, recorded, weight, is_sky, size,
-        buffers.behind, pairs, kept, buffers.sums.reshape(-1), buffers.covered,
+        (buffers.behind, pairs, kept, buffers.sums.reshape(-1), buffers.covered),
     )  # fmt: skip
     error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
     covered = float(buffers.covered.sum())

@@ -52,6 +52,11 @@ class Splats:
     def __len__(self) -> int:
         return len(self.means)
 
+    def adam_state(self) -> kernels.AdamState:
+        return kernels.AdamState(
+            *(getattr(self, name).reshape(-1) for name in kernels.AdamState._fields)
+        )
+
     @property
     def part_of(self) -> np.ndarray:
         """int32 [N]: the part each splat belongs to."""

@@ -23,7 +23,7 @@ from torch import Tensor
 from augment.cameras import Camera, Frame
 from augment.labels import EGO_VEHICLE
 from augment.reconstruct.config import FitConfig
-from augment.reconstruct.kernels import MOMENTS, sum_forces, update_splats
+from augment.reconstruct.kernels import MOMENTS, GradientRows, sum_forces, update_splats
 from augment.reconstruct.loss import (
     IDENTITY_MAP,
     LossScratch,
@@ -711,11 +711,9 @@ class Trainer:
         with kernel_threads():
             update_splats(
                 inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-                grads.rows.reshape(-1), grads.ids, grads.counts, self._functions,
+                GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts), self._functions,
                 splat_rates(self.config, self.step, camera, self._extent_m),
-                CORRECTIONS.reshape(-1), splats.geometry_m.reshape(-1),
-                splats.geometry_v.reshape(-1), splats.sh_m.reshape(-1), splats.sh_v.reshape(-1),
-                splats.age, splats.grads.reshape(-1),
+                CORRECTIONS.reshape(-1), splats.adam_state(),
             )  # fmt: skip
         if loss.d_sky is not None:
             rate = decayed(rates.sky, rates.sky_end, done)

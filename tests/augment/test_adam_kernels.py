@@ -118,18 +118,11 @@ def apply_update(splats: Splats, update: Update, config: FitConfig = CONFIG) -> 
             inputs.views,
             inputs.blocks,
             inputs.first_ids,
-            rows.reshape(-1),
-            ids,
-            counts,
+            kernels.GradientRows(rows.reshape(-1), ids, counts),
             update.functions,
             splat_rates(config, update.step, update.camera, EXTENT_M),
             CORRECTIONS.reshape(-1),
-            splats.geometry_m.reshape(-1),
-            splats.geometry_v.reshape(-1),
-            splats.sh_m.reshape(-1),
-            splats.sh_v.reshape(-1),
-            splats.age,
-            splats.grads.reshape(-1),
+            splats.adam_state(),
         )
 
 

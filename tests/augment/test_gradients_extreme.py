@@ -222,11 +222,9 @@ def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
         with kernel_threads():
             adam.update_splats(
                 inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-                found.rows.reshape(-1), found.ids, found.counts, 16,
+                adam.GradientRows(found.rows.reshape(-1), found.ids, found.counts), 16,
                 splat_rates(config, step, camera, 50.0), CORRECTIONS.reshape(-1),
-                splats.geometry_m.reshape(-1), splats.geometry_v.reshape(-1),
-                splats.sh_m.reshape(-1), splats.sh_v.reshape(-1), splats.age,
-                splats.grads.reshape(-1),
+                splats.adam_state(),
             )  # fmt: skip
     for name, array in splats.arrays().items():
         assert np.isfinite(array).all(), name
