@@ -13,6 +13,7 @@ from adapters.street.raycast import Tree
 from adapters.street.world import MovingBody
 from adapters.world import join_gaussians
 from augment.geometry import quat_from_rotmat
+from augment.render.sh import SH_C0
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
 
@@ -418,7 +419,6 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
 
 # ---- Gaussians of cells --------------------------------------------------------------------------
 
-SH_C0 = 0.28209479177387814
 OPACITY = 0.99
 # Standard deviation per cell side: the least that leaves no gap (alpha > 0.99 in the mean), since
 # wider splats blur and lead more (see `spacing`). Over a second layer they may be narrower.
