@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib.metadata
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import pytest
 
 from augment.render import threads
-from tests.conftest import ROOT
 
+ROOT = Path(__file__).parents[2]
 SECONDS = 120  # for a fresh process on a busy machine; a worker that hangs would wait for ever
 
 FORKED_WORKERS = """
