@@ -4,8 +4,9 @@
     total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + surface (1 - alpha)
             + sky alpha
 
-each a weighted mean as `LossWeights` says. A test holds it to its torch definition. SSIM is that of 3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of
-sigma 1.5, zeros beyond the image, per channel, of pictures in [0, 1] that are not clamped.
+each a weighted mean as `LossWeights` says. A test holds it to its torch definition. SSIM is that of
+3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of sigma 1.5, zeros
+beyond the image, per channel, of pictures in [0, 1] that are not clamped.
 
 Departures, all shared by the reference:
 - Where a pixel's weight is 0, both pictures hold the prediction there, as a constant: it neither
