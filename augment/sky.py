@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.memo import memo_of
 from augment.render.cuda.runtime import resident
 
 
@@ -106,19 +106,13 @@ def sample_within_faces(
     return _bilinear(faces, row.clamp(0, size - 1), column.clamp(0, size - 1), face=face)
 
 
-_bordered: WeakKeyDictionary[CubemapSky, tuple[int, Tensor]] = WeakKeyDictionary()
-
-
 def bordered_faces(sky: CubemapSky) -> Float[Tensor, "6 S S 3"]:
     """The faces with one texel of their neighbours around each, S = R + 2; kept with the sky.
 
     A corner, where three faces meet, has the mean of their texels, as nvdiffrast has it.
     """
-    faces = sky.faces
-    known = _bordered.get(sky)
-    if known is None or known[0] != faces._version:
-        known = _bordered[sky] = (faces._version, with_border(faces))
-    return known[1]
+    key = ("bordered faces", sky.faces._version)
+    return memo_of(sky).get(key, lambda: with_border(sky.faces))
 
 
 def with_border(faces: Float[Tensor, "6 R R C"]) -> Float[Tensor, "6 S S C"]:

@@ -18,13 +18,15 @@ from torch import Tensor
 MAX_DEGREE = 3
 SH_C0 = 0.5 * math.sqrt(1 / math.pi)  # the constant function of band 0
 
-_C1 = math.sqrt(3 / (4 * math.pi))
-_C2_XY = math.sqrt(15 / (4 * math.pi))
-_C2_ZZ = math.sqrt(5 / (16 * math.pi))
-_C3_CUBIC = math.sqrt(35 / (32 * math.pi))
-_C3_XYZ = math.sqrt(105 / (4 * math.pi))
-_C3_ZZ = math.sqrt(21 / (32 * math.pi))
-_C3_ZZZ = math.sqrt(7 / (16 * math.pi))
+C1 = math.sqrt(3 / (4 * math.pi))
+C2_XY = math.sqrt(15 / (4 * math.pi))
+C2_ZZ = math.sqrt(5 / (16 * math.pi))
+C2_XX = 0.5 * C2_XY
+C3_CUBIC = math.sqrt(35 / (32 * math.pi))
+C3_XYZ = math.sqrt(105 / (4 * math.pi))
+C3_ZZ = math.sqrt(21 / (32 * math.pi))
+C3_ZZZ = math.sqrt(7 / (16 * math.pi))
+C3_ZXX = 0.5 * C3_XYZ
 
 
 def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K"]:
@@ -35,24 +37,24 @@ def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*
     xx, yy, zz = x * x, y * y, z * z
     values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
-        values += [-_C1 * y, _C1 * z, -_C1 * x]
+        values += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
         values += [
-            _C2_XY * x * y,
-            -_C2_XY * y * z,
-            _C2_ZZ * (2 * zz - xx - yy),
-            -_C2_XY * x * z,
-            0.5 * _C2_XY * (xx - yy),
+            C2_XY * x * y,
+            -C2_XY * y * z,
+            C2_ZZ * (2 * zz - xx - yy),
+            -C2_XY * x * z,
+            C2_XX * (xx - yy),
         ]
     if degree >= 3:
         values += [
-            -_C3_CUBIC * y * (3 * xx - yy),
-            _C3_XYZ * x * y * z,
-            -_C3_ZZ * y * (4 * zz - xx - yy),
-            _C3_ZZZ * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C3_ZZ * x * (4 * zz - xx - yy),
-            0.5 * _C3_XYZ * z * (xx - yy),
-            -_C3_CUBIC * x * (xx - 3 * yy),
+            -C3_CUBIC * y * (3 * xx - yy),
+            C3_XYZ * x * y * z,
+            -C3_ZZ * y * (4 * zz - xx - yy),
+            C3_ZZZ * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3_ZZ * x * (4 * zz - xx - yy),
+            C3_ZXX * z * (xx - yy),
+            -C3_CUBIC * x * (xx - 3 * yy),
         ]
     return torch.stack(values, -1)
 

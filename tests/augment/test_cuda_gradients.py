@@ -346,7 +346,7 @@ def test_gradients_that_no_kernel_has_are_refused():
     camera = camera_ahead(9, 9, 9.0)
     colour, shape = (tracked(PosedGaussians(one_gaussian()), name) for name in ("sh", "means"))
     smog = Fog(sigma_per_m=0.1, rgb=(0.5, 0.5, 0.5))
-    with pytest.raises(ValueError, match=r"gradients through smog.* 'reference', on the CPU"):
+    with pytest.raises(ValueError, match=r"gradients through fog.* 'reference', on the CPU"):
         rasterize([colour], camera, fog=smog, backend="cuda")
     with pytest.raises(ValueError, match="gradients of median_depth"):
         rasterize([shape], camera, buffers=(MEDIAN_DEPTH,), backend="cuda")

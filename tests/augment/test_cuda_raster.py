@@ -109,7 +109,7 @@ def assert_matches_definition(
     parts, camera, settings=DEFAULT, *, max_flips=2, depth_p999=2e-4, smog=None, clip=None
 ):
     parts = as_given(parts)
-    actual = render(parts, camera, ALL, settings, smog=smog, clip=clip)
+    actual = render(parts, camera, ALL, settings, fog=smog, clip=clip)
     expected = rasterize(
         in_float64(parts),
         camera,

@@ -9,7 +9,6 @@ gsplat's (augment.render.gsplat_backend), which is an extra. Camera and part pos
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,9 +18,9 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render.buffers import EXPECTED_DEPTH, RGB, RenderOutput
-from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import RasterSettings
 from augment.render.cuda import blend_kernels as kernels
-from augment.render.cuda.driver import blend, list_tiles, project
+from augment.render.cuda.driver import blend, limits_of, list_tiles, project
 from augment.render.cuda.runtime import launch, resident
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
 from augment.render.gsplat_backend import draw_with_gsplat, tracked_geometry
@@ -62,10 +61,8 @@ def color_gradients(
     shares = torch.zeros(3, entries, device=device)
     launch(
         kernels.share_colors, (tiles.columns * tiles.rows,), splats.records, tiles.tile_splat_ids,
-        tiles.tile_offsets, d_rgb.contiguous(), shares, camera.width, camera.height, tiles.columns,
-        settings.alpha_max, math.log2(ALPHA_MIN),
-        min(settings.transmittance_stop, TRANSMITTANCE_STOP), settings.transmittance_stop,
-        BATCH=_BATCH, num_warps=_TILE_WARPS,
+        tiles.tile_offsets, d_rgb.contiguous(), shares, camera.width, camera.height,
+        limits_of(settings), BATCH=_BATCH, num_warps=_TILE_WARPS,
     )  # fmt: skip
     owners, order = torch.sort(tiles.tile_splat_ids, stable=True)  # lists are tile after tile
     bounds = torch.arange(count + 1, dtype=owners.dtype, device=device)

@@ -12,8 +12,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from augment.render import constants, layout, mode_depth, sh
+from augment.render import constants, layout, mode_depth
 from augment.render.cpu import geometry as cpu_geometry
+from augment.render.cuda.project_kernels import sh_basis
 from augment.render.cuda.splats import TILE
 
 # ---- Triton kernels: from the loss's gradient by the image to those of the splats' colours -------
@@ -30,26 +31,21 @@ _FALL_Y, _LOG_OPACITY = tl.constexpr(layout.FALL_Y), tl.constexpr(layout.LOG_OPA
 _RED = tl.constexpr(layout.RED)
 _V_ROTATION, _V_EYE = tl.constexpr(layout.V_ROTATION), tl.constexpr(layout.V_EYE)
 _V_PARALLEL = tl.constexpr(layout.V_PARALLEL)
-_C0, _C1 = tl.constexpr(sh.SH_C0), tl.constexpr(sh._C1)
-_C2_XY, _C2_ZZ = tl.constexpr(sh._C2_XY), tl.constexpr(sh._C2_ZZ)
-_C3_CUBIC, _C3_XYZ = tl.constexpr(sh._C3_CUBIC), tl.constexpr(sh._C3_XYZ)
-_C3_ZZ, _C3_ZZZ = tl.constexpr(sh._C3_ZZ), tl.constexpr(sh._C3_ZZZ)
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@triton.jit(do_not_specialize=["width", "height"])
 def share_colors(
-    records, tile_splat_ids, tile_offsets, d_rgb, shares,
-    width, height, columns, alpha_max, log_cut, least, end,
+    records, tile_splat_ids, tile_offsets, d_rgb, shares, width, height, limits,
     BATCH: tl.constexpr,
 ):  # fmt: skip
     """A program a tile: sum over its pixels of weight times dL/d rgb, for each entry of its list.
 
     d_rgb: float32 [height, width, 3]. shares: float32 [3, entries], zeros; written as far as light
-    reaches. alpha_max, log_cut = log2(ALPHA_MIN), least (what a splat must leave more of than this
-    to be blended), end (the transmittance at which a pixel is finished): as the forward blend's.
-    BATCH entries are looked at at once, all pixels of them, which leaves the products of
-    transmittances as the only chain.
+    reaches. limits: the forward blend's. BATCH entries are looked at at once, all pixels of them,
+    which leaves the products of transmittances as the only chain.
     """
+    alpha_max, log_cut, least, end = limits
+    columns = (width + _TILE - 1) // _TILE
     tile = tl.program_id(0)
     entries = tl.load(tile_offsets + tl.num_programs(0)).to(tl.int64)  # three times as many places
     at = tl.load(tile_offsets + tile)
@@ -158,28 +154,12 @@ def spread_to_sh(
     x, y, z = x * scale, y * scale, z * scale
     length = tl.sqrt(tl.maximum(x * x + y * y + z * z, 1e-30))
     x, y, z = (x / length)[:, None], (y / length)[:, None], (z / length)[:, None]
-    xx, yy, zz = x * x, y * y, z * z
+    functions = sh_basis(x, y, z, VALUES // 3)
     column = tl.arange(0, COLUMNS)[None, :]
     k, channel = column // 3, column % 3
-    basis = tl.where(k == 0, _C0, 0.0)
-    if VALUES > 3:
-        basis = tl.where(k == 1, -_C1 * y, basis)
-        basis = tl.where(k == 2, _C1 * z, basis)
-        basis = tl.where(k == 3, -_C1 * x, basis)
-    if VALUES > 12:
-        basis = tl.where(k == 4, _C2_XY * x * y, basis)
-        basis = tl.where(k == 5, -_C2_XY * y * z, basis)
-        basis = tl.where(k == 6, _C2_ZZ * (2 * zz - xx - yy), basis)
-        basis = tl.where(k == 7, -_C2_XY * x * z, basis)
-        basis = tl.where(k == 8, 0.5 * _C2_XY * (xx - yy), basis)
-    if VALUES > 27:
-        basis = tl.where(k == 9, -_C3_CUBIC * y * (3 * xx - yy), basis)
-        basis = tl.where(k == 10, _C3_XYZ * x * y * z, basis)
-        basis = tl.where(k == 11, -_C3_ZZ * y * (4 * zz - xx - yy), basis)
-        basis = tl.where(k == 12, _C3_ZZZ * z * (2 * zz - 3 * xx - 3 * yy), basis)
-        basis = tl.where(k == 13, -_C3_ZZ * x * (4 * zz - xx - yy), basis)
-        basis = tl.where(k == 14, 0.5 * _C3_XYZ * z * (xx - yy), basis)
-        basis = tl.where(k == 15, -_C3_CUBIC * x * (xx - 3 * yy), basis)
+    basis = tl.zeros([SPLATS, COLUMNS], tl.float32)
+    for number in tl.static_range(VALUES // 3):
+        basis = tl.where(k == number, functions[number], basis)
     own = is_one[:, None] & (column < VALUES)
     basis = tl.where(k < used, basis, 0.0)
     color = tl.load(d_colors + splat[:, None] * 3 + channel, mask=own, other=0.0)
@@ -190,21 +170,18 @@ def spread_to_sh(
 
 
 @triton.jit(do_not_specialize=["count", "columns"])
-def count_tiles(
-    order, counts, rects, sums, sorted_counts, count, columns,
-    IS_PARTIAL: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+def count_tiles(order, counts, rects, sums, sorted_counts, count, columns, BLOCK: tl.constexpr):
     """How many tiles each splat is listed in, nearest splat first.
 
     order: int64 [count], rows of CudaSplats. counts, rects: as there. sums: int32 [rows + 1,
-    columns + 1], wanted tiles above and to the left; read where IS_PARTIAL: splats without a wanted
-    tile count none. sorted_counts: int32 [count], written.
+    columns + 1], wanted tiles above and to the left, or None: splats without a wanted tile count
+    none. sorted_counts: int32 [count], written.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_there = at < count
     row = tl.load(order + at, mask=is_there, other=0)
     tiles = tl.load(counts + row, mask=is_there, other=0)
-    if IS_PARTIAL:
+    if sums is not None:
         is_drawn = is_there & (tiles > 0)
         first = tl.load(rects + 2 * row, mask=is_drawn, other=0)
         last = tl.load(rects + 2 * row + 1, mask=is_drawn, other=0)
@@ -223,14 +200,14 @@ def count_tiles(
 @triton.jit(do_not_specialize=["pairs", "count", "steps", "columns", "none"])
 def list_pairs(
     order, ends, rects, wanted, tiles, owners, pairs, count, steps, columns, none,
-    IS_PARTIAL: tl.constexpr, BLOCK: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Every pair of a splat and a tile, nearest splat first, the tiles of each row by row.
 
     order: as above. ends: int64 [count], how many pairs there are up to each splat, itself
-    included. steps: halvings that leave one of `count` splats. wanted: bool [tiles], read where
-    IS_PARTIAL. tiles, owners: [pairs], written: the tile, `none` where it is not wanted, and the
-    row of CudaSplats.
+    included. steps: halvings that leave one of `count` splats. wanted: bool [tiles], or None for
+    all. tiles, owners: [pairs], written: the tile, `none` where it is not wanted, and the row of
+    CudaSplats.
     """
     pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     is_there = pair < pairs
@@ -253,7 +230,7 @@ def list_pairs(
     within = (pair - begin).to(tl.int32)
     down = within // width
     tile = ((first >> 16) + down) * columns + (first & 0xFFFF) + within - down * width
-    if IS_PARTIAL:
+    if wanted is not None:
         is_wanted = tl.load(wanted + tile, mask=is_there, other=0)
         tile = tl.where(is_wanted != 0, tile, none)
     tl.store(tiles + pair, tile.to(tiles.dtype.element_ty), mask=is_there)
@@ -355,25 +332,32 @@ LANES = tl.constexpr(32)  # threads of a warp, splats looked at together, bits o
 MARGIN = tl.constexpr(0.0625)
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@triton.jit(do_not_specialize=["width", "height"])
 def blend_blocks(
-    records, tile_splat_ids, tile_offsets, cuts, lights, rgb, alpha, expected, median, ids, mode,
-    overlay, width, height, columns, alpha_max, log_cut, least, end, parallel, floor, inverse_fx2,
-    inverse_fy2,
-    HAS_CUTS: tl.constexpr, HAS_LIGHTS: tl.constexpr, HAS_RGB: tl.constexpr,
-    HAS_EXPECTED: tl.constexpr, HAS_MEDIAN: tl.constexpr, HAS_IDS: tl.constexpr,
-    HAS_MODE: tl.constexpr, HAS_OVERLAY: tl.constexpr, IS_COARSE: tl.constexpr,
-    BLOCK_W: tl.constexpr, BLOCK_H: tl.constexpr,
+    splats, tile_splat_ids, tile_offsets, images, width, height, limits, lens,
+    IS_COARSE: tl.constexpr, BLOCK_W: tl.constexpr, BLOCK_H: tl.constexpr,
 ):  # fmt: skip
     """Blend one block of BLOCK_W x BLOCK_H pixels of a tile; a tile's blocks are neighbours.
 
-    records, cuts, lights: as in CudaSplats. tile_splat_ids, tile_offsets: as in CudaTiles. rgb to
-    overlay: images; of those that are not asked for, and of cuts and lights that are not there,
-    nothing is read or written. width, height: of the image; columns: of its tiles. least: what a
-    splat must leave more of than this to be blended. end: the transmittance at which a pixel is
-    finished; IS_COARSE where it is not `least`. parallel: 1 where rays are parallel, else 0. floor:
-    mode depth's.
+    splats: records, cuts and lights of CudaSplats; cuts and lights may be None. tile_splat_ids,
+    tile_offsets: as in CudaTiles. images: in the order of BUFFERS; None where one is not asked for.
+    limits: alpha_max, log2(ALPHA_MIN), what a splat must leave more of than this to be blended, and
+    the transmittance at which a pixel is finished; IS_COARSE where these two differ. lens: 1 where
+    rays are parallel, else 0, mode depth's floor, 1/fx^2 and 1/fy^2.
     """
+    records, cuts, lights = splats
+    rgb, alpha, expected, median, ids, mode, overlay = images
+    alpha_max, log_cut, least, end = limits
+    parallel, floor, inverse_fx2, inverse_fy2 = lens
+    HAS_CUTS: tl.constexpr = cuts is not None
+    HAS_LIGHTS: tl.constexpr = lights is not None
+    HAS_RGB: tl.constexpr = rgb is not None
+    HAS_EXPECTED: tl.constexpr = expected is not None
+    HAS_MEDIAN: tl.constexpr = median is not None
+    HAS_IDS: tl.constexpr = ids is not None
+    HAS_MODE: tl.constexpr = mode is not None
+    HAS_OVERLAY: tl.constexpr = overlay is not None
+    columns = (width + _TILE - 1) // _TILE
     across = _TILE // BLOCK_W
     blocks = across * (_TILE // BLOCK_H)
     tile, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks

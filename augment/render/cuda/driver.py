@@ -18,17 +18,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import layout, shading
-from augment.render.buffers import (
-    ALPHA,
-    BUFFERS,
-    EXPECTED_DEPTH,
-    MEDIAN_DEPTH,
-    MODE_DEPTH,
-    OVERLAY,
-    RGB,
-    SPLAT_IDS,
-    RenderOutput,
-)
+from augment.render.buffers import ALPHA, BUFFERS, RGB, SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cuda import runtime
 from augment.render.cuda.blend_kernels import blend_blocks, count_tiles, list_pairs
@@ -70,11 +60,11 @@ def project(inputs: CudaInputs) -> CudaSplats:
     )
     launch(
         project_gaussians, (len(inputs.block_parts),), inputs.table, inputs.views,
-        inputs.block_parts, splats.records, splats.keys, splats.rects, splats.counts, splats.cuts,
-        splats.lights,
+        inputs.block_parts,
+        (splats.records, splats.keys, splats.rects, splats.counts, splats.cuts, splats.lights),
         COLOR=modes[layout.M_COLOR], FUNCTIONS=modes[layout.M_FUNCTIONS],
         ANTIALIASED=modes[layout.M_ANTIALIASED], FOG=modes[layout.M_FOG],
-        CLIP=modes[layout.M_CLIP], LIGHT=modes[layout.M_LIGHT], BLOCK=BLOCK, num_warps=BLOCK // 32,
+        BLOCK=BLOCK, num_warps=BLOCK // 32,
     )  # fmt: skip
     return splats
 
@@ -98,7 +88,6 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     """
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     count, tiles, device = len(splats.keys), columns * rows, splats.keys.device
-    none = torch.empty(0, dtype=torch.int32, device=device)
     is_drawn = (
         None if pixel_mask is None else _tiles_with_pixels(pixel_mask.to(device), columns, rows)
     )
@@ -107,8 +96,8 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     counts = torch.empty(count, dtype=torch.int32, device=device)
     runtime.launch(
         count_tiles, (-(-count // _SPLATS),), order, splats.counts, splats.rects,
-        none if is_drawn is None else _sums_from_corner(is_drawn), counts, count, columns,
-        IS_PARTIAL=is_drawn is not None, BLOCK=_SPLATS,
+        None if is_drawn is None else _sums_from_corner(is_drawn), counts, count, columns,
+        BLOCK=_SPLATS,
     )  # fmt: skip
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     pairs = int(ends[-1]) if count else 0
@@ -125,9 +114,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     runtime.launch(
         list_pairs, (-(-pairs // _PAIRS),), order, ends, splats.rects,
-        none if is_drawn is None else is_drawn, tile_of, owners, pairs, count, count.bit_length(),
-        columns, tiles,
-        IS_PARTIAL=is_drawn is not None, BLOCK=_PAIRS,
+        is_drawn, tile_of, owners, pairs, count, count.bit_length(), columns, tiles, BLOCK=_PAIRS,
     )  # fmt: skip
     grouped, index = torch.sort(tile_of, stable=True)
     edges = torch.arange(tiles + 1, dtype=numbers, device=device)
@@ -175,24 +162,28 @@ def blend(
 ) -> dict[str, Tensor]:
     """The images asked for, [H, W] each, rgb [H, W, 3], on the GPU."""
     images = {name: _empty(name, camera, splats) for name in buffers | {ALPHA}}
-    least = min(settings.transmittance_stop, TRANSMITTANCE_STOP)
     per_tile = (TILE // _BLOCK_W) * (TILE // _BLOCK_H)
-    none = images[ALPHA]  # stands for what is not there; nothing is read or written
     runtime.launch(
-        blend_blocks, (tiles.columns * tiles.rows * per_tile,), splats.records,
-        tiles.tile_splat_ids, tiles.tile_offsets, none if splats.cuts is None else splats.cuts,
-        none if splats.lights is None else splats.lights,
-        *(images.get(name, none) for name in BUFFERS), camera.width, camera.height, tiles.columns,
-        settings.alpha_max, math.log2(ALPHA_MIN), least, settings.transmittance_stop,
-        float(camera.is_orthographic), settings.mode_depth_floor_m, camera.fx**-2, camera.fy**-2,
-        HAS_CUTS=splats.cuts is not None, HAS_LIGHTS=splats.lights is not None and RGB in images,
-        HAS_RGB=RGB in images, HAS_EXPECTED=EXPECTED_DEPTH in images,
-        HAS_MEDIAN=MEDIAN_DEPTH in images, HAS_IDS=SPLAT_IDS in images,
-        HAS_MODE=MODE_DEPTH in images, HAS_OVERLAY=OVERLAY in images,
-        IS_COARSE=settings.transmittance_stop > least, BLOCK_W=_BLOCK_W, BLOCK_H=_BLOCK_H,
+        blend_blocks,
+        (tiles.columns * tiles.rows * per_tile,),
+        (splats.records, splats.cuts, splats.lights if RGB in images else None),
+        tiles.tile_splat_ids,
+        tiles.tile_offsets,
+        tuple(images.get(name) for name in BUFFERS),
+        *(camera.width, camera.height, limits_of(settings)),
+        (float(camera.is_orthographic), settings.mode_depth_floor_m, camera.fx**-2, camera.fy**-2),
+        IS_COARSE=settings.transmittance_stop > TRANSMITTANCE_STOP,
+        BLOCK_W=_BLOCK_W,
+        BLOCK_H=_BLOCK_H,
         num_warps=1,
-    )  # fmt: skip
+    )
     return {name: images[name] for name in buffers}
+
+
+def limits_of(settings: RasterSettings) -> tuple[float, float, float, float]:
+    """What blending is limited by, as blend_blocks names it."""
+    end = settings.transmittance_stop
+    return settings.alpha_max, math.log2(ALPHA_MIN), min(end, TRANSMITTANCE_STOP), end
 
 
 def _empty(name: str, camera: Camera, splats: CudaSplats) -> Tensor:

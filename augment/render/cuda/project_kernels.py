@@ -7,7 +7,7 @@ import math
 import triton
 import triton.language as tl
 
-from augment.render import fog, layout, shading
+from augment.render import fog, layout, sh, shading
 from augment.render.cuda import splats
 
 # ---- Triton functions: what is seen through fog (augment.render.fog) -----------------------------
@@ -194,16 +194,10 @@ MAP = tl.constexpr(layout.MAP)
 V_SIGMA, V_AIRLIGHT = tl.constexpr(layout.V_SIGMA), tl.constexpr(layout.V_AIRLIGHT)
 V_EYE_HEIGHT, V_UP = tl.constexpr(layout.V_EYE_HEIGHT), tl.constexpr(layout.V_UP)
 
-C0 = tl.constexpr(math.sqrt(1 / (4 * math.pi)))
-C1 = tl.constexpr(math.sqrt(3 / (4 * math.pi)))
-C2_XY = tl.constexpr(math.sqrt(15 / (4 * math.pi)))
-C2_ZZ = tl.constexpr(math.sqrt(5 / (16 * math.pi)))
-C2_XX = tl.constexpr(math.sqrt(15 / (16 * math.pi)))
-C3_CUBIC = tl.constexpr(math.sqrt(35 / (32 * math.pi)))
-C3_XYZ = tl.constexpr(math.sqrt(105 / (4 * math.pi)))
-C3_ZZ = tl.constexpr(math.sqrt(21 / (32 * math.pi)))
-C3_ZZZ = tl.constexpr(math.sqrt(7 / (16 * math.pi)))
-C3_ZXX = tl.constexpr(math.sqrt(105 / (16 * math.pi)))
+C0, C1 = tl.constexpr(sh.SH_C0), tl.constexpr(sh.C1)
+C2_XY, C2_ZZ, C2_XX = tl.constexpr(sh.C2_XY), tl.constexpr(sh.C2_ZZ), tl.constexpr(sh.C2_XX)
+C3_CUBIC, C3_XYZ = tl.constexpr(sh.C3_CUBIC), tl.constexpr(sh.C3_XYZ)
+C3_ZZ, C3_ZZZ, C3_ZXX = tl.constexpr(sh.C3_ZZ), tl.constexpr(sh.C3_ZZZ), tl.constexpr(sh.C3_ZXX)
 
 
 @triton.jit
@@ -223,7 +217,7 @@ def color_of(sh, functions, towards, distance, mask, FUNCTIONS: tl.constexpr):
     """
     inverse = 1.0 / distance
     x, y, z = towards[0] * inverse, towards[1] * inverse, towards[2] * inverse
-    basis = _basis(x, y, z, FUNCTIONS)
+    basis = sh_basis(x, y, z, FUNCTIONS)
     half = tl.full(x.shape, 0.5, tl.float32)
     color = (half, half, half)
     read = tl.where(mask, functions, 0)
@@ -235,7 +229,7 @@ def color_of(sh, functions, towards, distance, mask, FUNCTIONS: tl.constexpr):
 
 
 @triton.jit
-def _basis(x, y, z, FUNCTIONS: tl.constexpr):
+def sh_basis(x, y, z, FUNCTIONS: tl.constexpr):
     """Spherical harmonics of unit directions, as render.sh lists them; 0 for those not read."""
     zero = tl.zeros_like(x)
     y0 = zero + C0
@@ -450,15 +444,16 @@ RECORD = tl.constexpr(layout.RECORD)
 
 @triton.jit
 def project_gaussians(
-    table, views, block_parts, records, keys, rects, counts, cuts, lights,
+    table, views, block_parts, written,
     COLOR: tl.constexpr, FUNCTIONS: tl.constexpr, ANTIALIASED: tl.constexpr, FOG: tl.constexpr,
-    CLIP: tl.constexpr, LIGHT: tl.constexpr, BLOCK: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Splats of the Gaussians of every part; each program takes BLOCK of one part.
 
-    table, views, block_parts: see splats. The rest: of splats, and written; cuts and
-    lights where CLIP and LIGHT ask for them. In capitals: the modes (see layout).
+    table, views, block_parts: see splats. written: fields of CudaSplats; cuts and lights are None
+    where no mode asks for them. In capitals: the other modes (see layout).
     """
+    records, keys, rects, counts, cuts, lights = written
     program = tl.program_id(0)
     part = tl.load(block_parts + program)
     row, view = table + part * COLUMNS, views + part * VIEW
@@ -490,7 +485,7 @@ def project_gaussians(
     radius_x, radius_y = tl.sqrt(budget * blurred_x), tl.sqrt(budget * blurred_y)
     drawn = seen & (log_opacity >= log_cut) & (blurred_x + blurred_y <= HUGE)
     drawn = drawn & (tl.maximum(radius_x, radius_y) > tl.load(view + V_RADIUS_CLIP))
-    if CLIP:
+    if cuts is not None:
         partly, cut = cut_of(d, right, down, columns, scales, inverse, view)
         drawn = drawn & partly
     mean_x, mean_y = to_image(x, y, inverse, view)
@@ -535,9 +530,9 @@ def project_gaussians(
     )  # fmt: skip
     record = tl.reshape(tl.join(even, odd), (BLOCK, RECORD))
     _store_rows(records + out * RECORD, record, drawn, BLOCK, RECORD)
-    if CLIP:
+    if cuts is not None:
         _store_rows(cuts + out * CUT, cut, drawn, BLOCK, CUT)
-    if LIGHT:
+    if lights is not None:
         lit = tl.where(drawn, tl.load(view + V_LIT), 0.0) > 0.0
         slopes = three_where(floats_at(tl.load(row + A_SLOPES)) + first * 3 + lane * 3, lit)
         lines = lights + out * LINES + lane * LINES

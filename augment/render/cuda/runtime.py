@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -136,8 +136,7 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any
     if 0 in grid:
         return
     # Triton refuses integers of numpy where it compiles, but not where it interprets.
-    plain = (a.item() if isinstance(a, np.generic) else a for a in arguments)
-    given = [_kernel_argument(argument) for argument in plain]
+    given = [_argument(argument) for argument in arguments]
     # Interpreted kernels run in numpy, which warns of infinities that a GPU goes on with.
     with np.errstate(all="ignore"):
         # Fused multiply-add is Triton's own choice too, until a version that asks to be told.
@@ -150,6 +149,12 @@ def address_of(tensor: Tensor) -> int:
     Whoever launches them keeps the tensor alive.
     """
     return _kernel_argument(tensor).data_ptr()
+
+
+def _argument(given: Any) -> Any:
+    if isinstance(given, tuple):
+        return tuple(map(_argument, given))
+    return _kernel_argument(given.item() if isinstance(given, np.generic) else given)
 
 
 def _kernel_argument(argument: Any) -> Any:
@@ -206,28 +211,3 @@ def download(images: Mapping[str, Tensor]) -> Callable[[], dict[str, np.ndarray]
 @functools.cache
 def _copying(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
-
-
-# ---- Small arrays of a frame that travel to the GPU together -------------------------------------
-
-_ALIGNED = 4  # words of 4 bytes, at multiples of which every array begins
-_DTYPES = {"i4": torch.int32, "i8": torch.int64, "f4": torch.float32}
-
-
-def upload_together(arrays: Sequence[np.ndarray]) -> list[Tensor]:
-    """Copies on the GPU, for this frame only, of int32, int64 and float32 arrays: one upload."""
-    starts, end = [], 0
-    for array in arrays:
-        starts.append(end)
-        end += -(-(array.nbytes // 4) // _ALIGNED) * _ALIGNED
-    words = np.zeros(end, np.int32)
-    for start, array in zip(starts, arrays, strict=True):
-        own = words[start : start + array.nbytes // 4].view(array.dtype)
-        own[:] = array.reshape(-1)
-    packed = upload(words)
-    return [
-        packed[start : start + array.nbytes // 4]
-        .view(_DTYPES[array.dtype.str[1:]])
-        .reshape(array.shape)
-        for start, array in zip(starts, arrays, strict=True)
-    ]

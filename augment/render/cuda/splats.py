@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.memo import memo_of
 from augment.render import layout
 from augment.render.constants import RasterSettings
 from augment.render.cuda.runtime import address_of, gpu_device, resident, upload, version_of
@@ -93,34 +94,34 @@ def gather_inputs(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Resident:
+class _Resident(NamedTuple):
     """Gaussians on the GPU, as `layout` lists what a part is read from. versions: of the tensors
     when that was.
     """
 
-    device: torch.device
     versions: list[int | None]
     tensors: list[Tensor]
     addresses: list[int]
 
 
-# Of scenes' parts, which stay the same from frame to frame: asking for every tensor of every part
-# anew would take longer than the GPU takes to project them.
-_known: weakref.WeakKeyDictionary[Gaussians, _Resident] = weakref.WeakKeyDictionary()
-
-
-def _resident_gaussians(gaussians: Gaussians, device: torch.device) -> _Resident:
-    g = gaussians
+def _resident_gaussians(g: Gaussians, device: torch.device) -> _Resident:
+    """Known of scenes' parts, which stay the same from frame to frame: asking for every tensor of
+    every part anew would take longer than the GPU takes to project them.
+    """
     given = (g.means, g.quats, g.scales, g.opacities, g.sh)
     versions = [version_of(tensor) for tensor in given]
-    known = _known.get(g)
-    if known is not None and known.versions == versions and known.device == device:
-        return known
-    tensors = [_readable(tensor) for tensor in given]
-    known = _Resident(device, versions, tensors, [address_of(tensor) for tensor in tensors])
-    if None not in versions:
-        _known[g] = known
+
+    def read() -> _Resident:
+        tensors = [_readable(tensor) for tensor in given]
+        return _Resident(versions, tensors, [address_of(tensor) for tensor in tensors])
+
+    if None in versions:
+        return read()
+    memo, key = memo_of(g), ("on the GPU", device)
+    known = memo.get(key, read)
+    if known.versions != versions:
+        known = read()
+        memo.put(key, known)
     return known
 
 
