@@ -9,6 +9,7 @@ import tempfile
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -34,8 +35,8 @@ from augment.dataset.samples import (
 )
 from augment.effects import share_effects
 from augment.errors import BackendUnavailable, OutputError
+from augment.jobs.box_tables import BoxNumbers, Item
 from augment.jobs.files import (
-    BoxNumbers,
     CameraRecord,
     SceneIndex,
     View,
@@ -571,7 +572,7 @@ class RowReader:
         self._files = StoredFiles(store)
         self._boxes = Companions(self._files, read_boxes)
         self._box_weather = {
-            k: Companions(self._files, table.read) for k, table in box_tables().items()
+            k: Companions(self._files, partial(_read_numbers, k)) for k in box_tables()
         }
         self._calibration = Companions(self._files, read_entries)
         self._sweeps = Companions(self._files, _read_one_sweep)
@@ -694,6 +695,11 @@ def _parts(rows: Rows, row: int, kind: str) -> tuple[str, str] | None:
     """The folder and the name of a row's file; None where it has none."""
     column: Any = rows[f"{kind}_path"]
     return column.parts(row)
+
+
+def _read_numbers(kind: str, path: Path) -> dict[Item, BoxNumbers]:
+    """By the table's name: tables hold functions, which do not travel to other processes."""
+    return box_tables()[kind].read(path)
 
 
 def _read_one_sweep(path: Path) -> tuple[LidarSweep]:

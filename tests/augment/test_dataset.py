@@ -26,6 +26,7 @@ from batch_scenes import (
 from dataset_folders import CLEAR, FOGGY, assert_same_sample, write_scene
 from torch.utils.data import DataLoader
 
+from augment.boxes import PlacedBoxes
 from augment.dataset import (
     ClipDataset,
     MixedDataset,
@@ -34,9 +35,9 @@ from augment.dataset import (
     clean_frames,
     collate_frames,
 )
-from augment.effects.flood.flood import hidden_pixels, submerged_fraction
+from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
-from augment.jobs.files import TABLES
+from augment.jobs.files import box_tables
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.flood import Flood
 from recipes.schema import Recipe
@@ -119,11 +120,12 @@ def test_a_flooded_sample_holds_what_it_says(written: Path) -> None:
     camera, boxes = make_frame(1).cameras["front"], FakeLabels().boxes(1)
     view = fake_render(open_fake("fake:street"), camera, FLOODED, backend="")
     assert sample["water"].dtype == torch.bool
-    np.testing.assert_array_equal(sample["water"].numpy(), view.water > 0)
+    np.testing.assert_array_equal(sample["water"].numpy(), view.masks["water"] > 0)
     assert sample["surface"] == "first"
-    submerged = submerged_fraction(boxes, ORIGIN_M, LEVEL_Z_M)
+    placed = PlacedBoxes.of(boxes, ORIGIN_M)
+    submerged = submerged_fraction(placed, LEVEL_Z_M)
     np.testing.assert_array_equal(sample["boxes"]["submerged_fraction"].numpy(), submerged)
-    counted = hidden_pixels(boxes, ORIGIN_M, camera, view.flood.scene_depth_m, view.water)
+    counted = hidden_pixels(placed, camera, view.effects["flood"].depth_m, view.masks["water"])
     assert counted.marked.sum() > 0
     hidden = [h / p if p else np.nan for p, h in zip(counted.pixels, counted.marked, strict=True)]
     np.testing.assert_array_equal(sample["boxes"]["hidden_fraction"].numpy(), hidden)
@@ -290,9 +292,9 @@ def one_flooded_image(tmp_path: Path) -> Path:
     ],
 )
 def test_numbers_of_other_boxes_are_refused(one_flooded_image: Path, item, message) -> None:
-    none = TABLES["box_water"].from_json([(), (), (), ()])
+    none = box_tables()["box_water"].from_json([(), (), (), ()])
     path = one_flooded_image / "street" / "clear-009" / "labels" / "water.parquet"
-    path.write_bytes(TABLES["box_water"].to_bytes({item: none}))
+    path.write_bytes(box_tables()["box_water"].to_bytes({item: none}))
     with pytest.raises(OutputError, match=message):
         WeatherDataset(one_flooded_image)[0]
     path.write_bytes((path.parent / "boxes.parquet").read_bytes())
