@@ -95,7 +95,7 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
         gaussians = in_float64([PosedGaussians(gaussians)])[0].gaussians
     settings = RasterSettings(antialiased=antialiased)
     found = gradients(
-        gaussians, camera, backend="reference", seed=seed, settings=settings, smog=SMOGS[smog]
+        gaussians, camera, backend="reference", seed=seed, settings=settings, fog=SMOGS[smog]
     )
     assert_finite(found)
 

@@ -502,13 +502,13 @@ def test_second_derivatives_are_refused():
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        ({"smog": Fog(0.05, (0.5, 0.6, 0.7))}, "gradients through smog are asked for"),
+        ({"fog": Fog(0.05, (0.5, 0.6, 0.7))}, "gradients through fog are asked for"),
         (
             {"buffers": [RGB, "median_depth", "splat_ids"]},
             "gradients of median_depth, splat_ids are asked for",
         ),
     ],
-    ids=["smog", "median depth and splat ids"],
+    ids=["fog", "median depth and splat ids"],
 )
 def test_what_the_kernels_have_no_gradients_of(arguments, what):
     """Naming the backend raises; auto takes the definition, to the bit."""

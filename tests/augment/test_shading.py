@@ -90,12 +90,12 @@ def render(parts, view, **options):
 def test_the_kernel_shows_what_the_definition_says(smog, orthographic):
     view = camera(is_orthographic=True, fx=12.0, fy=11.0) if orthographic else camera()
     fast, slow = (
-        render(some_parts(), view, smog=smog, backend=name) for name in ("cpu", "reference")
+        render(some_parts(), view, fog=smog, backend=name) for name in ("cpu", "reference")
     )
     difference = (fast.rgb - slow.rgb).abs()
     assert float(difference.quantile(0.999)) < 1e-4
     assert float(difference.max()) < 5e-3  # an alpha at its cut-off may fall on either side
-    plain = render(some_parts(shaded=False), view, smog=smog)
+    plain = render(some_parts(shaded=False), view, fog=smog)
     assert float((fast.rgb - plain.rgb).abs().max()) > 0.1
     assert torch.equal(fast.alpha, plain.alpha)
 
