@@ -1,4 +1,4 @@
-"""What is worked out once for an owner: kept within its bytes, made once by threads, handed over."""
+"""What is worked out once for an owner: within its bytes, made once by threads, handed over."""
 
 from __future__ import annotations
 

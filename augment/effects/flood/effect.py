@@ -38,7 +38,12 @@ from augment.semantics import SemanticClass
 from recipes.flood import Flood
 from recipes.schema import Recipe
 
-PASSES = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
+PASSES: tuple[str, ...] = (
+    "flood: waves",
+    "flood: bed",
+    "flood: mirrored view",
+    "flood: screen march",
+)
 MIN_DEPTH_M = 0.05  # waves run in at least this much water
 _SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a coarse resolution
 

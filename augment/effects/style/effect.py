@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ ON_SCENE, ON_PICTURE = "style on the scene", "style on the picture"
 class PackedMaps:
     """Maps as arrays: pickled tensors would lie in memory that is gone with their process."""
 
-    arrays: tuple[np.ndarray | None, ...]
+    arrays: tuple[Any, ...]
 
     @staticmethod
     def of(maps: StyleMaps) -> PackedMaps:
@@ -37,7 +37,8 @@ class PackedMaps:
         return PackedMaps(tuple(None if t is None else t.numpy() for t in tensors))
 
     def load(self) -> StyleMaps:
-        return StyleMaps(*(None if a is None else torch.from_numpy(a.copy()) for a in self.arrays))
+        found: list[Any] = [None if a is None else torch.from_numpy(a.copy()) for a in self.arrays]
+        return StyleMaps(*found)
 
 
 class StyleEffect(Effect):
