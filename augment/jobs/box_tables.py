@@ -143,3 +143,38 @@ def share_of_pixels(marked: str) -> Callable[[Mapping[str, np.ndarray]], np.ndar
     counted, NaN of none.
     """
     return lambda columns: fraction_of(columns[marked], columns["pixels"])
+
+
+def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """float64 [B]: the box's pixels of those and of what hides it; NaN where there are neither."""
+    both = columns["pixels"] + columns["hidden_pixels"]
+    return np.where(both == 0, np.nan, columns["pixels"] / np.maximum(both, 1))
+
+
+def _modal_xyxy(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """float32 [B, 4]."""
+    return np.stack([columns[name] for name in MODAL_SIDES], axis=1).astype(np.float32)
+
+
+SIDES = ("x0", "y0", "x1", "y1")
+MODAL_SIDES = ("modal_x0", "modal_y0", "modal_x1", "modal_y1")
+# The boxes in 2D. instance: the object's number (`augment.boxes`). x0 ... y1: pixels, bounds of the
+# part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of the
+# pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those inside its
+# outline that show what stands before it. truncated_fraction: of the outline's area, outside the
+# image.
+BOXES_2D = BoxTable(
+    name="box_2d",
+    file="labels/boxes_2d.parquet",
+    kind="boxes 2d",
+    columns={
+        "instance": np.int64,
+        **dict.fromkeys((*SIDES, *MODAL_SIDES), np.float64),
+        "pixels": np.int64,
+        "hidden_pixels": np.int64,
+        "visible_fraction": np.float64,
+        "truncated_fraction": np.float64,
+    },
+    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
+    derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
+)

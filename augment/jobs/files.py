@@ -35,8 +35,7 @@ from augment.boxes import (
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.box_tables import BoxNumbers, BoxTable, BoxWeather
-from augment.jobs.layout import BOXES_2D as BOXES_2D_NAME
+from augment.jobs.box_tables import BOXES_2D, MODAL_SIDES, SIDES, BoxNumbers, BoxTable, BoxWeather
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
 from augment.labels import Boxes, LabelSource
@@ -56,41 +55,6 @@ class View(Protocol):
     # What labels are measured from, as in augment.views.
     effects: Mapping[str, Any]  # EffectView by name, of the recipe's effects
     surface: Any  # SurfaceView, None without boxes
-
-
-def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """float64 [B]: the box's pixels of those and of what hides it; NaN where there are neither."""
-    both = columns["pixels"] + columns["hidden_pixels"]
-    return np.where(both == 0, np.nan, columns["pixels"] / np.maximum(both, 1))
-
-
-def _modal_xyxy(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """float32 [B, 4]."""
-    return np.stack([columns[name] for name in _MODAL], axis=1).astype(np.float32)
-
-
-_SIDES = ("x0", "y0", "x1", "y1")
-_MODAL = ("modal_x0", "modal_y0", "modal_x1", "modal_y1")
-# The boxes in 2D. instance: the object's number (`augment.boxes`). x0 ... y1: pixels, bounds of the
-# part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of the
-# pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those inside its
-# outline that show what stands before it. truncated_fraction: of the outline's area, outside the
-# image.
-BOXES_2D = BoxTable(
-    name=BOXES_2D_NAME,
-    file="labels/boxes_2d.parquet",
-    kind="boxes 2d",
-    columns={
-        "instance": np.int64,
-        **dict.fromkeys((*_SIDES, *_MODAL), np.float64),
-        "pixels": np.int64,
-        "hidden_pixels": np.int64,
-        "visible_fraction": np.float64,
-        "truncated_fraction": np.float64,
-    },
-    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
-    derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
-)
 
 
 def box_tables() -> dict[str, BoxTable]:
@@ -133,8 +97,8 @@ def _measure_2d(
     found = find_occlusion(_grown(placed, view), camera, surface.depth_m, surface.actors, actors)
     return {
         "instance": instance.astype(np.int64),
-        **dict(zip(_SIDES, outlines.xyxy.T.copy(), strict=True)),
-        **dict(zip(_MODAL, found.xyxy.T.copy(), strict=True)),
+        **dict(zip(SIDES, outlines.xyxy.T.copy(), strict=True)),
+        **dict(zip(MODAL_SIDES, found.xyxy.T.copy(), strict=True)),
         "pixels": found.shown,
         "hidden_pixels": found.hidden,
         "truncated_fraction": outlines.truncated_fraction,

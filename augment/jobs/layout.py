@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from augment import effects
 from augment.errors import OutputError
+from augment.jobs.box_tables import BOXES_2D
 from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
@@ -43,13 +44,12 @@ def variant_name(recipe: Recipe) -> str:
 # Kinds of files whose paths a row of the manifest has, but for those of effects.
 _IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
 _LAST = "calibration"
-BOXES_2D = "box_2d"
 
 
 def path_kinds() -> tuple[str, ...]:
     """In the order of the manifest's columns: `image` and so on, its column being `image_path`."""
     tables = [e.table.name for e in reversed(effects.EFFECTS) if e.table]
-    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D, *tables, _LAST)
+    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D.name, *tables, _LAST)
 
 
 def mask_names() -> tuple[str, ...]:
@@ -74,7 +74,7 @@ def box_weather_files(recipe: Recipe) -> dict[str, str]:
     if not recipe.output.labels:
         return {}
     own = [e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None]
-    return {BOXES_2D: "labels/boxes_2d.parquet", **{table.name: table.file for table in own}}
+    return {table.name: table.file for table in (BOXES_2D, *own)}
 
 
 def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str, str | None]:
