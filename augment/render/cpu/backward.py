@@ -21,6 +21,7 @@ from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import DEPTH_EPS, RasterSettings
 from augment.render.cpu import backward_kernels
+from augment.render.cpu.blend import Frame, TileSplats
 from augment.render.cpu.driver import (
     Inputs,
     Scratch,
@@ -32,6 +33,7 @@ from augment.render.cpu.driver import (
     rank,
     sort,
 )
+from augment.render.cpu.project import Splats
 from augment.render.layout import BLOCK, V_EYE
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
@@ -68,12 +70,9 @@ class Tape:
     rgb: np.ndarray
     alpha: np.ndarray
     expected_depth: np.ndarray | None
-    records: np.ndarray
-    found: np.ndarray
-    tile_splat_ids: np.ndarray
-    tile_offsets: np.ndarray
-    size: np.ndarray
-    limits: np.ndarray
+    splats: Splats
+    listed: TileSplats
+    frame: Frame
     scratch: Scratch
 
     def backward(
@@ -93,33 +92,27 @@ class Tape:
             d_depth = d_expected_depth / weight
             inside = self.alpha > np.float32(DEPTH_EPS)
             d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
-        scratch, inputs = self.scratch, self.inputs
-        entries, slots, blocks = len(self.tile_splat_ids), inputs.slots, len(inputs.blocks)
+        scratch, inputs, listed = self.scratch, self.inputs, self.listed
+        entries, slots, blocks = len(listed.tile_splat_ids), inputs.slots, len(inputs.blocks)
         shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
-        reached = scratch.array("reached", (len(self.tile_offsets) - 1,), np.int64)
+        reached = scratch.array("reached", (len(listed.tile_offsets) - 1,), np.int64)
         sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
         touched = scratch.array("touched", (slots,), np.uint8)
         rows = scratch.array("grads", (slots, backward_kernels.GRAD), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
         counts = scratch.array("grad_counts", (blocks,), np.int64)
+        images = (self.rgb, self.alpha, depth, d_rgb, d_alpha, d_depth)
+        slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            backward_kernels.blend_backward(
-                self.records, self.tile_splat_ids, self.tile_offsets, self.size, self.limits,
-                self.rgb.reshape(-1), self.alpha.reshape(-1),
-                None if depth is None else depth.reshape(-1), d_rgb.reshape(-1),
-                d_alpha.reshape(-1), None if d_depth is None else d_depth.reshape(-1), shares,
-                reached,
-            )  # fmt: skip
+            backward_kernels.blend_backward(listed, self.frame, slopes, shares, reached)
             timer.end_stage("raster backward")
             backward_kernels.sum_shares(
-                self.tile_splat_ids, self.tile_offsets, reached, shares, _RANGES, sums, touched
+                listed.tile_splat_ids, listed.tile_offsets, reached, shares, _RANGES, sums, touched
             )
             timer.end_stage("sum backward")
             backward_kernels.project_backward(
-                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-                self.found, touched, inputs.modes, self.records, sums, rows.reshape(-1), ids,
-                counts,
-            )  # fmt: skip
+                inputs.read, self.splats, touched, sums, rows.reshape(-1), ids, counts
+            )
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
 
@@ -158,13 +151,12 @@ def record(
         timer.end_stage("bin")
         timer.count("visible", len(slots))
         timer.count("pairs", len(tile_splat_ids))
-        tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
+        listed = tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
         timer.end_stage("raster")
     return Tape(
         inputs=inputs, camera=camera, rgb=images[RGB], alpha=images[ALPHA],
-        expected_depth=images.get(EXPECTED_DEPTH), records=splats.records, found=splats.found,
-        tile_splat_ids=tile_splat_ids, tile_offsets=tile_offsets, size=tiles.size,
-        limits=tiles.limits, scratch=scratch,
+        expected_depth=images.get(EXPECTED_DEPTH), splats=splats, listed=listed,
+        frame=tiles.frame, scratch=scratch,
     )  # fmt: skip
 
 

@@ -17,13 +17,21 @@ nothing is added in an order that depends on threads.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
-from augment.render.cpu.blend import alpha_of, is_closed, remaining_transmittance, shrink
+from augment.render.cpu.blend import (
+    Images,
+    Work,
+    alpha_of,
+    is_closed,
+    remaining_transmittance,
+    shrink,
+)
 from augment.render.cpu.geometry import (
     BATCH,
     ITEMS,
@@ -53,35 +61,44 @@ GROUP = 4  # tiles a thread takes at a time
 _LN2 = np.float32(math.log(2))
 
 
+class Slopes(NamedTuple):
+    """rgb, alpha: flat images as rendered; depth: sum of weights times z. d_rgb, d_alpha, d_depth:
+    the loss's derivatives by them. depth and d_depth may be None.
+    """
+
+    rgb: Any
+    alpha: Any
+    depth: Any
+    d_rgb: Any
+    d_alpha: Any
+    d_depth: Any
+
+
 @kernel
-def blend_backward(
-    records, tile_splat_ids, tile_offsets, size, limits, rgb, alpha, depth, d_rgb, d_alpha, d_depth,
-    shares, reached,
-):  # fmt: skip
+def blend_backward(splats, frame, slopes, shares, reached):
     """dL of every list entry that the forward blend came to.
 
-    records, tile_splat_ids, tile_offsets, size, limits: as for blend.blend_tiles, in one slice.
-    rgb, alpha: flat images as rendered. depth: sum of weights times z. d_rgb, d_alpha, d_depth: the
-    loss's derivatives by them; depth and d_depth may be None. shares: float32 [entries * SHARE],
-    filled up to reached[tile] (int64, tiles) entries of each list.
+    splats, frame: as for blend.blend_tiles, in one slice. shares: float32 [entries * SHARE], filled
+    up to reached[tile] (int64, tiles) entries of each list.
     """
-    columns = (size[0] + TILE_W - 1) // TILE_W
     for group in prange((reached.size + GROUP - 1) // GROUP):
-        state = np.empty(PLANES, np.float32)
-        staged = np.empty(RECORD * BATCH, np.float32)
-        spans = np.empty(2 * BATCH, np.int32)
-        values = np.empty(2 * ITEMS, np.float32)
-        places = np.empty(2 * ITEMS, np.int32)
-        rows = np.empty(2 * STRIPS, np.int64)
+        columns, s = (frame.size[0] + TILE_W - 1) // TILE_W, slopes
+        state, rows = np.empty(PLANES, np.float32), np.empty(2 * STRIPS, np.int64)
+        staged, spans = np.empty(RECORD * BATCH, np.float32), np.empty(2 * BATCH, np.int32)
+        values, places = np.empty(2 * ITEMS, np.float32), np.empty(2 * ITEMS, np.int32)
+        work = Work(state, staged, spans, values, places, rows, None, None, None, None)
         for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
-            first, last = tile_offsets[tile], tile_offsets[tile + 1]
+            first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
             left, top = tile % columns * TILE_W, tile // columns * TILE_H
             if first < last:
-                _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth)
+                _load_tile(
+                    state, left, top, frame.size, s.rgb, s.alpha, s.depth, s.d_rgb, s.d_alpha,
+                    s.d_depth,
+                )  # fmt: skip
+            corner = (np.float32(left), np.float32(top))
             reached[tile] = _replay_list(
-                records, tile_splat_ids, first, last, np.float32(left), np.float32(top), limits,
-                state, staged, spans, values, places, rows, d_depth, shares,
-            )  # fmt: skip
+                splats, first, last, corner, frame.limits, work, slopes.d_depth, shares
+            )
 
 
 @inner()
@@ -111,11 +128,12 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
 
 
 @inner()
-def _replay_list(
-    records, tile_splat_ids, first, last, left, top, limits, state, staged, spans, values, places,
-    rows, d_depth, shares,
-):  # fmt: skip
+def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
     """Fill the shares of a tile's list as far as light reaches; returns how far that is."""
+    state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
+    values, places = work.values, work.places
+    records, ids = splats.records, splats.tile_splat_ids
+    images = Images(shares, shares, d_depth, None, None, None, None)
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
         if first < last:
@@ -125,11 +143,8 @@ def _replay_list(
             return at - first
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
-        stage(
-            records, tile_splat_ids, U(at), U(count), left, top, shares, d_depth, None, None, None,
-            None, staged,
-        )  # fmt: skip
+            v8.prefetch(records, U(ids[k]) * U(RECORD))
+        stage(records, ids, U(at), U(count), corner, images, staged)
         for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):
@@ -144,18 +159,16 @@ def _replay_list(
             for k in range(U(count)):
                 end = item + U(spans[U(BATCH) + k] - spans[k])
                 if end > item:
-                    _add_share(
-                        state, staged, values, places, k, item, end, limits, d_depth,
-                        shares, (U(at) + k) * U(SHARE),
-                    )  # fmt: skip
+                    _add_share(work, k, item, end, limits, d_depth, shares, (U(at) + k) * U(SHARE))
                 item = end
             shrink(state, strip, rows)
     return last - first
 
 
 @inner()
-def _add_share(state, staged, values, places, k, item, end, limits, d_depth, shares, share):
+def _add_share(work, k, item, end, limits, d_depth, shares, share):
     """Blend one splat into its rows of a strip, adding what each pixel says of it."""
+    state, staged, values, places = work.state, work.staged, work.values, work.places
     n = U(BATCH)
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     least, end_light = v8.splat(limits[2]), v8.splat(limits[7])
@@ -259,28 +272,24 @@ _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
 
 
 @kernel
-def project_backward(
-    addresses, sizes, views, blocks, first_ids, found, touched, modes, records, sums, grads, ids,
-    counts,
-):  # fmt: skip
+def project_backward(inputs, splats, touched, sums, grads, ids, counts):
     """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
-    addresses to first_ids, found, modes, records: as in project. touched, sums: what
-    sum_shares wrote. Block b fills rows b BLOCK to b BLOCK + counts[b] of grads
-    (float32 [B BLOCK * GRAD]) and of ids (int32, index of the Gaussian in its part).
+    inputs, splats: project_slice's. touched, sums: what sum_shares wrote. Block b fills rows
+    b BLOCK to b BLOCK + counts[b] of grads (float32 [B BLOCK * GRAD]) and of ids (int32, index of
+    the Gaussian in its part).
     """
-    for block in prange(blocks.shape[0]):
-        part = blocks[block, 0]
-        slots = np.empty(BLOCK + LANES, np.int32)
-        picked = np.empty(BLOCK + LANES, np.int32)
+    for block in prange(inputs.blocks.shape[0]):
+        part, records = inputs.blocks[block, 0], splats.records
+        view, modes, addresses = inputs.views[part], inputs.modes, inputs.addresses
+        slots, picked = np.empty(BLOCK + LANES, np.int32), np.empty(BLOCK + LANES, np.int32)
         rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
-        base = block * BLOCK
-        taken = U(0)
-        for slot in range(base, base + found[block]):
+        base, taken = block * BLOCK, U(0)
+        for slot in range(base, base + splats.found[block]):
             if touched[slot] != 0:
                 number = np.float32(records[slot * RECORD + L.SPLAT_ID]).view(np.int32)
                 slots[taken] = np.int32(slot)
-                picked[taken] = number - np.int32(first_ids[part])
+                picked[taken] = number - np.int32(inputs.first_ids[part])
                 ids[U(base) + taken] = picked[taken]
                 taken += U(1)
         counts[block] = taken
@@ -289,19 +298,18 @@ def project_backward(
         for lane in range(U(LANES)):
             slots[taken + lane] = slots[taken - U(1)]
             picked[taken + lane] = picked[taken - U(1)]
-        count, functions = sizes[part]
-        means = floats_at(addresses[part, 0], count * 3)
-        quats = floats_at(addresses[part, 1], count * 4)
-        scales = floats_at(addresses[part, 2], count * 3)
-        sh = floats_at(addresses[part, 4], count * functions * 3)
+        count, functions = inputs.sizes[part]
+        means = floats_at(addresses[part, L.A_MEANS], count * 3)
+        quats = floats_at(addresses[part, L.A_QUATS], count * 4)
+        scales = floats_at(addresses[part, L.A_SCALES], count * 3)
+        sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
         used = min(modes[L.M_FUNCTIONS], functions)
         for at in range(U(0), taken, U(LANES)):
             _color_backward(
-                sh, U(functions), U(used), means, views[part], slots, picked, at, records, sums,
-                rows,
-            )  # fmt: skip
+                sh, U(functions), U(used), means, view, slots, picked, at, records, sums, rows
+            )
             _geometry_backward(
-                means, quats, scales, views[part], slots, picked, at, modes, records, sums, rows
+                means, quats, scales, view, slots, picked, at, modes, records, sums, rows
             )
             for lane in range(min(U(LANES), taken - at)):
                 row = (U(base) + at + lane) * U(GRAD)

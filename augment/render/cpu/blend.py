@@ -9,6 +9,8 @@ Images that are not asked for are None, which the compiler turns into no code at
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import prange
 
@@ -276,36 +278,81 @@ STATE = MODELESS_STATE + MODE_PLANES * PIXELS
 CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 
 
+class Images(NamedTuple):
+    """Flat images to write, in the order of BUFFERS; None where one is not asked for."""
+
+    rgb: Any
+    alpha: Any
+    expected: Any
+    median: Any
+    ids: Any
+    mode: Any
+    overlay: Any
+
+
+class TileSplats(NamedTuple):
+    """What tiles blend. records, cuts, lights: flat, of each slot (see layout, geometry); cuts and
+    lights may be None. tile_splat_ids, tile_offsets: every tile's list of slots.
+    """
+
+    records: Any
+    cuts: Any
+    lights: Any
+    tile_splat_ids: Any
+    tile_offsets: Any
+
+
+class Frame(NamedTuple):
+    """size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), what a splat must
+    leave more of than this to be blended, 1 where rays are parallel, mode depth's floor, 1/fx^2,
+    1/fy^2, the transmittance at which a pixel is finished.
+    """
+
+    size: Any
+    limits: Any
+
+
+class Work(NamedTuple):
+    """A tile's state, and what a batch of its splats asks for: see geometry."""
+
+    state: Any
+    staged: Any
+    spans: Any
+    values: Any
+    places: Any
+    rows: Any
+    lines: Any
+    edges: Any
+    surfaces: Any
+    lit: Any
+
+
 @kernel
-def blend_tiles(
-    records, tile_splat_ids, tile_offsets, tiles, states, is_last, size, limits, rgb, alpha,
-    expected, median, ids, mode, overlay, cuts, lights,
-):  # fmt: skip
+def blend_tiles(splats, tiles, states, is_last, frame, images):
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
-    records: flat float32. tile_splat_ids, tile_offsets: lists of slots. tiles: uint8 [tiles],
-    CLOSED, OPEN or FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles
-    wait for the next slice. size: image width and height. limits: float32, alpha_max,
-    log2(ALPHA_MIN), what a splat must leave more of than this to be blended, 1 where rays are
-    parallel, mode depth's floor, 1/fx^2, 1/fy^2, the transmittance at which a pixel is finished.
-    rgb to overlay: flat images; all but alpha may be None. cuts, lights: flat, of each slot as
-    geometry has them, or None.
+    tiles: uint8 [tiles], CLOSED, OPEN or FRESH, updated. states: float32 [tiles * used part of
+    STATE], where open tiles wait for the next slice. images: all but alpha may be None.
     """
-    columns = (size[0] + TILE_W - 1) // TILE_W
-    used = states.size // tiles.size
     for group in prange((tiles.size + GROUP - 1) // GROUP):
-        state = np.empty(STATE, np.float32)
-        staged = np.empty(RECORD * BATCH, np.float32)
-        spans = np.empty(2 * BATCH, np.int32)
-        values = np.empty(2 * ITEMS, np.float32)
-        places = np.empty(2 * ITEMS, np.int32)
-        lines = np.empty(LINES, np.float32)
-        edges = np.empty(ITEMS, np.float32)
-        surfaces = np.empty(ITEMS, np.float32)
-        lit = np.empty(LIT, np.float32)
-        rows = np.empty(2 * STRIPS, np.int64)
+        size = frame.size
+        columns = (size[0] + TILE_W - 1) // TILE_W
+        used = states.size // tiles.size
+        work = Work(
+            np.empty(STATE, np.float32),
+            np.empty(RECORD * BATCH, np.float32),
+            np.empty(2 * BATCH, np.int32),
+            np.empty(2 * ITEMS, np.float32),
+            np.empty(2 * ITEMS, np.int32),
+            np.empty(2 * STRIPS, np.int64),
+            np.empty(LINES, np.float32),
+            np.empty(ITEMS, np.float32),
+            np.empty(ITEMS, np.float32),
+            np.empty(LIT, np.float32),
+        )
+        state = work.state
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
-            first, last = tile_offsets[tile], tile_offsets[tile + 1]
+            first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
             if tiles[tile] == CLOSED or (first == last and not is_last):
                 continue
             left, top = tile % columns * TILE_W, tile // columns * TILE_H
@@ -313,20 +360,18 @@ def blend_tiles(
                 _clear(state, used, size[0] - left, size[1] - top)
             else:
                 _copy(states, U(tile * used), state, U(0), U(used))
-            is_open = _blend_list(
-                records, tile_splat_ids, first, last, np.float32(left), np.float32(top), limits,
-                state, staged, spans, values, places, rows, rgb, expected, median, ids, mode,
-                overlay, cuts, lines, edges, surfaces, lights, lit,
-            )  # fmt: skip
+            corner = (np.float32(left), np.float32(top))
+            is_open = _blend_list(splats, first, last, corner, frame.limits, images, work)
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
                 tiles[tile] = OPEN
             else:
-                if mode is not None:
+                if images.mode is not None:
                     close_clusters(state, P_MODE)
                 _write_pixels(
-                    state, left, top, size, rgb, alpha, expected, median, ids, mode, overlay
-                )
+                    state, left, top, size, images.rgb, images.alpha, images.expected,
+                    images.median, images.ids, images.mode, images.overlay,
+                )  # fmt: skip
                 tiles[tile] = CLOSED
 
 
@@ -353,11 +398,10 @@ def _clear(state, used, width, height):
 
 
 @inner()
-def _blend_list(
-    records, tile_splat_ids, first, last, left, top, limits, state, staged, spans, values, places,
-    rows, rgb, expected, median, ids, mode, overlay, cuts, lines, edges, surfaces, lights, lit,
-):  # fmt: skip
+def _blend_list(splats, first, last, corner, limits, images, work):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
+    state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
+    records, ids = splats.records, splats.tile_splat_ids
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
         shrink(state, strip, rows)
@@ -366,45 +410,33 @@ def _blend_list(
             return False
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
-        stage(
-            records, tile_splat_ids, U(at), U(count), left, top,
-            rgb, expected, median, ids, mode, overlay, staged,
-        )  # fmt: skip
-        if lights is not None and rgb is not None:
-            stage_lights(lights, tile_splat_ids, U(at), U(count), lit)
-        any_cut = False
-        if cuts is not None:
-            any_cut = stage_cuts(
-                cuts, tile_splat_ids, U(at), U(count), staged, expected, mode, lines
-            )
+            v8.prefetch(records, U(ids[k]) * U(RECORD))
+        stage(records, ids, U(at), U(count), corner, images, staged)
+        if images.rgb is not None:
+            stage_lights(splats.lights, ids, U(at), U(count), work.lit)
+        has_surfaces = images.expected is not None or images.mode is not None
+        any_cut = stage_cuts(splats.cuts, ids, U(at), U(count), staged, has_surfaces, work.lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
             find_spans(staged, U(count), strip, rows, limits[1], spans)
-            items = list_items(staged, U(count), strip, spans, values, places)
+            items = list_items(staged, U(count), strip, spans, work.values, work.places)
             if items == U(0):
                 continue
-            if cuts is not None and (expected is not None or mode is not None):
-                list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
-            if cuts is not None and any_cut:
-                list_lines(lines, SHARE, U(count), strip, spans, edges)
-                _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    overlay, cuts, lines, edges, surfaces, lights, lit,
-                )  # fmt: skip
-            elif (median is not None or ids is not None or mode is not None) and _can_change(
-                state, strip, rows, median, ids, mode
-            ):
-                _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    overlay, cuts, lines, None, surfaces, lights, lit,
-                )  # fmt: skip
+            if splats.cuts is not None and has_surfaces:
+                list_lines(work.lines, SURFACE, U(count), strip, spans, work.surfaces)
+            if splats.cuts is not None and any_cut:
+                list_lines(work.lines, SHARE, U(count), strip, spans, work.edges)
+                _blend_items(work, items, limits, images, splats.cuts, splats.lights, work.edges)
+            elif (
+                images.median is not None or images.ids is not None or images.mode is not None
+            ) and _can_change(state, strip, rows, images.median, images.ids, images.mode):
+                _blend_items(work, items, limits, images, splats.cuts, splats.lights, None)
             else:
-                _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, None, None, None,
-                    overlay, cuts, lines, None, surfaces, lights, lit,
-                )  # fmt: skip
+                fewer = Images(
+                    images.rgb, images.alpha, images.expected, None, None, None, images.overlay
+                )
+                _blend_items(work, items, limits, fewer, splats.cuts, splats.lights, None)
             shrink(state, strip, rows)
     return not is_closed(rows)
 
@@ -450,14 +482,14 @@ def shrink(state, strip, rows):
 
 
 @inner()
-def _blend_items(
-    state, staged, values, places, items, limits, rgb, expected, median, ids, mode, overlay, cuts,
-    lines, edges, surfaces, lights, lit,
-):  # fmt: skip
+def _blend_items(work, items, limits, images, cuts, lights, edges):
     """Blend all items in turn. The next one's alpha is begun before this one is blended.
 
     edges: None where no splat is cut.
     """
+    state, staged, values, places = work.state, work.staged, work.values, work.places
+    rgb, expected, median, ids = images.rgb, images.expected, images.median, images.ids
+    mode, overlay, lines, lit = images.mode, images.overlay, work.lines, work.lit
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     least, end = v8.splat(limits[2]), v8.splat(limits[7])
     zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
@@ -494,7 +526,7 @@ def _blend_items(
             centre = staged[U(L.DEPTH) * n + splat]
             depth = v8.splat(centre)
             if cuts is not None:
-                depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
+                depth = surface_depth(lines, work.surfaces, splat, item, centre, limits[3])
             if expected is not None:
                 sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
                 v8.store(state, at + P_DEPTH, sums)

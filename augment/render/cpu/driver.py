@@ -66,6 +66,13 @@ class Inputs:
     arrays: list[np.ndarray]
 
     @property
+    def read(self) -> project_kernels.Parts:
+        """What kernels read of it."""
+        return project_kernels.Parts(
+            self.addresses, self.sizes, self.first_ids, self.views, self.blocks, self.modes
+        )
+
+    @property
     def slots(self) -> int:
         """Room for every Gaussian, block by block."""
         return len(self.blocks) * layout.BLOCK
@@ -246,9 +253,7 @@ def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, 
     """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
-    project_kernels.rank_splats(
-        inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, depths, histograms
-    )
+    project_kernels.rank_splats(inputs.read, depths, histograms)
     cover, counts = histograms.sum(0)
     return depths, _slice_edges(cover / (camera.width * camera.height), counts)
 
@@ -275,46 +280,34 @@ def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
     return [*edges, end]
 
 
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """What project_slice wrote."""
-
-    records: np.ndarray
-    rects: np.ndarray
-    keys: np.ndarray
-    found: np.ndarray
-    counts: np.ndarray
-    cuts: np.ndarray | None
-    lights: np.ndarray | None
-
-
 def project(
     inputs: Inputs, depths: np.ndarray, bins: tuple[int, int], tiles: Tiles, scratch: Scratch
-) -> Splats:
+) -> project_kernels.Splats:
+    """The slice's splats; cuts and lights None where nothing asks for them."""
     blocks = len(inputs.blocks)
     is_cut = bool(inputs.modes[layout.M_CLIP])
     cuts = scratch.array("cuts", (geometry.CUT * (inputs.slots if is_cut else 1),), np.float32)
     is_lit = bool(inputs.modes[layout.M_LIGHT])
     lights = (geometry.SHADING_LINES * (inputs.slots if is_lit else 1),)
     lights = scratch.array("lights", lights, np.float32)
-    splats = Splats(
+    splats = project_kernels.Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
         scratch.array("keys", (inputs.slots,), np.uint32),
         scratch.array("found", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
-        cuts if is_cut else None,
-        lights if is_lit else None,
+        cuts,
+        lights,
     )
     project_kernels.project_slice(
-        inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
-        depths.view(np.uint32), np.array(bins, np.int64), tiles.open_sums(), inputs.modes,
-        splats.records, splats.rects, splats.keys, splats.found, splats.counts, cuts, lights,
-    )  # fmt: skip
-    return splats
+        inputs.read, depths.view(np.uint32), np.array(bins, np.int64), tiles.open_sums(), splats
+    )
+    return splats._replace(cuts=cuts if is_cut else None, lights=lights if is_lit else None)
 
 
-def sort(splats: Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def sort(
+    splats: project_kernels.Splats, first_bin: int, scratch: Scratch
+) -> tuple[np.ndarray, np.ndarray]:
     """Slots nearest first (ties in index order), and their tiles in that order."""
     # Bin after bin, and in each of them block after block.
     bin_offsets = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
@@ -341,8 +334,8 @@ class Tiles:
         self._columns = -(-camera.width // layout.TILE_W)
         self._rows = -(-camera.height // layout.TILE_H)
         count = self._columns * self._rows
-        self.size = np.array([camera.width, camera.height], np.int64)
-        self.limits = np.array(
+        size = np.array([camera.width, camera.height], np.int64)
+        limits = np.array(
             [
                 settings.alpha_max,
                 math.log2(ALPHA_MIN),
@@ -355,10 +348,11 @@ class Tiles:
             ],
             np.float32,
         )
+        self.frame = blend_kernels.Frame(size, limits)
         # Alpha is always written, so that kernels come in fewer variants.
         spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
         flat = {name: image.reshape(-1) for name, image in (spare | images).items()}
-        self._images = [flat.get(name) for name in BUFFERS]
+        self._images = blend_kernels.Images(*(flat.get(name) for name in BUFFERS))
         used = _state_size(images)
         self._scratch = scratch
         self._states = scratch.array("states", (count * used,), np.float32)
@@ -382,7 +376,7 @@ class Tiles:
 
     def blend(
         self,
-        splats: Splats,
+        splats: project_kernels.Splats,
         slots: np.ndarray,
         rects: np.ndarray,
         *,
@@ -402,13 +396,22 @@ class Tiles:
                 return
 
     def blend_lists(
-        self, splats: Splats, tile_splat_ids: np.ndarray, tile_offsets: np.ndarray, *, is_last: bool
-    ) -> None:
-        """Blend every open tile's list; is_last closes them all."""
+        self,
+        splats: project_kernels.Splats,
+        tile_splat_ids: np.ndarray,
+        tile_offsets: np.ndarray,
+        *,
+        is_last: bool,
+    ) -> blend_kernels.TileSplats:
+        """Blend every open tile's list; is_last closes them all. Returns what was blended."""
+        lights = splats.lights if self._images.rgb is not None else None
+        listed = blend_kernels.TileSplats(
+            splats.records, splats.cuts, lights, tile_splat_ids, tile_offsets
+        )
         blend_kernels.blend_tiles(
-            splats.records, tile_splat_ids, tile_offsets, self.open, self._states, is_last,
-            self.size, self.limits, *self._images, splats.cuts, splats.lights,
-        )  # fmt: skip
+            listed, self.open, self._states, is_last, self.frame, self._images
+        )
+        return listed
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The lists of all splats and where each begins, however long they are."""

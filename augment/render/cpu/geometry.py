@@ -22,24 +22,24 @@ ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the sur
 
 
 @inner()
-def stage(
-    records, tile_splat_ids, at, count, left, top, rgb, expected, median, ids, mode, overlay, staged
-):
-    """Records of a batch, turned to one row a field, relative to the tile's corner."""
-    n = U(BATCH)
+def stage(records, tile_splat_ids, at, count, corner, images, staged):
+    """Records of a batch, turned to one row a field, relative to the tile's corner. images: those
+    that are not None say which fields.
+    """
+    n, (left, top) = U(BATCH), corner
     for k in range(count):
         record = U(tile_splat_ids[at + k]) * U(RECORD)
         staged[U(L.MEAN_X) * n + k] = records[record + U(L.MEAN_X)] - left
         staged[U(L.MEAN_Y) * n + k] = records[record + U(L.MEAN_Y)] - top
         for field in range(U(L.LEAN_X), U(L.BLUNT_Y + 1)):
             staged[field * n + k] = records[record + field]
-        if expected is not None or median is not None or mode is not None:
+        if images.expected is not None or images.median is not None or images.mode is not None:
             staged[U(L.DEPTH) * n + k] = records[record + U(L.DEPTH)]
-        if ids is not None:
+        if images.ids is not None:
             staged[U(L.SPLAT_ID) * n + k] = records[record + U(L.SPLAT_ID)]
-        if overlay is not None:
+        if images.overlay is not None:
             staged[U(L.IS_OVERLAY) * n + k] = records[record + U(L.IS_OVERLAY)]
-        if rgb is not None:
+        if images.rgb is not None:
             staged[U(L.RED) * n + k] = records[record + U(L.RED)]
             staged[U(L.GREEN) * n + k] = records[record + U(L.GREEN)]
             staged[U(L.BLUE) * n + k] = records[record + U(L.BLUE)]
@@ -325,13 +325,15 @@ def _depth_slope(x, y, z):
 
 
 @inner()
-def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
+def stage_cuts(cuts, tile_splat_ids, at, count, staged, has_surfaces, lines):
     """Cuts of a batch, turned to one row a number, about the tile's corner. staged: list_items'.
 
-    expected, mode: None where the lines of the surfaces are not wanted. Returns whether any splat
-    is cut: the others lie wholly on the kept side.
+    cuts: None without a clip. has_surfaces: whether the lines of the surfaces are wanted. Returns
+    whether any splat is cut: the others lie wholly on the kept side.
     """
     n, any_cut = U(BATCH), False
+    if cuts is None:
+        return any_cut
     for k in range(count):
         cut = U(tile_splat_ids[at + k]) * U(CUT)
         x, y = staged[U(L.MEAN_X) * n + k], staged[U(L.MEAN_Y) * n + k]
@@ -340,7 +342,7 @@ def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
         any_cut = any_cut or lx != np.float32(0) or ly != np.float32(0)
-        if expected is not None or mode is not None:
+        if has_surfaces:
             gx, gy = cuts[cut + U(L.C_RIGHT)], cuts[cut + U(L.C_DOWN)]
             lines[U(3) * n + k] = -gx * x - gy * y
             lines[U(4) * n + k] = gx
@@ -429,7 +431,9 @@ def light_eight(m, towards, view):
 
 @inner()
 def stage_lights(lights, tile_splat_ids, at, count, lit):
-    """Lines of a batch, turned to one row a number."""
+    """Lines of a batch, turned to one row a number; nothing where lights is None."""
+    if lights is None:
+        return
     n = U(BATCH)
     for k in range(count):
         first, most = U(tile_splat_ids[at + k]) * U(SHADING_LINES), np.float32(0)

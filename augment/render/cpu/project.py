@@ -8,6 +8,7 @@ open. Both take Gaussians eight at a time.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -39,6 +40,18 @@ from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
 from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import BIN_SHIFT, BLOCK, CUT, LANES, MAP, RECORD, TILE_H, TILE_W, U
+from augment.render.sh import (
+    C1,
+    C2_XX,
+    C2_XY,
+    C2_ZZ,
+    C3_CUBIC,
+    C3_XYZ,
+    C3_ZXX,
+    C3_ZZ,
+    C3_ZZZ,
+    SH_C0,
+)
 
 # ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then fog -----
 # Eight splats at a time for what depends on the direction alone (`prepare_colors`), one at a time
@@ -48,16 +61,10 @@ MAX_FUNCTIONS = 16
 TRANSMITTANCE = MAX_FUNCTIONS  # row of the fog's transmittance, after those of the SH functions
 COLOR_ROWS = MAX_FUNCTIONS + 1
 
-_C0 = np.float32(math.sqrt(1 / (4 * math.pi)))
-_C1 = np.float32(math.sqrt(3 / (4 * math.pi)))
-_C2_XY = np.float32(math.sqrt(15 / (4 * math.pi)))
-_C2_ZZ = np.float32(math.sqrt(5 / (16 * math.pi)))
-_C2_XX = np.float32(math.sqrt(15 / (16 * math.pi)))
-_C3_CUBIC = np.float32(math.sqrt(35 / (32 * math.pi)))
-_C3_XYZ = np.float32(math.sqrt(105 / (4 * math.pi)))
-_C3_ZZ = np.float32(math.sqrt(21 / (32 * math.pi)))
-_C3_ZZZ = np.float32(math.sqrt(7 / (16 * math.pi)))
-_C3_ZXX = np.float32(math.sqrt(105 / (16 * math.pi)))
+_C0, _C1, _C2_XY, _C2_ZZ, _C2_XX = map(np.float32, (SH_C0, C1, C2_XY, C2_ZZ, C2_XX))
+_C3_CUBIC, _C3_XYZ, _C3_ZZ, _C3_ZZZ, _C3_ZXX = map(
+    np.float32, (C3_CUBIC, C3_XYZ, C3_ZZ, C3_ZZZ, C3_ZXX)
+)
 
 
 @inner()
@@ -218,25 +225,53 @@ _ROWS = _LIGHTS + SHADING_LINES
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
+class Parts(NamedTuple):
+    """What is projected. addresses: uint64 [P, ADDRESSES], see layout. sizes: int64 [P, 2],
+    Gaussians and SH functions. first_ids: int64 [P]. views: float32 [P, VIEW]. blocks: int64
+    [B, 3], part, first and last + 1. modes: int64 [MODES].
+    """
+
+    addresses: Any
+    sizes: Any
+    first_ids: Any
+    views: Any
+    blocks: Any
+    modes: Any
+
+
+class Splats(NamedTuple):
+    """Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
+    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
+    them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
+    cuts: CUT float32 each, where modes ask for a clip; lights: LINES each, where for light.
+    """
+
+    records: Any
+    rects: Any
+    keys: Any
+    found: Any
+    counts: Any
+    cuts: Any
+    lights: Any
+
+
 @kernel
-def rank_splats(addresses, sizes, views, blocks, depths, histograms):
+def rank_splats(inputs, depths, histograms):
     """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
 
-    addresses: uint64 [P, ADDRESSES], see layout. sizes: int64 [P, 2], Gaussians and SH functions.
-    views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths: float32
-    [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own: opacity
-    times area, px^2.
+    depths: float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own:
+    opacity times area, px^2.
     """
-    runs, total = histograms.shape[0], blocks.shape[0]
+    runs = histograms.shape[0]
     for run in prange(runs):
-        picked = np.empty(LANES, np.int32)
-        areas = np.empty(LANES, np.float32)
+        addresses, total = inputs.addresses, inputs.blocks.shape[0]
         histogram = histograms[run]
+        picked, areas = np.empty(LANES, np.int32), np.empty(LANES, np.float32)
         for z_bin in range(histogram.shape[1]):
             histogram[0, z_bin] = histogram[1, z_bin] = 0
         for block in range(total * run // runs, total * (run + 1) // runs):
-            part, first, last = blocks[block]
-            count = sizes[part, 0]
+            part, first, last = inputs.blocks[block]
+            count, view = inputs.sizes[part, 0], inputs.views[part]
             means = floats_at(addresses[part, L.A_MEANS], count * 3)
             scales = floats_at(addresses[part, L.A_SCALES], count * 3)
             opacities = floats_at(addresses[part, L.A_OPACITIES], count)
@@ -244,7 +279,7 @@ def rank_splats(addresses, sizes, views, blocks, depths, histograms):
             for group in range(first, last, LANES):
                 for lane in range(LANES):
                     picked[lane] = min(group + lane, last - 1)
-                _rank_eight(means, scales, opacities, views[part], picked, depths, U(at), areas)
+                _rank_eight(means, scales, opacities, view, picked, depths, U(at), areas)
                 for lane in range(min(LANES, last - group)):
                     z = depths[at + lane]
                     if z > 0:
@@ -309,71 +344,67 @@ def _may_exceed_clip(opacity, reach, view):
 
 
 @kernel
-def project_slice(
-    addresses, sizes, views, blocks, first_ids, depth_bits, bins, open_sums, modes, records, rects,
-    keys, found, counts, cuts, lights,
-):  # fmt: skip
+def project_slice(inputs, depth_bits, bins, open_sums, splats):
     """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
-    Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
-    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
-    them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
-    depth_bits: uint32, what rank_splats wrote. first_ids: int64 [P]. open_sums: int32 [rows + 1,
-    columns + 1], number of open tiles above and left. modes: int64 [MODES]. cuts: CUT float32 each,
-    written where modes ask for a clip. lights: LINES each, where they ask for light.
+    depth_bits: uint32, what rank_splats wrote. open_sums: int32 [rows + 1, columns + 1], number of
+    open tiles above and left. splats: written.
     """
-    for block in prange(blocks.shape[0]):
-        part, first, last = blocks[block]
-        picked = np.empty(BLOCK + LANES, np.int32)
-        rows = np.empty(_ROWS * LANES, np.float32)
-        base = block * BLOCK
-        taken = _pick_bins(depth_bits, base, first, last, bins, picked)
-        count, functions = sizes[part]
-        means = floats_at(addresses[part, L.A_MEANS], count * 3)
-        quats = floats_at(addresses[part, L.A_QUATS], count * 4)
-        scales = floats_at(addresses[part, L.A_SCALES], count * 3)
-        opacities = floats_at(addresses[part, L.A_OPACITIES], count)
-        sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
-        slopes = floats_at(
-            addresses[part, L.A_SLOPES], count * 3 if views[part, L.V_LIT] > 0 else 1
-        )
-        map_count = np.int64(views[part, L.V_MAPS])
-        maps = floats_at(addresses[part, L.A_MAPS], max(map_count, 1) * MAP)
-        map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
-        used = min(modes[L.M_FUNCTIONS], functions)
-        slot = U(base)
-        for at in range(U(0), U(taken), U(LANES)):
-            _project_eight(
-                means, quats, scales, opacities, views[part], picked, at, used, modes, rows
-            )
-            for lane in range(min(U(LANES), U(taken) - at)):
-                if not _touches_open(rows, lane, open_sums, rects, slot):
-                    continue
-                splat = picked[at + lane]
-                record = slot * U(RECORD)
-                _write_record(rows, lane, first_ids[part] + splat, records, record)
-                records[record + U(L.IS_OVERLAY)] = views[part, L.V_OVERLAY]
-                if modes[L.M_COLOR]:
-                    from_sh = U(splat) * U(functions * 3)
-                    at_map = _map_of(map_rows, splat, map_count)
-                    write_color(
-                        sh, from_sh, used, maps, at_map, views[part], modes[L.M_FOG], rows, lane,
-                        records, record,
-                    )  # fmt: skip
-                if modes[L.M_CLIP]:
-                    for field in range(U(L.C_REACH + 1)):
-                        cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
-                if modes[L.M_LIGHT]:
-                    _write_lights(
-                        slopes, splat, modes[L.M_FOG], views[part], rows, lane, lights, slot
-                    )
-                keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
-                slot += U(1)
-        found[block] = slot - U(base)
-        for z_bin in range(counts.shape[1]):
-            counts[block, z_bin] = 0
-        for i in range(U(base), slot):
-            counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
+    for block in prange(inputs.blocks.shape[0]):
+        # Of its own: numba drops what a parallel loop itself writes to arrays of a record.
+        _project_block(np.int64(block), inputs, depth_bits, bins, open_sums, splats)
+
+
+@inner()
+def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
+    part, first, last = inputs.blocks[block]
+    addresses, modes, view = inputs.addresses, inputs.modes, inputs.views[part]
+    records, rects, keys, counts = splats.records, splats.rects, splats.keys, splats.counts
+    picked = np.empty(BLOCK + LANES, np.int32)
+    rows = np.empty(_ROWS * LANES, np.float32)
+    base = block * BLOCK
+    taken = _pick_bins(depth_bits, base, first, last, bins, picked)
+    count, functions = inputs.sizes[part]
+    means = floats_at(addresses[part, L.A_MEANS], count * 3)
+    quats = floats_at(addresses[part, L.A_QUATS], count * 4)
+    scales = floats_at(addresses[part, L.A_SCALES], count * 3)
+    opacities = floats_at(addresses[part, L.A_OPACITIES], count)
+    sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
+    slopes = floats_at(addresses[part, L.A_SLOPES], count * 3 if view[L.V_LIT] > 0 else 1)
+    map_count = np.int64(view[L.V_MAPS])
+    maps = floats_at(addresses[part, L.A_MAPS], max(map_count, 1) * MAP)
+    map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
+    used = min(modes[L.M_FUNCTIONS], functions)
+    slot = U(base)
+    for at in range(U(0), U(taken), U(LANES)):
+        _project_eight(means, quats, scales, opacities, view, picked, at, used, modes, rows)
+        for lane in range(min(U(LANES), U(taken) - at)):
+            if not _touches_open(rows, lane, open_sums, rects, slot):
+                continue
+            splat = picked[at + lane]
+            record = slot * U(RECORD)
+            _write_record(rows, lane, inputs.first_ids[part] + splat, records, record)
+            records[record + U(L.IS_OVERLAY)] = view[L.V_OVERLAY]
+            if modes[L.M_COLOR]:
+                from_sh = U(splat) * U(functions * 3)
+                at_map = _map_of(map_rows, splat, map_count)
+                write_color(
+                    sh, from_sh, used, maps, at_map, view, modes[L.M_FOG], rows, lane,
+                    records, record,
+                )  # fmt: skip
+            if modes[L.M_CLIP]:
+                for field in range(U(L.C_REACH + 1)):
+                    cut = rows[(U(_CUTS) + field) * U(LANES) + lane]
+                    splats.cuts[slot * U(CUT) + field] = cut
+            if modes[L.M_LIGHT]:
+                _write_lights(slopes, splat, modes[L.M_FOG], view, rows, lane, splats.lights, slot)
+            keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
+            slot += U(1)
+    splats.found[block] = slot - U(base)
+    for z_bin in range(counts.shape[1]):
+        counts[block, z_bin] = 0
+    for i in range(U(base), slot):
+        counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
 
 
 @inner()
