@@ -333,7 +333,9 @@ def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, written)
     stride]; sums, flat [H, 2, LANES]: of weight |x - y| and of weight; covered, float64 [H]: of
     alpha in the sky. Where the weight is 0, y is x.
     """
-    behind, pairs, weights, sums, covered = written
+    # One by one: unpacked, they are wrong in a parallel kernel (numba 0.68).
+    behind, pairs, weights = written[0], written[1], written[2]
+    sums, covered = written[3], written[4]
     height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
     plane = U(size[0] + 2 * PAD) * stride
     to_unit = v8.splat(np.float32(1 / 255))
