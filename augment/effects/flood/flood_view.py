@@ -18,12 +18,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
+from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
 from augment.effects.flood.screen_space import trace_screen
 from augment.effects.flood.water import is_smooth, shade_water
@@ -32,6 +34,7 @@ from augment.effects.flood.water_plane import (
     Margins,
     Window,
     falling,
+    image_coordinates,
     mirrored_camera,
     mirrored_window,
     plane_depth,
@@ -39,26 +42,36 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import wave_field
-from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput
+from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, kernels_for
 from augment.render.composite import composite_sky, sky_behind
 from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
+from augment.render.threads import kernel_threads
 from augment.sky import Sky, sample_at
 from augment.timing import timed
 
 # ---- Layers composited ---------------------------------------------------------------------------
 
 
+ROWS = 32  # image rows a thread takes at a time
+
+
 def find_water(
-    alpha: Float[Tensor, "H W"], camera: Camera
-) -> tuple[Bool[Tensor, "H W"], Float[Tensor, ""]]:
+    alpha: Float[Tensor, "H W"], camera: Camera, *, backend: str = CPU
+) -> tuple[Bool[Tensor, "H W"], float]:
     """Where a camera above the water sees it first, and the largest share of it in any pixel.
 
     alpha: of what stands before the water, which is seen where that leaves more than half.
     """
+    if kernels_for(backend, alpha) == CPU:
+        water = np.empty(tuple(alpha.shape), np.uint8)
+        shown = np.empty(len(alpha), np.float32)
+        with kernel_threads(ROWS):
+            water_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
+        return torch.from_numpy(water).view(torch.bool), float(shown.max())
     share = torch.where(falling(camera, alpha.device), 1 - alpha, 0)
-    return share > 0.5, share.max()
+    return share > 0.5, float(share.max())  # waits for the GPU: what is drawn depends on it
 
 
 def composite_water(
@@ -81,6 +94,15 @@ def composite_water(
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
         image[:dry] = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog, backend=backend)
+    if kernels_for(backend, rgb, alpha) == CPU:
+        if window.top < dry:  # rows that show both: what falls belongs to the water
+            wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
+            image[window.top : dry][wet] = rgb[window.top : dry][wet]
+        with kernel_threads(ROWS):
+            images = alpha.numpy(), color.contiguous().numpy(), image.numpy()
+            rays = _rays(window.of(camera))
+            water_kernels.composite_water(*rays, window.top, window.left, *images)
+        return image
     mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
     shared = min(max(dry - window.top, 0), len(mixed))  # rows that show both
     if shared:
@@ -97,20 +119,42 @@ def _dry_rows(camera: Camera) -> int:
     return int(dry.max()) + 1 if len(dry) else 0
 
 
+def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rise = np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
+    return *image_coordinates(camera), rise
+
+
 def merge_depths(
-    front: RenderOutput, behind: RenderOutput, window: Window, buffers: frozenset[str]
+    front: RenderOutput,
+    behind: RenderOutput,
+    window: Window,
+    buffers: frozenset[str],
+    *,
+    backend: str = CPU,
 ) -> RenderOutput:
     """Buffers of two layers as one scene's, colour excepted; behind: what the window shows through
     the water.
 
     Alpha and expected depth are what one render would give; other buffers are those of the layer
-    that covers more of the pixel.
+    that covers more of the pixel. backend: the CPU's kernels work in place.
     """
     assert front.alpha is not None and behind.alpha is not None
     requested = buffers - {RGB, ALPHA}
     if not requested:
         return RenderOutput()
     here, there = window.overlap(front.alpha)
+    if kernels_for(backend, front.alpha) == CPU:
+        values = {name: getattr(front, name) for name in (*requested, ALPHA)}
+        alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
+        with kernel_threads(ROWS):
+            for name in sorted(requested):
+                pair = (values[name].numpy()[here], getattr(behind, name).numpy()[there])
+                if name == EXPECTED_DEPTH:
+                    water_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
+                else:
+                    water_kernels.join_heavier(*alphas, *pair)
+            water_kernels.join_alpha(*alphas)
+        return RenderOutput(**values)
     alpha = front.alpha[here]
     share = (1 - alpha) * behind.alpha[there]
     total = alpha + share
@@ -230,8 +274,8 @@ def render_flooded(
     sky, fog = renderer.sky, renderer.fog
     backend, device = renderer.backend, front.alpha.device
     with timed("flood: where it is seen"):
-        water, most_shown = find_water(front.alpha, camera)
-    if float(most_shown) < 1 - HIDDEN_COVER:  # waits for the GPU: what is drawn depends on it
+        water, most_shown = find_water(front.alpha, camera, backend=backend)
+    if most_shown < 1 - HIDDEN_COVER:
         with timed("sky"):
             image = composite_sky(front.rgb, front.alpha, camera, sky, fog=fog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
@@ -269,7 +313,7 @@ def render_flooded(
         )
     with timed("flood: layers joined"):
         image = composite_water(front, camera, window, color, sky, fog, backend=backend)
-        scene = merge_depths(front, bed, bed_window, buffers)
+        scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
 
 
@@ -360,5 +404,5 @@ def _from_below(
     image = view_from_below(*layers, medium, renderer.sky, renderer.fog)
     water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
-    scene = merge_depths(front, air, whole, buffers)
+    scene = merge_depths(front, air, whole, buffers, backend=renderer.backend)
     return FloodedImage(image, scene, water)

@@ -9,6 +9,7 @@ mirrored direction, T: what comes up through the surface.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -511,6 +512,7 @@ def _end_in_image(
 # ---- The kernel's arrays -------------------------------------------------------------------------
 
 ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
+MIP_ROWS = 32
 SKY_SIZE = 256  # texels along a face where a sky that is no cube map is sampled onto one
 LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
@@ -596,13 +598,21 @@ def _image(layer: Layer | None) -> kernels.Image:
 def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
     if layer is None or not rough:
         return kernels.Mips(np.zeros(1, np.float32), np.zeros((1, 3), np.int64))
-    levels = mip_chain(stacked(layer).detach().float())
-    counts = [image.shape[0] * image.shape[1] for image in levels]
-    firsts = np.cumsum([0, *counts])
-    sizes = [(first, i.shape[1], i.shape[0]) for first, i in zip(firsts[:-1], levels, strict=True)]
-    spare = torch.zeros(layer.alpha.shape[1] + 1, 4)
-    flat = torch.cat([*(image.reshape(-1, 4) for image in levels), spare])
-    return kernels.Mips(flat.reshape(-1).numpy(), np.asarray(sizes, np.int64))
+    rgb, alpha = _array(layer.rgb), _array(layer.alpha)
+    height, width = alpha.shape
+    spare, sizes, first = width + 1, [(0, width, height)], height * width
+    while len(sizes) < MIP_LEVELS and max(height, width) > 1:
+        height, width = (height + 1) // 2, (width + 1) // 2
+        sizes.append((first, width, height))
+        first += height * width
+    mips = np.empty((first + spare, 4), np.float32)
+    mips[first:] = 0
+    images = [mips[start : start + w * h].reshape(h, w, 4) for start, w, h in sizes]
+    with kernel_threads(MIP_ROWS):
+        kernels.pack(rgb, alpha, images[0])
+        for fine, coarse in pairwise(images):
+            kernels.halve_mip(fine, coarse)
+    return kernels.Mips(mips.reshape(-1), np.asarray(sizes, np.int64))
 
 
 def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:

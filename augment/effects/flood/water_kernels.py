@@ -1,4 +1,4 @@
-"""The numba kernel that shades a water surface.
+"""Numba kernels that shade a water surface and composite a flooded view's layers.
 
 `shade` implements `water.shade_water`. It sorts a row's water pixels into a smooth and a rough list
 and works on eight pixels at a time: rough ones need three slopes and mip levels, smooth ones the
@@ -45,6 +45,108 @@ MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
 MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
 FAINT = 1 / 256  # a share of the sky that does not change what it shows through
+
+# ---- Mip levels ----------------------------------------------------------------------------------
+
+
+@kernel
+def pack(rgb, alpha, out):
+    """rgb [H, W, 3] and alpha [H, W] side by side in out [H, W, 4]."""
+    for i in prange(out.shape[0]):
+        for j in range(np.uint64(out.shape[1])):
+            for c in range(np.uint64(3)):
+                out[i, j, c] = rgb[i, j, c]
+            out[i, j, 3] = alpha[i, j]
+
+
+@kernel
+def halve_mip(image, out):
+    """Averages over 2 x 2 pixels of image [H, W, 4] into out [h, w, 4]."""
+    height, width, _ = image.shape
+    quarter = np.float32(0.25)
+    for i in prange(out.shape[0]):
+        top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
+        for j in range(np.uint64(out.shape[1])):
+            c0 = np.uint64(2) * j
+            c1 = min(c0 + np.uint64(1), np.uint64(width - 1))
+            for c in range(np.uint64(4)):
+                total = (image[top, c0, c] + image[bottom, c0, c]) + (
+                    image[top, c1, c] + image[bottom, c1, c]
+                )
+                out[i, j, c] = quarter * total
+
+
+# ---- Layers of a flooded view --------------------------------------------------------------------
+
+
+@inner()
+def _falls(u, v, rise):
+    """Vertical part of a pixel's ray, summed in the order of Camera.ray_directions."""
+    return (u * rise[0] + v * rise[1]) + rise[2]
+
+
+@kernel
+def find_water(u, v, rise, alpha, shown, water):
+    """water [H, W] uint8: 1 where a ray falls and alpha leaves more than half of it, else 0.
+
+    u [W], v [H]: image coordinates at unit depth, float64. rise [3]: world z along the camera's
+    axes. shown [H]: the largest share of a falling ray that alpha leaves in each row, 0 where none
+    falls.
+    """
+    for i in prange(alpha.shape[0]):
+        most = np.float32(0)
+        for j in range(alpha.shape[1]):
+            share = np.float32(1) - alpha[i, j]
+            share = share if _falls(u[j], v[i], rise) < 0.0 else np.float32(0)
+            most = max(most, share)
+            water[i, j] = np.uint8(share > np.float32(0.5))
+        shown[i] = most
+
+
+@kernel
+def composite_water(u, v, rise, top, left, alpha, color, rgb):
+    """rgb += (1 - alpha) color where rays fall. color: [h, w, 3], its corner at row top, column
+    left of rgb [H, W, 3]; u, v: of its own columns and rows.
+    """
+    for i in prange(color.shape[0]):
+        row = U(top + i)
+        for j in range(color.shape[1]):
+            if _falls(u[j], v[i], rise) < 0.0:
+                column = U(left + j)
+                transmittance = np.float32(1) - alpha[row, column]
+                for c in range(U(3)):
+                    rgb[row, column, c] += transmittance * color[U(i), U(j), c]
+
+
+@kernel
+def join_depth(alpha, behind_alpha, depth, behind_depth, least):
+    """Expected depth of two layers as one: means by weight, into depth [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            share = (np.float32(1) - a) * behind_alpha[i, j]
+            total = a * depth[i, j] + share * behind_depth[i, j]
+            depth[i, j] = total / max(a + share, least)
+
+
+@kernel
+def join_heavier(alpha, behind_alpha, values, behind):
+    """Values of the layer that covers more of a pixel, into values [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            if (np.float32(1) - a) * behind_alpha[i, j] > a:
+                values[i, j] = behind[i, j]
+
+
+@kernel
+def join_alpha(alpha, behind_alpha):
+    """alpha [h, w] += (1 - alpha) of the layer behind."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            alpha[i, j] = a + (np.float32(1) - a) * behind_alpha[i, j]
+
 
 # ---- The water's colour --------------------------------------------------------------------------
 
