@@ -495,11 +495,13 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
     camera: at the written resolution.
     """
-    expected = {effect.name for effect in effects.EFFECTS if effect.of(recipe) is not None}
-    if set(view.effects) != expected:
+    present = [effect for effect in effects.EFFECTS if effect.of(recipe) is not None]
+    expected = {effect.name for effect in present}
+    measured = {effect.name for effect in present if effect.table is not None}
+    if not measured <= set(view.effects) <= expected:
         raise ValueError(
-            f"the renderer returned the labels of {', '.join(view.effects) or 'no effect'} for a "
-            f"recipe with {', '.join(sorted(expected)) or 'no effect'}"
+            f"the renderer returned what labels of {_listed(sorted(view.effects)) or 'no effect'} "
+            f"are measured from, for a recipe with {_listed(sorted(expected)) or 'no effect'}"
         )
     output, masks = recipe.output, {e.mask for e in effects.EFFECTS if e.name in expected}
     requested = {

@@ -243,8 +243,8 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     slow = trace_screen(front, camera, LEVEL_M, backend="reference")
     close = torch.isclose(fast.distance, slow.distance, rtol=1e-3, atol=1e-3)
     close &= (fast.weight - slow.weight).abs() < 1e-3
-    # The definition steps over corners of pixels (a pixel of the longer axis a step): there a ray may
-    # pass a silhouette that it grazes, about one ray in 300.
+    # The definition steps over corners of pixels (a pixel of the longer axis a step): there a ray
+    # may pass a silhouette that it grazes, about one ray in 300.
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 

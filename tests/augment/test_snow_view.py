@@ -153,7 +153,7 @@ def test_the_two_shadings_agree_on_how_bright_snow_is(scene):
     """One is a detail of the other: means agree, pixels differ."""
     splat = view_of(scene, snow()).rgb.astype(int)
     pixel = view_of(scene, snow(shading="per_pixel")).rgb.astype(int)
-    lies = view_of(scene, snow()).snow == 255
+    lies = view_of(scene, snow()).masks["snow"] == 255
     assert abs(splat[lies].mean() - pixel[lies].mean()) < 10
     assert not np.array_equal(splat, pixel)
 
@@ -199,7 +199,7 @@ def test_the_plan_names_what_runs_and_what_does_not(scene):
     assert OVERLAY not in make_plan(recipe_of(), scene).buffers
     white = steps(recipe_of(snow()))
     assert white["snow: placement and layer"] and not white["snow: light per pixel"]
-    assert not white["snow: bare surface"]
+    assert not white["bare surface"]
     assert steps(recipe_of(snow(shading="per_pixel")))["snow: light per pixel"]
     bare = make_plan(recipe_of(snow(), surface="scene", depth="mode"), scene)
     assert {MODE_DEPTH, SPLAT_IDS} < bare.bare_buffers
