@@ -74,7 +74,7 @@ def _make_images(view: WeatheredBuffers, plan: Plan) -> dict[str, Tensor | None]
             semantic = _look_up(shown.raster, table, int(SemanticClass.SKY))
     if plan.instance:
         with timed("instance image"):
-            instance = _instances(shown.raster, shown.parts, device)
+            instance = _look_up(shown.raster, _instance_table(shown.parts, device), 0)
     for mask, front in fronts:
         if front is None:
             continue
@@ -111,16 +111,12 @@ def _semantic_table(parts: tuple[PosedGaussians, ...], device: torch.device) -> 
     ])  # fmt: skip
 
 
-def _instances(
-    raster: RenderOutput, parts: tuple[PosedGaussians, ...], device: torch.device
-) -> Tensor:
-    """int32 [H, W]: the instance of the part whose surface every pixel shows, else 0."""
-    assert raster.splat_ids is not None
-    ends = np.cumsum([len(part.gaussians) for part in parts])
-    table = np.stack([ends, [part.instance_id for part in parts]]).astype(np.int32)
-    own = torch.from_numpy(table).to(device)
-    part = torch.searchsorted(own[0], raster.splat_ids, right=True).clamp_max(len(parts) - 1)
-    return torch.where(_is_surface(raster), own[1][part], 0)
+def _instance_table(parts: tuple[PosedGaussians, ...], device: torch.device) -> Tensor:
+    """int32 [total splats]: the instance of every splat's part."""
+    counts = [len(part.gaussians) for part in parts]
+    own = torch.tensor([[part.instance_id for part in parts], counts], dtype=torch.int32)
+    own = own.to(device)
+    return torch.repeat_interleave(own[0], own[1], output_size=sum(counts))
 
 
 def _look_up(raster: RenderOutput, table: Tensor, none: int) -> Tensor:

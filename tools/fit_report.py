@@ -320,7 +320,8 @@ def means_by_camera(scores: Sequence[ViewScore]) -> dict[str, dict[str, float]]:
 def render_recorded(scene: Scene, camera: Camera) -> RenderedView:
     """The view at the camera's own resolution under no weather, as its camera records it."""
     plan = make_plan(_clear(), scene)
-    plan = dataclasses.replace(plan, buffers=plan.buffers | {EXPECTED_DEPTH, MEDIAN_DEPTH})
+    depths = {EXPECTED_DEPTH, MEDIAN_DEPTH}
+    plan = dataclasses.replace(plan, image_buffers=plan.image_buffers | depths)
     buffers = render_buffers(scene, camera, plan)
     raster = buffers.raster
     assert raster.alpha is not None

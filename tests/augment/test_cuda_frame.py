@@ -210,26 +210,24 @@ def check_same(got: WeatheredView, expected: WeatheredView) -> None:
     """Of two float32 backends: what is rounded may fall to either side, and single pixels may flip
     at a cut-off.
     """
-    for field in dataclasses.fields(WeatheredView):
-        a, b = getattr(got, field.name), getattr(expected, field.name)
-        assert (a is None) == (b is None), field.name
-        if not isinstance(b, np.ndarray):
-            continue
-        assert a.dtype == b.dtype and a.shape == b.shape, field.name
-        if field.name == "rgb":
+    images, others = images_of(got), images_of(expected)
+    assert images.keys() == others.keys()
+    for name, b in others.items():
+        a = images[name]
+        assert a.dtype == b.dtype and a.shape == b.shape, name
+        if name == "rgb":
             assert np.abs(a.astype(int) - b).max() <= 1
         else:
             close = np.isclose(a, b, rtol=1e-4, atol=0)
-            assert (~close).sum() <= 2, f"{field.name}: {(~close).sum()} pixels differ"
-    for name, depth in (
-        ("flood", "scene_depth_m"),
-        ("snowy", "surface_depth_m"),
-        ("smoggy", "surface_depth_m"),
-    ):
-        a, b = (getattr(getattr(view, name), depth, None) for view in (got, expected))
-        assert (a is None) == (b is None), name
-        if b is not None:
-            assert (~np.isclose(a, b, rtol=1e-4, atol=0)).sum() <= 2, name
+            assert (~close).sum() <= 2, f"{name}: {(~close).sum()} pixels differ"
+
+
+def images_of(view: WeatheredView) -> dict[str, np.ndarray]:
+    """All arrays of a view by name."""
+    fields = {field.name: getattr(view, field.name) for field in dataclasses.fields(view)}
+    depths = {f"depth of {name}": seen.depth_m for name, seen in view.effects.items()}
+    found = {**fields, **view.masks, **depths}
+    return {name: image for name, image in found.items() if isinstance(image, np.ndarray)}
 
 
 @pytest.mark.parametrize(
