@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.snow.height_map import draw_views
 from augment.geometry import rigid
 from augment.render.buffers import RGB
 from augment.render.rasterize import rasterize
@@ -84,7 +83,6 @@ def views(scene: Scene | None = None) -> dict[str, Callable[[], object]]:
         return lambda: render_view(scene, camera, recipe, backend="cuda")
 
     out: dict[str, Callable[[], object]] = {n: render(r) for n, r in RECIPES.items()}
-    out["ground is seen"] = lambda: _see_ground(scene, camera)
     out["gradients of colours"] = lambda: _learn_colors(scene, camera)
     return out
 
@@ -96,14 +94,6 @@ def _learn_colors(scene: Scene, camera: Camera) -> None:
     out = rasterize([part], camera, buffers=(RGB,), backend="cuda")
     assert out.rgb is not None
     out.rgb.sum().backward()
-
-
-def _see_ground(scene: Scene, camera: Camera) -> None:
-    """What placing snow asks of cameras."""
-    seen_from = draw_views([camera], [PosedGaussians(scene.background)], backend="cuda")
-    points = scene.background.means.double().numpy()
-    upwards = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    seen_from.see(points, upwards, np.zeros(len(points), bool))
 
 
 def small_scene() -> Scene:
