@@ -35,7 +35,7 @@ from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
 from augment.jobs.quality import resolve_quality_for
-from augment.jobs.render_job import FILE_FOLDERS, RenderJob, SceneLoader, run_job
+from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
 from augment.jobs.worker import Outcome, Renderer, WorkTimes, describe
 from augment.scene import Scene
@@ -45,8 +45,6 @@ from recipes.schema import Recipe
 # Its files go there first, to an object store those of an image as soon as it is finished; nobody
 # sees them before the block's rows follow in one step. What belongs to several images lies by
 # blocks, so that no two write one file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
-
-_OF_VARIANT = ("*/*/recipe.yaml", *(f"*/*/{folder}/*" for folder in FILE_FOLDERS))
 
 
 def _of_block() -> set[str]:
@@ -89,7 +87,8 @@ class Publisher:
         rows = read_manifest(self._folder)
         new = _renamed(rows, self._block.file_stem)
         # The recipe, and the files that it names: every block of a variant has the same.
-        of_variant = [p for glob in _OF_VARIANT for p in sorted(self._folder.glob(glob))]
+        globs = ("*/*/recipe.yaml", *(f"*/*/{folder}/*" for folder in file_folders()))
+        of_variant = [p for glob in globs for p in sorted(self._folder.glob(glob))]
         left = {p: p for p in (p.relative_to(self._folder).as_posix() for p in of_variant)}
         for kind in path_kinds():
             there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()

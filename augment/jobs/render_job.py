@@ -497,8 +497,12 @@ def _write_calibration(job_state: JobState, variant: VariantState, trajectory: s
 # ---- The files that a recipe names, beside the images: those of a style in `<variant>/style/` ----
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
-FILE_FOLDERS = tuple(path.split(".")[-1] for path, model in SECTIONS.items() if model.file_fields)
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
+
+
+def file_folders() -> tuple[str, ...]:
+    """Folders inside a variant's that hold files which recipes name."""
+    return tuple(path.split(".")[-1] for path, model in SECTIONS.items() if model.file_fields)
 
 
 def stored_names(recipe: Recipe) -> dict[str, str]:
