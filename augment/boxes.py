@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -420,6 +421,8 @@ class Instances:
     actors: their track_ids, in the scene's order. frames: numbers of all its frames. labels: None
     where there are no boxes.
     """
+
+    own_bytes: ClassVar[int] = 0  # labels are the scene's
 
     actors: tuple[str, ...]
     frames: tuple[int, ...]

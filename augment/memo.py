@@ -1,15 +1,16 @@
 """What has been worked out once for a scene, or for another object that cannot change.
 
 `memo_of(scene).get(key, make)` makes a value at its first use and keeps it while its owner lives,
-at most MAX_BYTES of values an owner: those unused for longest go first. Values that a job's worker
-processes need, too, are `put` with `shared=True`: `shared()` gives them, `update` takes them over.
+at most MAX_BYTES an owner beside the largest value: those unused for longest go first. Values that
+a job's worker processes need, too, are `put` with `shared=True`: `shared()` gives them, `update`
+takes them over.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import threading
-from collections import OrderedDict, defaultdict
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 from weakref import WeakKeyDictionary
@@ -37,23 +38,28 @@ class SceneMemo:
         self._sizes: dict[Hashable, int] = {}
         self._shared: dict[Hashable, Any] = {}
         self._lock = threading.Lock()
-        self._making: defaultdict[Hashable, threading.RLock] = defaultdict(threading.RLock)
+        self._making: dict[Hashable, threading.RLock] = {}  # keys hold objects: only while made
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """The key's value; made, and kept, where it is not known. It must not refer to its owner,
         which it would keep alive.
         """
         with self._lock:
-            making = self._making[key]
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+            making = self._making.setdefault(key, threading.RLock())
         with making:
             with self._lock:
-                if key in self._values:
-                    self._values.move_to_end(key)
+                if key in self._values:  # made while this thread waited
                     return self._values[key]
                 given = self._shared.get(key)
-            value = given.load() if isinstance(given, Stored) else given
-            value = make() if value is None else value
-            return self._keep(key, value)
+            try:
+                value = given.load() if isinstance(given, Stored) else given
+                return self._keep(key, make() if value is None else value)
+            finally:
+                with self._lock:
+                    self._making.pop(key, None)
 
     def known(self, key: Hashable) -> bool:
         """Whether `get` would make nothing."""
@@ -86,9 +92,15 @@ class SceneMemo:
         with self._lock:
             self._values[key], self._sizes[key] = value, size
             self._values.move_to_end(key)
-            total = sum(self._sizes[k] for k in self._values)
-            while total > self._max_bytes and len(self._values) > 1:
-                total -= self._sizes.pop(self._values.popitem(last=False)[0])
+            sizes = {k: self._sizes[k] for k in self._values}
+            # The largest counts nothing: one that is beyond the limit would drive out all others,
+            # and they it, frame after frame.
+            left = sum(sizes.values()) - max(sizes.values()) - self._max_bytes
+            for old in [k for k, bytes_ in sizes.items() if bytes_ and k != key]:
+                if left <= 0:
+                    break
+                del self._values[old]
+                left -= self._sizes.pop(old)
         return value
 
 
@@ -106,7 +118,12 @@ _lock = threading.Lock()
 
 
 def size_of(value: Any) -> int:
-    """Bytes of the arrays and tensors in a value: in records, tuples and mappings, too."""
+    """Bytes of the arrays and tensors in a value: in records, tuples and mappings, too. One that
+    holds what is its owner's says what it adds to that by an attribute `own_bytes`.
+    """
+    own_bytes = getattr(value, "own_bytes", None)
+    if isinstance(own_bytes, int):
+        return own_bytes
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, np.ndarray):

@@ -33,7 +33,7 @@ from augment.dataset.samples import (
     loadable,
     make_sample,
 )
-from augment.effects import share_effects
+from augment.effects import Sharing, share_effects
 from augment.errors import BackendUnavailable, OutputError
 from augment.jobs.box_tables import BoxNumbers, Item
 from augment.jobs.files import (
@@ -132,7 +132,7 @@ class SceneDataset(Dataset):
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
 
-        share_effects(scene, [self.recipe], backend=self._backend)
+        share_effects(Sharing(scene, [self.recipe], backend=self._backend))
         self._memo = memo_of(scene).shared()
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -2,46 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
-from augment.cameras import Camera
-from augment.effects.effect import Effect
+from augment.effects.effect import Effect, Sharing
 from augment.effects.flood.effect import FloodEffect
 from augment.effects.smog import SmogEffect
 from augment.effects.snow.effect import SnowEffect
 from augment.effects.style.effect import StyleEffect
-from augment.scene import Scene
-from recipes.schema import Recipe, add_section, remove_section
+from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather; then come the air before it, snow on it, water over it.
 EFFECTS: tuple[Effect, ...] = (StyleEffect(), SmogEffect(), SnowEffect(), FloodEffect())
 
 
-def share_effects(
-    scene: Scene,
-    recipes: Sequence[Recipe],
-    *,
-    cameras: Sequence[Camera] | None = None,
-    folder: Path | None = None,
-    backend: str = "auto",
-    progress: bool = False,
-    only_files: bool = False,
-) -> None:
-    """Work out what all images of the recipes share, once: it is then in the scene's memo, whose
-    `shared()` other processes take over.
-
-    cameras: all that a camera path has, or None for the scene's: never a selection, so that no
-    image depends on what else is rendered. folder: for what lies in files, which later jobs find;
-    None to keep it in memory. backend: that renders the images. progress: bars on stderr.
-    only_files: nothing but what lies in files.
+def share_effects(job: Sharing, *, only_files: bool = False) -> None:
+    """Work out what all images of a job share, once: it is then in the scene's memo, whose
+    `shared()` other processes take over. only_files: nothing but what lies in files.
 
     Raises:
         SceneError, StyleError: an effect cannot be had in this scene.
     """
     for effect in EFFECTS:
         if effect.shares_files or not only_files:
-            effect.share(scene, recipes, cameras, folder=folder, backend=backend, progress=progress)
+            effect.share(job)
 
 
 def add_effect(effect: Effect) -> None:

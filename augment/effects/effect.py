@@ -94,6 +94,22 @@ class Active:
         return next((scene for scene in relit if scene is not None), self.scene)
 
 
+@dataclass(frozen=True, eq=False)
+class Sharing:
+    """What a job will render. cameras: all that a camera path has, or None for the scene's: never a
+    selection, so that no image depends on what else is rendered. folder: for what lies in files,
+    which later jobs find; None to keep it in memory. backend: that renders the images. progress:
+    bars on stderr.
+    """
+
+    scene: Scene
+    recipes: Sequence[Recipe]
+    cameras: Sequence[Camera] | None = None
+    folder: Path | None = None
+    backend: str = "auto"
+    progress: bool = False
+
+
 @dataclass(frozen=True)
 class Sight:
     """What can be seen of a scene in one view. cameras: that look into it, between them. poses:
@@ -202,19 +218,9 @@ class Effect:
         """A scene with the light that later effects find, or None where it is as before."""
         return None
 
-    def share(
-        self,
-        scene: Scene,
-        recipes: Sequence[Recipe],
-        cameras: Sequence[Camera] | None,
-        *,
-        folder: Path | None,
-        backend: str,
-        progress: bool,
-    ) -> None:
+    def share(self, job: Sharing) -> None:
         """Prepare what a job's processes would otherwise each work out, and `put` it into the
-        scene's memo as shared. cameras: all that the scene will be seen by, None for its own.
-        folder: for what is large; None to keep it in memory. progress: a bar on stderr.
+        scene's memo as shared.
         """
 
     # ---- Once a view -----------------------------------------------------------------------------

@@ -435,9 +435,8 @@ class BlockWorker:
         if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
             with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
-                effects.share_effects(
-                    scene, [recipe], folder=folder, backend=backend, only_files=True
-                )
+                job = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
+                effects.share_effects(job, only_files=True)
 
 
 class _SceneFailed(ClimateGSError):

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 import augment
 from augment.cameras import Camera, Frame
-from augment.effects import share_effects
+from augment.effects import Sharing, share_effects
 from augment.errors import SceneError
 from augment.jobs.claims import try_claim
 from augment.jobs.files import trajectory_id
@@ -193,7 +193,7 @@ class Bench:
         """Let the scene know what images of these settings share, if that was found here."""
         if self._cameras is None and self._renderer is None:
             recipe = with_settings(self._recipe, settings)
-            share_effects(self._scene, [recipe], backend=self._backend)
+            share_effects(Sharing(self._scene, [recipe], backend=self._backend))
             memo_of(scene).update(memo_of(self._scene).shared())
 
     def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
@@ -218,7 +218,7 @@ class Bench:
         """Find for a camera path what pictures would otherwise find for the scene's own cameras."""
         if self._cameras is None or self._renderer is not None:
             return
-        share_effects(self._scene, [recipe], cameras=self._cameras, backend=self._backend)
+        share_effects(Sharing(self._scene, [recipe], self._cameras, backend=self._backend))
 
 
 def _key(settings: Mapping[str, Value]) -> tuple:

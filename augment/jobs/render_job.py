@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 import augment
 from augment.cameras import Frame
-from augment.effects import share_effects
+from augment.effects import Sharing, share_effects
 from augment.errors import OutputError
 from augment.jobs.atomic import (
     flush_folder,
@@ -785,14 +785,9 @@ class _Run:
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
         with self.times.spent("prepare"):
-            share_effects(
-                self.scene,
-                recipes,
-                cameras=cameras,
-                folder=self.job.shared_dir or self.out_dir / STATE_FOLDER,
-                backend=self.backend,
-                progress=self.progress,
-            )
+            folder = self.job.shared_dir or self.out_dir / STATE_FOLDER
+            given = (self.scene, recipes, cameras, folder, self.backend, self.progress)
+            share_effects(Sharing(*given))
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""

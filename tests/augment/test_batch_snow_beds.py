@@ -23,7 +23,7 @@ from batch_scenes import (
 
 from augment.cameras import Frame
 from augment.dataset import SceneDataset
-from augment.effects import share_effects
+from augment.effects import Sharing, share_effects
 from augment.effects.snow import support as beds
 from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
@@ -149,7 +149,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
     """One scene object, two output folders: workers of the second job need a file there."""
     scene, key = open_fake("fake:street"), ("snow support", PlacementSettings())
     for name in "ab":
-        share_effects(scene, [snowy()], folder=tmp_path / name)
+        share_effects(Sharing(scene, [snowy()], folder=tmp_path / name))
         stored = memo_of(scene).shared()[key]
         assert Path(stored.path).parent == tmp_path / name and Path(stored.path).is_file()
     assert len(placements) == 1
@@ -163,7 +163,9 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
 def test_a_folder_that_cannot_be_written_is_named(placements, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        share_effects(open_fake("fake:street"), [snowy()], folder=tmp_path / "file" / "state")
+        share_effects(
+            Sharing(open_fake("fake:street"), [snowy()], folder=tmp_path / "file" / "state")
+        )
 
 
 def test_live_samples_share_one_search(placements) -> None:

@@ -24,7 +24,7 @@ from batch_scenes import (
 )
 
 from augment.cameras import Frame
-from augment.effects import share_effects
+from augment.effects import Sharing, share_effects
 from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
 from augment.jobs.manifest import read_manifest
@@ -130,7 +130,7 @@ def test_a_camera_path_has_maps_of_its_own(searches, tmp_path: Path) -> None:
 
 def test_maps_travel_with_all_their_bits(searches, tmp_path: Path) -> None:
     scene, other, recipe = *(open_fake("fake:street") for _ in range(2)), styled(1 / 3)
-    share_effects(scene, [recipe])
+    share_effects(Sharing(scene, [recipe]))
     memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
     searches.before = pytest.fail
     again = scene_maps.style_maps(other, recipe.style)

@@ -10,6 +10,7 @@ import weakref
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import torch
 
 from augment.memo import SceneMemo, memo_of, size_of
@@ -28,10 +29,10 @@ class InFile:
 
 
 def test_a_value_is_made_once_and_forgotten_when_too_many_bytes_came_after_it():
-    memo, made = SceneMemo(max_bytes=1000), []
+    memo, made = SceneMemo(max_bytes=400), []  # for one more beside the largest
 
-    def get(key: str, count: int = 100) -> np.ndarray:
-        return memo.get((key,), lambda: made.append(key) or np.zeros(count, np.float32))
+    def get(key: str) -> np.ndarray:
+        return memo.get((key,), lambda: made.append(key) or np.zeros(100, np.float32))
 
     assert get("a") is get("a")
     get("b")
@@ -41,8 +42,32 @@ def test_a_value_is_made_once_and_forgotten_when_too_many_bytes_came_after_it():
     assert made == ["a", "b", "c"]
     get("b")
     assert made == ["a", "b", "c", "b"]
-    assert len(get("large", 10_000)) == 10_000  # kept though it is beyond the limit alone
-    assert get("large") is get("large")
+
+
+def test_a_value_beyond_the_limit_drives_out_no_other_and_none_drives_it_out():
+    memo, made = SceneMemo(max_bytes=100), []
+    for _ in range(3):
+        for key, count in (("large", 10_000), ("small", 10), ("empty", 0)):
+            memo.get((key,), lambda k=key, n=count: made.append(k) or np.zeros(n, np.float32))
+    assert made == ["large", "small", "empty"]
+
+
+def test_what_a_key_holds_goes_with_its_value():
+    memo, owner = SceneMemo(max_bytes=1), Owner()
+    memo.get(("of", owner), lambda: np.zeros(10))
+    gone = weakref.ref(owner)
+    del owner
+    for number in range(2):
+        memo.get((number,), lambda: np.zeros(20))
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_value_that_could_not_be_made_is_asked_for_again():
+    memo = SceneMemo()
+    with pytest.raises(ZeroDivisionError):
+        memo.get(("key",), lambda: 1 // 0)
+    assert memo.get(("key",), lambda: 1) == 1
 
 
 def test_none_is_a_value():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -20,6 +20,7 @@ from augment.effects.effect import (
     FrontSurface,
     InView,
     Placed,
+    Sharing,
     Sight,
     Step,
     skipped,
@@ -30,6 +31,7 @@ from augment.effects.flood.lidar import meet_flood
 from augment.effects.flood.water_plane import mirrored_camera, plane_depth, plane_window
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar.beam import Echoes
+from augment.errors import SceneError
 from augment.ground import ground_of
 from augment.jobs.box_tables import BoxTable, share_of_pixels
 from augment.memo import memo_of
@@ -73,19 +75,11 @@ class FloodEffect(Effect):
     def kernels(self, section: Flood) -> Hashable:
         return section.reflection
 
-    def share(
-        self,
-        scene: Scene,
-        recipes: Sequence[Recipe],
-        cameras: Sequence[Camera] | None,
-        *,
-        folder: Path | None,
-        backend: str,
-        progress: bool,
-    ) -> None:
+    def share(self, job: Sharing) -> None:
         """The height of the road."""
-        if any(self.of(recipe) is not None for recipe in recipes):
-            memo_of(scene).put(("ground",), ground_of(scene), shared=True)
+        if any(self.of(recipe) is not None for recipe in job.recipes):
+            with suppress(SceneError):  # which every image then says
+                memo_of(job.scene).put(("ground",), ground_of(job.scene), shared=True)
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         flood = self.of(recipe)

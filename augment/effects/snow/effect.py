@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -23,6 +22,7 @@ from augment.effects.effect import (
     EffectView,
     InView,
     Placed,
+    Sharing,
     Sight,
     Step,
     skipped,
@@ -101,22 +101,11 @@ class SnowEffect(Effect):
     def prepare(self, own: Active) -> SnowLayers:
         return snow_layers_of(own.scene, own.data, own.light, backend=own.backend)
 
-    def share(
-        self,
-        scene: Scene,
-        recipes: Sequence[Recipe],
-        cameras: Sequence[Camera] | None,
-        *,
-        folder: Path | None,
-        backend: str,
-        progress: bool,
-    ) -> None:
+    def share(self, job: Sharing) -> None:
         """Where snow can lie."""
-        found = (self.of(recipe) for recipe in recipes)
+        found = (self.of(recipe) for recipe in job.recipes)
         for settings in dict.fromkeys(placement_settings(s) for s in found if s and s.changes):
-            share_support(
-                scene, settings, cameras, folder=folder, backend=backend, progress=progress
-            )
+            share_support(job, settings)
 
     def in_view(self, own: Active, sight: Sight) -> InView:
         layers = own.prepared

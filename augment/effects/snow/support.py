@@ -17,6 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.effects.effect import Sharing
 from augment.effects.snow.cells import FLUSH, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.errors import SceneError
@@ -209,29 +210,27 @@ class StoredSupport:
         return load_support(Path(self.path), self.key)
 
 
-def share_support(
-    scene: Scene,
-    settings: PlacementSettings,
-    cameras: Sequence[Camera] | None,
-    *,
-    folder: Path | None,
-    backend: str,
-    progress: bool = False,
-) -> None:
+def share_support(job: Sharing, settings: PlacementSettings) -> None:
     """Find the support and share it, in a file of the folder where there is one, with whoever
-    takes over the scene's memo. Arguments as of `support_of`.
+    takes over the scene's memo.
     """
-    options = {"cameras": cameras, "backend": backend}
-    support = support_of(scene, settings, folder=folder, progress=progress, **options)
+    support = support_of(
+        job.scene,
+        settings,
+        cameras=job.cameras,
+        folder=job.folder,
+        backend=job.backend,
+        progress=job.progress,
+    )
     stored: SnowSupport | StoredSupport = support
-    if folder is not None:
-        every = every_camera(scene) if cameras is None else cameras
-        key = support_key(scene, every, settings, backend=backend)
-        path = support_path(folder, key)
+    if job.folder is not None:
+        every = every_camera(job.scene) if job.cameras is None else job.cameras
+        key = support_key(job.scene, every, settings, backend=job.backend)
+        path = support_path(job.folder, key)
         if not path.is_file():  # this process knew it from a job in another folder
             save_support(path, support, key)
         stored = StoredSupport(str(path), key)
-    memo = memo_of(scene)
+    memo = memo_of(job.scene)
     memo.put(("snow support", settings), stored, shared=True)
     memo.put(("snow support", settings), support)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.effect import PICTURE, SCENE, Active, Drawn, Effect, Placed, Step
+from augment.effects.effect import PICTURE, SCENE, Active, Drawn, Effect, Placed, Sharing, Step
 from augment.effects.style.color_maps import StyleMaps
 from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
 from augment.memo import memo_of
@@ -81,21 +81,12 @@ class StyleEffect(Effect):
     def relight(self, own: Active) -> Scene | None:
         return own.prepared.lighting_scene if own.data.applied_to == "scene" else None
 
-    def share(
-        self,
-        scene: Scene,
-        recipes: Sequence[Recipe],
-        cameras: Sequence[Camera] | None,
-        *,
-        folder: Path | None,
-        backend: str,
-        progress: bool,
-    ) -> None:
+    def share(self, job: Sharing) -> None:
         """The maps, so that no other process renders what they are fitted to, or reads files."""
-        found = (self.of(recipe) for recipe in recipes)
+        found = (self.of(recipe) for recipe in job.recipes)
         for style in dict.fromkeys(s for s in found if s and s.changes):
-            maps = style_maps(scene, style, cameras=cameras)
-            memo = memo_of(scene)
+            maps = style_maps(job.scene, style, cameras=job.cameras)
+            memo = memo_of(job.scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
             memo.put(("style maps", style), maps)
 

@@ -42,7 +42,7 @@ from augment.effects.style.statistics import (
     closed_maps,
 )
 from augment.errors import StyleError
-from augment.memo import memo_of
+from augment.memo import memo_of, size_of
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
@@ -271,6 +271,12 @@ class SceneStyle:
     ) -> tuple[PosedGaussians, ...]:
         """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
         return tuple(part if part.is_overlay else self._mapped(part, backend) for part in parts)
+
+    @property
+    def own_bytes(self) -> int:
+        """What it keeps beside the scene: levels, the sky, and the SH that it folds."""
+        folded = self.bare.background.sh if self.folds else None
+        return size_of((self.levels, self.sky, folded))
 
     @cached_property
     def lighting_scene(self) -> Scene:
