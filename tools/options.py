@@ -9,13 +9,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, get_args
 
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from tyro.conf import Positional, arg
 
 from tools.output import JsonFile, write_json
 
 if TYPE_CHECKING:
+    from pydantic import ModelWrapValidatorHandler
+    from pydantic_core import ErrorDetails
+
     from adapters.training_views.depth_priors import DepthPriors
     from augment.effects.style.pairs import PairWeights
     from augment.effects.style.train import StyleTrainConfig
@@ -26,6 +30,43 @@ DEPTH_KINDS = ("sparse", "metric", "relative")
 Densify = Literal["absgrad", "mcmc", "none"]
 Device = Literal["cpu", "cuda"]
 _Value = TypeVar("_Value")
+
+
+class Command(BaseModel):
+    """What a command can be asked for: each field is an option, and says which values it takes.
+
+    The docstring of each command is its help. `run` does it and returns the exit code.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _name_options(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Refuses what is wrong in the words of the command line."""
+        try:
+            return handler(values)
+        except ValidationError as error:
+            from augment.errors import ClimateGSError
+
+            raise ClimateGSError("; ".join(map(cls._refusal, error.errors()))) from None
+
+    @classmethod
+    def _refusal(cls, error: ErrorDetails) -> str:
+        text = error["msg"].removeprefix("Value error, ")
+        if not error["loc"]:  # of several options together
+            return text
+        name = str(error["loc"][0])
+        known = cls.model_fields.get(name)
+        named = [getattr(each, "name", None) for each in (known.metadata if known else ())]
+        option = next(filter(None, named), name).replace("_", "-")
+        if (rule := text.removeprefix("Input should be ")) == text:
+            return f"--{option} {text}"
+        return f"--{option} must be {rule}; got {error['input']}"
+
+    def run(self) -> int:
+        """The command. Returns its exit code."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
