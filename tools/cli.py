@@ -1,5 +1,6 @@
-"""The `climategs` command: typed functions and options, whose docstrings are the help, and how
-errors leave it. Heavy imports stay inside the functions, so that `--help` answers at once.
+"""The `climategs` command: models of options, and functions where there is little to ask for, whose
+docstrings are the help; and how errors leave it. Heavy imports stay inside the functions, so that
+`--help` answers at once.
 """
 
 from __future__ import annotations
@@ -9,14 +10,15 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import tyro
-from tyro.conf import Positional
+from pydantic import AfterValidator, Field, model_validator
+from tyro.conf import Positional, arg
 
-from tools.options import FitOptions, StyleTrainOptions
+from tools.options import Command, FitOptions, StyleTrainOptions
 from tools.output import JsonFile, check_local, write_json
 
 if TYPE_CHECKING:
@@ -24,23 +26,42 @@ if TYPE_CHECKING:
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 Links = Literal["hard", "copy"]
+Count = Annotated[int, Field(ge=1)]
 
 
-@dataclass(frozen=True)
-class RenderOptions:
-    """Render a scene under a recipe into images, depth, labels and a manifest.
+def _check_frames(text: str) -> str:
+    from recipes.schema import parse_frames
+
+    parse_frames(text)
+    return text
+
+
+def _check_shard(text: str) -> str:
+    number, slash, count = text.partition("/")
+    are_numbers = slash and number.isdecimal() and count.isdecimal() and len(text) < 20
+    if not are_numbers or not 1 <= int(number) <= int(count):
+        raise ValueError(f"{text!r}: write i/n with i from 1 to n, as in 2/8")
+    return text
+
+
+def _local(instead: str) -> AfterValidator:
+    return AfterValidator(partial(check_local, instead=instead))
+
+
+class RenderOptions(Command):
+    """Render a scene under recipes into images, depth, labels and a manifest.
 
     Run it again to go on after an interruption: what is finished is not rendered twice.
 
     Args:
-        recipe: A recipe file (.yaml), or the name of a preset; `climategs recipes` lists them.
+        recipes: Recipe files (.yaml), or names of presets; `climategs recipes` lists them.
         scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, and
             others (docs/scenes.md), or a bare path, which is recognised by what it holds.
         out: The output folder. Further recipes and scenes may go into the same one.
         frames: Frame numbers: all, 4, 0,5,9, or 0:20:2 (start:stop:step, stop excluded).
         cameras: Camera names separated by commas, or all.
         scale: Resolution relative to the recipe's.
-        variants: How many draws from the recipe's ranges. The recipe's own number by default.
+        variants: How many draws from each recipe's ranges. The recipe's own number by default.
         workers: Processes. The bits do not depend on it. One is best where a GPU draws.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
         camera_path: A JSON file of camera poses to render instead of the scene's own.
@@ -52,14 +73,20 @@ class RenderOptions:
             shared.
     """
 
-    recipe: Positional[str]
+    recipes: Positional[
+        Annotated[
+            tuple[str, ...],
+            arg(metavar="RECIPE [RECIPE ...]", help_behavior_hint="(required)"),
+            Field(min_length=1),
+        ]
+    ]
     scene: str
-    out: Path
-    frames: str = "all"
+    out: Annotated[Path, _local("`climategs generate` writes to object stores")]
+    frames: Annotated[str, AfterValidator(_check_frames)] = "all"
     cameras: str = "all"
-    scale: float = 1.0
-    variants: int | None = None
-    workers: int = 1
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    variants: Count | None = None
+    workers: Count = 1
     backend: Backend = "auto"
     camera_path: Path | None = None
     overwrite: bool = False
@@ -68,15 +95,12 @@ class RenderOptions:
     links: Links = "hard"
 
     def run(self) -> int:
-        """The command. Returns its exit code."""
-        from tools.render import render_recipe
+        from tools.render import render_recipes
 
-        check_local(self.out, "`climategs generate` writes to object stores")
-        return render_recipe(self)
+        return render_recipes(self)
 
 
-@dataclass(frozen=True)
-class GenerateOptions:
+class GenerateOptions(Command):
     """Make a dataset: many scenes under many recipes, as a job file says (docs/generate.md).
 
     Run it again to go on after an interruption, on this machine or another; what is published is
@@ -102,22 +126,23 @@ class GenerateOptions:
     job: Positional[Path | None] = None
     out: str = ""
     executor: Literal["serial", "processes", "ray"] = "processes"
-    workers: int | None = None
-    shard: str = "1/1"
+    workers: Count | None = None
+    shard: Annotated[str, AfterValidator(_check_shard)] = "1/1"
     dry_run: bool = False
     status: bool = False
     rescan: bool = False
     scratch: Path | None = None
     backend: Backend = "auto"
 
-    def run(self) -> int:
-        """The command. Returns its exit code."""
-        from augment.errors import ClimateGSError
-
+    @model_validator(mode="after")
+    def _names_job_and_out(self) -> Self:
         if not self.out:
-            raise ClimateGSError("--out is missing: a folder, or s3://bucket/path")
+            raise ValueError("--out is missing: a folder, or s3://bucket/path")
         if self.job is None and not self.status:
-            raise ClimateGSError("no job file is named: climategs generate JOB.yaml --out OUT")
+            raise ValueError("no job file is named: climategs generate JOB.yaml --out OUT")
+        return self
+
+    def run(self) -> int:
         from tools.render import generate_dataset, show_status
 
         return show_status(self.out) if self.status else generate_dataset(self)
@@ -141,13 +166,7 @@ def inspect(
     return 0
 
 
-def explain(
-    recipe: Positional[str],
-    scene: str,
-    variant: int = 0,
-    times: bool = True,
-    json_file: JsonFile = None,
-) -> int:
+class ExplainOptions(Command):
     """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
     Args:
@@ -157,12 +176,20 @@ def explain(
         times: Render a few views to measure each pass's share of the time.
         json_file: Also write the plan to this file.
     """
-    from tools.explain import explain_recipe, explanation_text
 
-    facts = explain_recipe(recipe, scene, variant, times=times)
-    print(explanation_text(facts))
-    write_json(json_file, facts)
-    return 0
+    recipe: Positional[str]
+    scene: str
+    variant: Annotated[int, Field(ge=0)] = 0
+    times: bool = True
+    json_file: JsonFile = None
+
+    def run(self) -> int:
+        from tools.explain import explain_recipe, explanation_text
+
+        facts = explain_recipe(self.recipe, self.scene, self.variant, times=self.times)
+        print(explanation_text(facts))
+        write_json(self.json_file, facts)
+        return 0
 
 
 def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> int:
@@ -185,30 +212,37 @@ def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> 
     return 0
 
 
-def sheet(
-    out: Positional[Path],
-    frame: int | None = None,
-    video_camera: str | None = None,
-    fps: float = 10.0,
-) -> int:
+class SheetOptions(Command):
     """Draw pictures of an output folder: a contact sheet, and a video of one camera.
 
     Args:
         out: A folder that `climategs render` or `generate` wrote.
-        frame: Which frame the contact sheet shows. The middle one by default.
+        recipe: Recipe names separated by commas, or all; of the video, too.
+        camera: Camera names separated by commas, or all. They stand as on the car.
+        frame: Which frames the contact sheet shows: 4, 0,5,9, or 0:20:2. The middle one by default.
         video_camera: Also write an MP4 of this camera, all variants side by side.
         fps: Frames per second of the video.
     """
-    from tools.drawing import draw_sheet, draw_video
 
-    check_local(out, "`climategs report` reads object stores; or copy the output here")
-    print(draw_sheet(out, frame))
-    if video_camera is not None:
-        print(draw_video(out, video_camera, fps))
-    return 0
+    out: Positional[
+        Annotated[Path, _local("`climategs report` reads object stores; or copy the output here")]
+    ]
+    recipe: str = "all"
+    camera: str = "all"
+    frame: Annotated[str, AfterValidator(_check_frames)] | None = None
+    video_camera: str | None = None
+    fps: Annotated[float, Field(gt=0)] = 10.0
+
+    def run(self) -> int:
+        from tools.drawing import draw_sheet, draw_video
+
+        print(draw_sheet(self.out, self.recipe, self.camera, self.frame))
+        if self.video_camera is not None:
+            print(draw_video(self.out, self.video_camera, self.fps, self.recipe))
+        return 0
 
 
-def report(out: Positional[str], html: Path | None = None, images: int = 48) -> int:
+class ReportOptions(Command):
     """Write one HTML page about an output: contents, weather, pictures, sliders, failures.
 
     It needs no network, may be sent to others as it is, and is written also while jobs are running.
@@ -219,24 +253,19 @@ def report(out: Positional[str], html: Path | None = None, images: int = 48) -> 
             where OUT is not on this machine.
         images: How many pictures the page has at most. It stays below 5 MB with any number.
     """
-    from tools.report import write_report
 
-    print(write_report(out, html, images).sentence)
-    return 0
+    out: Positional[str]
+    html: Path | None = None
+    images: int = 48
+
+    def run(self) -> int:
+        from tools.report import write_report
+
+        print(write_report(self.out, self.html, self.images).sentence)
+        return 0
 
 
-def evaluate(
-    out: Positional[str],
-    short: int = 1,
-    long: int = 7,
-    scenes: str = "all",
-    recipes: str = "all",
-    pairs: int | None = None,
-    lpips: Path | None = None,
-    lpips_heads: Path | None = None,
-    pictures: Path | None = None,
-    json_file: JsonFile = None,
-) -> int:
+class EvaluateOptions(Command):
     """Measure how consistent an output's images are: between frames, and between cameras.
 
     One image is warped into the other by the depth that was written with them, and compared where
@@ -255,22 +284,31 @@ def evaluate(
         pictures: A folder for a picture of each recipe's worst pair of each kind.
         json_file: Also write all figures to this file, those of every pair included.
     """
-    from tools.evaluate import evaluate_output, evaluation_text
 
-    facts = evaluate_output(
-        out,
-        short=short,
-        long=long,
-        scenes=None if scenes == "all" else scenes.split(","),
-        recipes=None if recipes == "all" else recipes.split(","),
-        pairs=pairs,
-        lpips=lpips,
-        lpips_heads=lpips_heads,
-        pictures=pictures,
-    )
-    print(evaluation_text(facts))
-    write_json(json_file, facts)
-    return 0
+    out: Positional[str]
+    short: Count = 1
+    long: Count = 7
+    scenes: str = "all"
+    recipes: str = "all"
+    pairs: Count | None = None
+    lpips: Path | None = None
+    lpips_heads: Path | None = None
+    pictures: Path | None = None
+    json_file: JsonFile = None
+
+    @model_validator(mode="after")
+    def _long_is_longer(self) -> Self:
+        if self.long <= self.short:
+            raise ValueError(f"--long must be above --short {self.short}; got {self.long}")
+        return self
+
+    def run(self) -> int:
+        from tools.evaluate import evaluate_output, evaluation_text
+
+        facts = evaluate_output(self)
+        print(evaluation_text(facts))
+        write_json(self.json_file, facts)
+        return 0
 
 
 def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
@@ -285,14 +323,7 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     return run_demo(out, frames)
 
 
-def export(
-    scene: Positional[str],
-    out: Path,
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat"] = "file",
-    frame: int | None = None,
-    half: bool = False,
-    overwrite: bool = False,
-) -> int:
+class ExportOptions(Command):
     """Write a scene as one file to share, or for other programs: .ply, .splat.
 
     What the kind of file cannot keep is said.
@@ -306,12 +337,31 @@ def export(
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
-    from tools.export import export_scene
 
-    return export_scene(scene, out, kind=kind, frame=frame, half=half, overwrite=overwrite)
+    scene: Positional[str]
+    out: Path
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat"] = "file"
+    frame: int | None = None
+    half: bool = False
+    overwrite: bool = False
+
+    @model_validator(mode="after")
+    def _kind_has_them(self) -> Self:
+        if self.frame is not None and self.kind not in ("ply", "splat"):
+            text = "--frame is for ply and splat, which show one moment; not for"
+            raise ValueError(f"{text} {self.kind}")
+        if self.half and self.kind != "file":
+            text = "--half is for a single scene file (--kind file); not for"
+            raise ValueError(f"{text} {self.kind}")
+        return self
+
+    def run(self) -> int:
+        from tools.export import export_scene
+
+        return export_scene(self)
 
 
-def mirror(out: Positional[Path], scene: str | None = None, links: Links = "hard") -> int:
+class MirrorOptions(Command):
     """Lay rendered images into copies of their dataset, as `render --layout source` does.
 
     Args:
@@ -319,24 +369,18 @@ def mirror(out: Positional[Path], scene: str | None = None, links: Links = "hard
         scene: Only of this scene. By default of all that the manifest names.
         links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
     """
-    from tools.export import mirror_again
 
-    check_local(out, "copy the output here")
-    return mirror_again(out, scene, links=links)
+    out: Positional[Annotated[Path, _local("copy the output here")]]
+    scene: str | None = None
+    links: Links = "hard"
+
+    def run(self) -> int:
+        from tools.export import mirror_again
+
+        return mirror_again(self.out, self.scene, links=self.links)
 
 
-def apply(
-    scene: Positional[str],
-    style: Positional[str],
-    out: Path,
-    method: Literal["mkl", "reinhard", "gscm"] = "mkl",
-    strength: float = 1.0,
-    per_region: bool = False,
-    mask: Path | None = None,
-    checkpoint: Path | None = None,
-    overwrite: bool = False,
-    json_file: JsonFile = None,
-) -> int:
+class ApplyOptions(Command):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
     Args:
@@ -352,21 +396,24 @@ def apply(
         overwrite: Replace the scene that is there.
         json_file: Also write the maps and figures to this file.
     """
-    from tools.style import apply_style
 
-    facts = apply_style(
-        scene,
-        style,
-        out,
-        method=method,
-        strength=strength,
-        per_region=per_region,
-        mask=mask,
-        checkpoint=checkpoint,
-        overwrite=overwrite,
-    )
-    write_json(json_file, facts)
-    return 0
+    scene: Positional[str]
+    style: Positional[str]
+    out: Path
+    method: Literal["mkl", "reinhard", "gscm"] = "mkl"
+    strength: float = 1.0
+    per_region: bool = False
+    mask: Path | None = None
+    checkpoint: Path | None = None
+    overwrite: bool = False
+    json_file: JsonFile = None
+
+    def run(self) -> int:
+        from tools.style import apply_style
+
+        asked = dict(self)
+        write_json(asked.pop("json_file"), apply_style(**asked))
+        return 0
 
 
 def presets(name: Positional[str | None] = None) -> int:
@@ -410,19 +457,19 @@ COMMANDS = {
     "generate": GenerateOptions,
     "fit": FitOptions,
     "inspect": inspect,
-    "explain": explain,
+    "explain": ExplainOptions,
     "recipes": recipes,
-    "sheet": sheet,
-    "report": report,
-    "evaluate": evaluate,
+    "sheet": SheetOptions,
+    "report": ReportOptions,
+    "evaluate": EvaluateOptions,
     "bench": bench,
     "demo": demo,
     "style": style,
-    "export": export,
-    "mirror": mirror,
+    "export": ExportOptions,
+    "mirror": MirrorOptions,
 }
 # Commands of commands, which take over where the first word names one.
-GROUPS = {"style": {"apply": apply, "train": StyleTrainOptions, "presets": presets}}
+GROUPS = {"style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets": presets}}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -10,8 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,7 +38,11 @@ from augment.metrics.consistency import (
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
 from tools.drawing import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
+from tools.options import names_in
 from tools.report_pictures import evenly
+
+if TYPE_CHECKING:
+    from tools.cli import EvaluateOptions
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
 KINDS = (SHORT, LONG, CAMERAS)
@@ -56,41 +59,21 @@ _COUNTS, _MOVED, _WATER = (190, 190, 190), (240, 160, 30), (60, 120, 230)
 _PARTS = {ALL: "", DRY: "without water", WATER: "water only"}
 
 
-def evaluate_output(
-    out: str | Path,
-    *,
-    short: int = 1,
-    long: int = 7,
-    scenes: Sequence[str] | None = None,
-    recipes: Sequence[str] | None = None,
-    pairs: int | None = None,
-    lpips: Path | None = None,
-    lpips_heads: Path | None = None,
-    pictures: Path | None = None,
-    progress: bool = True,
-) -> dict[str, Any]:
+def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[str, Any]:
     """The consistency of an output's images, as facts for `evaluation_text` and for JSON.
-
-    short, long: how many frame numbers apart. pairs: at most so many of each kind from each variant
-    of a scene. lpips, lpips_heads: weights (`augment.metrics.lpips.load_lpips`). pictures: a folder
-    for pictures of the worst pair of each recipe and kind.
 
     Raises:
         OutputError: nothing is finished there, a file is missing or damaged, there is no pair, or
             a picture cannot be written.
         MetricError: the weights cannot be used.
     """
-    if short < 1 or long <= short or (pairs is not None and pairs < 1):
-        raise OutputError(
-            f"expected 1 <= short < long and pairs >= 1; got short={short}, long={long}, "
-            f"pairs={pairs}"
-        )
-    network = None if lpips is None else load_lpips(lpips, lpips_heads)
-    views = Views(open_store(out), scenes, recipes)
+    out, short, long = options.out, options.short, options.long
+    network = options.lpips and load_lpips(options.lpips, options.lpips_heads)
+    views = Views(open_store(out), names_in(options.scenes), names_in(options.recipes))
     found = [
         (drive, pair)
         for drive in views.drives()
-        for pair in pairs_of(views, drive, short, long, pairs)
+        for pair in pairs_of(views, drive, short, long, options.pairs)
     ]
     if not found:
         raise OutputError(
@@ -101,14 +84,14 @@ def evaluate_output(
     shown = tqdm(found, unit="pair", disable=not progress)
     records = [_record(views, drive, pair, network) for drive, pair in shown]
     worst = _worst(records)
-    if pictures is not None:
+    if options.pictures is not None:
         for record in worst:
             name = f"{folder_name(record['recipe'])}-{record['kind']}.png"
-            write_rgb(pictures / name, pair_picture(views, record))
+            write_rgb(options.pictures / name, pair_picture(views, record))
     for record in records:
         del record["rows"]
     return {
-        "out": str(out),
+        "out": out,
         "frames_apart": {"short": short, "long": long},
         "lpips": None if network is None else network.name,
         "recipes": _summaries(records, ("recipe",)),

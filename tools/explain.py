@@ -18,7 +18,7 @@ import torch
 from adapters.base import open_scene
 from augment import effects
 from augment.cameras import Camera
-from augment.errors import SceneError
+from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of, ground_sentence
 from augment.jobs.quality import resolve_quality, resolved_recipe
 from augment.plan import Plan, make_plan, plan_view
@@ -172,6 +172,13 @@ def explain_recipe(
     without, the plan is that of reference.
     """
     template = load_recipe(recipe)
+    if variant >= template.variants:
+        raise ClimateGSError(
+            f"--variant {variant}: {recipe} has {template.variants} variants, 0 to "
+            f"{template.variants - 1}"
+            if template.variants > 1
+            else f"--variant {variant}: {recipe} has one variant, 0"
+        )
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
     is_open = resolved.quality.is_open

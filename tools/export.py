@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adapters.base import open_scene
 from adapters.detect_format import source_tree
@@ -57,8 +57,10 @@ from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.output import fill, print_note
 
+if TYPE_CHECKING:
+    from tools.cli import ExportOptions
+
 _SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
-_BAKED = ("ply", "splat")
 
 
 def recipes_for_source(
@@ -287,40 +289,23 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
         )
 
 
-def export_scene(
-    uri: str,
-    out: Path,
-    *,
-    kind: ExportKind = "file",
-    frame: int | None = None,
-    half: bool = False,
-    overwrite: bool = False,
-) -> int:
+def export_scene(options: ExportOptions) -> int:
     """Writes the scene, prints what was written and what could not be kept. Returns 0.
-
-    kind: scene (a scene folder), file (the same in one .climategs file), ply and splat (baked at a
-    frame, with cameras.json beside it), ply-parts (a folder of .ply files). A file's suffix is
-    added where it lacks; another kind's is refused. frame: at which ply and splat are baked; the
-    first without. half: of a file, about half the size at a small loss.
 
     Raises:
         SceneError: the scene cannot be opened, or has no such frame, or cannot be kept in such a
             file. OutputError: OUT holds something, or cannot be written.
     """
-    if frame is not None and kind not in _BAKED:
-        raise ClimateGSError(f"--frame is for ply and splat, which show one moment; not for {kind}")
-    if half and kind != "file":
-        raise ClimateGSError(f"--half is for a single scene file (--kind file); not for {kind}")
-    out = _named(Path(out), kind)
-    _check_out(out, kind, overwrite)
-    scene = open_scene(uri)
+    kind = options.kind
+    out = _named(options.out, kind)
+    _check_out(out, kind, options.overwrite)
+    scene = open_scene(options.scene)
     for problem in scene.problems:
         print_note(f"note: {problem}")
-    moment = _moment(scene, frame)
-    written = _write(storable(scene), out, kind, moment, half)
-    for path in written:
+    moment = _moment(scene, options.frame)
+    for path in _write(storable(scene), out, kind, moment, options.half):
         print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    for loss in export_losses(scene, kind, moment, half=half):
+    for loss in export_losses(scene, kind, moment, half=options.half):
         print(f"note: {loss}")
     return 0
 

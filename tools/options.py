@@ -38,7 +38,7 @@ class Command(BaseModel):
     The docstring of each command is its help. `run` does it and returns the exit code.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     @model_validator(mode="wrap")
     @classmethod
@@ -198,6 +198,11 @@ class FitOptions:
             **({} if self.device == "cpu" else {"device": self.device}),
             **_flat(config),
         }
+
+
+def names_in(text: str) -> tuple[str, ...] | None:
+    """Of names separated by commas; None for all."""
+    return None if text == "all" else tuple(text.split(","))
 
 
 def check_range(

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
+import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
 MAX_FAILURES = 20  # that are printed
+SILENT_S = 2.0
 JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
 
 
@@ -30,6 +35,40 @@ def print_images(result: Any, took: str) -> None:
         print_note(f"failed: {failure}")
     if (more := len(result.failures) - MAX_FAILURES) > 0:
         print_note(f"... and {more} more; the manifest has them all")
+
+
+@contextlib.contextmanager
+def compiling_noted(*, on_gpu: bool = False) -> Iterator[None]:
+    """Says that kernels are compiled before the first of them is, and at the end how long it took.
+
+    What lies in numba's cache is loaded in silence. Triton does not tell beforehand: on a GPU what
+    takes longer than SILENT_S is taken to compile.
+    """
+    from numba.core.event import Event, Listener, install_listener
+
+    class Announcer(Listener):
+        has_spoken = False
+
+        def on_start(self, event: Event | None = None) -> None:
+            if not self.has_spoken:
+                self.has_spoken = True
+                print_note("compiling kernels (once; kept for the next run) ...")
+
+        def on_end(self, event: Event) -> None:
+            pass
+
+    announcer, started = Announcer(), time.perf_counter()
+    timer = threading.Timer(SILENT_S, announcer.on_start)
+    timer.daemon = True
+    if on_gpu:
+        timer.start()
+    try:
+        with install_listener("numba:compile", announcer):
+            yield
+    finally:
+        timer.cancel()
+    if announcer.has_spoken:
+        print_note(f"compiled the kernels in {time.perf_counter() - started:.1f} s")
 
 
 def fill(template: str, **facts: Any) -> str:
@@ -61,7 +100,7 @@ def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) ->
         print_note(f"wrote {path}")
 
 
-def check_local(out: Path, instead: str) -> None:
+def check_local(out: Path, instead: str) -> Path:
     """Refuse `s3://bucket/path` where a folder is meant: as a path it would be a folder `s3:` here.
 
     instead: what to do, for the message.
@@ -76,6 +115,7 @@ def check_local(out: Path, instead: str) -> None:
         raise OutputError(
             f"{out} is not on this machine, and this command needs a folder that is; {instead}"
         )
+    return out
 
 
 def check_scene_out(out: Path, *, may_replace: bool, why: str = "") -> None:

@@ -50,7 +50,8 @@ from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video
 from tools.export import mirror_outputs, recipes_for_source
-from tools.output import fill, print_images, print_note
+from tools.options import names_in
+from tools.output import compiling_noted, fill, print_images, print_note
 
 if TYPE_CHECKING:
     from tools.cli import GenerateOptions, RenderOptions
@@ -63,32 +64,29 @@ SIZE = 32  # pixels a side
 ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
 
-def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
-    """Compile the kernels that the recipes take, or load them; seconds it took."""
+def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> None:
+    """Compile the kernels that the recipes take, or load them."""
     if not renders_on_gpu(backend):
-        seconds = cpu.warm_up()
-        started = time.perf_counter()
+        cpu.warm_up()
         _warm_recipes(recipes)
-        return seconds + time.perf_counter() - started
-    if is_interpreted():  # there is nothing to compile, and drawing takes long
-        return 0.0
-    started = time.perf_counter()
-    _warm_recipes(recipes, CUDA)
-    return time.perf_counter() - started
+    elif not is_interpreted():  # there is nothing to compile then, and drawing takes long
+        _warm_recipes(recipes, CUDA)
 
 
-def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
+def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
     """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
 
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
     """
-    if not renders_on_gpu(backend):
-        return warm_up(recipes)
-    started = time.perf_counter()
-    process = multiprocessing.get_context("spawn").Process(target=warm_up, args=(recipes, backend))
-    process.start()
-    process.join()
-    return time.perf_counter() - started
+    on_gpu = renders_on_gpu(backend)
+    with compiling_noted(on_gpu=on_gpu):
+        if not on_gpu:
+            warm_up(recipes)
+            return
+        spawn = multiprocessing.get_context("spawn")
+        process = spawn.Process(target=warm_up, args=(recipes, backend))
+        process.start()
+        process.join()
 
 
 @contextlib.contextmanager
@@ -194,11 +192,10 @@ def generate_dataset(options: GenerateOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
     job, out, backend = options.job, options.out, options.backend
     assert job is not None
-    if options.workers is not None and options.workers < 1:
-        raise ClimateGSError(f"--workers must be 1 or more; got {options.workers}")
     requested = load_job(job)
     recipes = load_job_recipes(requested, job.parent)
     store = open_store(out)
+    number, count = map(int, options.shard.split("/"))
     setup = WorkSetup(
         store_uri=out if store.local_dir is None else store.uri,
         scratch=options.scratch or default_scratch(out),
@@ -211,7 +208,7 @@ def generate_dataset(options: GenerateOptions) -> int:
         setup,
         executor=options.executor,
         workers=options.workers,
-        shard=parse_shard(options.shard),
+        shard=(number, count),
         rescan=options.rescan,
     )
     if options.dry_run:
@@ -221,9 +218,7 @@ def generate_dataset(options: GenerateOptions) -> int:
     store.write(probe, b"")
     store.delete([probe])
     with ended_by_sigterm():
-        result = run_generate(
-            task, prepare=lambda recipes: _note_compiled(warm_up_for_workers(recipes, backend))
-        )
+        result = run_generate(task, prepare=lambda recipes: warm_up_for_workers(recipes, backend))
     print_images(result, _duration(result.seconds))
     if shares := shares_of(result.timings):
         print(shares.sentence)
@@ -245,19 +240,6 @@ def show_status(out: str) -> int:
     for status in found:
         print(_status_text(status))
     return 0 if all(_is_done(status) for status in found) else 1
-
-
-def parse_shard(text: str) -> tuple[int, int]:
-    """`2/8`, the second of eight.
-
-    Raises:
-        ClimateGSError: the text is something else.
-    """
-    number, slash, count = text.partition("/")
-    are_numbers = slash and number.isdecimal() and count.isdecimal() and len(text) < 20
-    if not are_numbers or not 1 <= int(number) <= int(count):
-        raise ClimateGSError(f"--shard {text!r}: write i/n with i from 1 to n, as in 2/8")
-    return int(number), int(count)
 
 
 def _dry_run(job: GenerateJob) -> int:
@@ -303,11 +285,6 @@ def _is_done(status: JobStatus) -> bool:
     return total.published == total.planned and not total.in_failed_blocks and not status.unusable
 
 
-def _note_compiled(seconds: float) -> None:
-    if seconds > 1:
-        print_note(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
-
-
 @contextlib.contextmanager
 def ended_by_sigterm() -> Iterator[None]:
     """Let a scheduler's SIGTERM end the job as Ctrl-C does."""
@@ -336,12 +313,13 @@ def _size(count: float) -> str:
     return f"{count / 1000**step:.1f} {steps[step]}"
 
 
-def render_recipe(options: RenderOptions) -> int:
+def render_recipes(options: RenderOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
     out, backend = options.out, options.backend
-    recipes = resolve_variants(options.recipe, options.variants, options.scale)
+    recipes = resolve_recipes(options.recipes, options.variants, options.scale)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
-    _note_compiled(warm_up(tried, backend))
+    with compiling_noted(on_gpu=renders_on_gpu(backend)):
+        warm_up(tried, backend)
     scene = open_scene(options.scene)
     if options.camera_path is None:
         check_frames(scene)
@@ -360,11 +338,7 @@ def render_recipe(options: RenderOptions) -> int:
     recipes = [_with_quality(resolved, scene, options, path) for resolved in recipes]
     for resolved in recipes:
         make_plan(resolved, scene)  # refuse once, not for every image
-    try:
-        pattern = parse_frames(options.frames)
-    except ValueError as error:
-        raise ClimateGSError(f"--frames {error}") from None
-    chosen = pattern.select([frame.index for frame in scene.frames])
+    chosen = parse_frames(options.frames).select([frame.index for frame in scene.frames])
     notes = lidar_notes(recipes)
     labelled = SceneIndex.of(scene, path).labelled
     asked = labelled if chosen is None else labelled.intersection(chosen)
@@ -376,7 +350,7 @@ def render_recipe(options: RenderOptions) -> int:
         recipes=recipes,
         out_dir=out,
         frames=chosen,
-        cameras=None if options.cameras == "all" else tuple(options.cameras.split(",")),
+        cameras=names_in(options.cameras),
         camera_path=path,
         workers=options.workers,
         backend=backend,
@@ -400,18 +374,28 @@ def render_recipe(options: RenderOptions) -> int:
     return 1 if result.failed else 0
 
 
-def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.0) -> list[Recipe]:
-    """The recipe's variants in numbers, at `scale` times the recipe's resolution.
+def resolve_recipes(
+    names: Sequence[str], variants: int | None = None, scale: float = 1.0
+) -> list[Recipe]:
+    """The recipes' variants in numbers, at `scale` times each recipe's resolution.
 
     Raises:
-        RecipeError: the recipe is invalid, or scaled beyond its limits.
+        RecipeError: a recipe is invalid, or scaled beyond its limits.
+        ClimateGSError: two would write to the same folder.
     """
-    template = load_recipe(recipe)
-    count = template.variants if variants is None else variants
-    if count < 1:
-        raise ClimateGSError(f"--variants must be >= 1; got {count}")
-    resolved = [template.resolve(number) for number in range(count)]
-    return [scaled_recipe(r, scale) for r in resolved]
+    resolved, known = [], dict[str, str]()
+    for asked in names:
+        template = load_recipe(asked)
+        if template.name in known:
+            raise ClimateGSError(
+                f"the recipes {known[template.name]} and {asked} are both called "
+                f"{template.name!r} and would write to the same folders: leave one out, or give "
+                f"it another name"
+            )
+        known[template.name] = asked
+        count = template.variants if variants is None else variants
+        resolved += [scaled_recipe(template.resolve(number), scale) for number in range(count)]
+    return resolved
 
 
 def _with_quality(

@@ -1,6 +1,7 @@
 """The `climategs` command as a user runs it, on a scene small enough to be quick."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from augment.files.ply import write_ply
 from augment.scene import Gaussians
 from recipes.style import style_preset_names
 from tools.cli import main
-from tools.render import resolve_variants
+from tools.render import resolve_recipes
 
 FOG = """
 version: 1
@@ -116,6 +117,18 @@ def test_a_flood_asks_for_metres_and_gravity(scene_uri, tmp_path, capsys):
     assert "up=" in message and "scale=" in message and not out.exists()
 
 
+def test_render_takes_several_recipes(scene_uri, recipe, tmp_path, capsys):
+    out = ["--scene", scene_uri, "--out", str(tmp_path / "out"), "--no-sheet", "--frames", "1"]
+    assert main(["render", "clear", recipe, *out, "--variants", "2"]) == 0
+    written = {path.parts[-4] for path in (tmp_path / "out").glob("*/*/images/*/*.png")}
+    assert written == {"clear-000", "clear-001", "fog-000", "fog-001"}
+    (tmp_path / "others").mkdir()
+    other = shutil.copy(recipe, tmp_path / "others")
+    for again in (recipe, str(other)):
+        assert main(["render", recipe, again, *out]) == 2
+        assert f"{recipe} and {again} are both called 'fog'" in capsys.readouterr().err
+
+
 def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
     out = tmp_path / "out"
     arguments = ["render", recipe, "--scene", scene_uri, "--out", str(out), "--variants", "1"]
@@ -181,7 +194,13 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         ([*here, "--frames", "9"], "no frame 9"),
         ([*here, "--cameras", "q"], "no camera q"),
         ([*here, "--scale", "99"], "a scale of 99"),
-        ([*here, "--variants", "0"], "--variants"),
+        ([*here, "--scale", "nan"], "--scale must be a finite number; got nan"),
+        ([*here, "--variants", "0"], "--variants must be greater than or equal to 1; got 0"),
+        ([*here, "--workers", "0"], "--workers must be"),
+        (["explain", "clear", "--scene", scene_uri, "--variant", "9"], "clear has one variant, 0"),
+        (["evaluate", out[1], "--short", "7"], "--long must be above --short 7; got 7"),
+        (["export", scene_uri, *out, "--frame", "4"], "--frame is for ply and splat"),
+        (["export", scene_uri, *out, "--kind", "ply", "--half"], "--half is for a single scene"),
         (["sheet", out[1]], "manifest.parquet does not exist"),
         (["inspect", scene_uri, "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts"),
         (["style", "presets", "dawn-mits"], "dawn-mist"),
@@ -227,8 +246,8 @@ def test_a_defect_keeps_its_traceback(monkeypatch):
 
 
 def test_scale_is_recorded_in_the_recipe(recipe):
-    (half, _) = resolve_variants(recipe, scale=0.5)
-    (whole, _) = resolve_variants(recipe)
+    (half, _) = resolve_recipes([recipe], scale=0.5)
+    (whole, _) = resolve_recipes([recipe])
     assert half.render.scale == 0.5 and half.hash != whole.hash
     assert half.weather == whole.weather
 
@@ -239,7 +258,7 @@ def test_help_loads_neither_torch_nor_the_kernels():
         "import sys; from tools.cli import main\n"
         "try: main(['--help'])\n"
         "except SystemExit: pass\n"
-        "loaded = {'torch', 'numba', 'numpy', 'cv2', 'pyarrow', 'pydantic'} & set(sys.modules)\n"
+        "loaded = {'torch', 'numba', 'numpy', 'cv2', 'pyarrow'} & set(sys.modules)\n"
         "sys.exit(f'loaded {loaded}' if loaded else 0)"
     )
     root = Path(__file__).resolve().parents[2]

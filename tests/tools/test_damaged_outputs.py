@@ -21,6 +21,7 @@ from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import METADATA_KEY
 from recipes.flood import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
+from tools.cli import EvaluateOptions
 from tools.drawing import draw_sheet
 from tools.evaluate import evaluate_output
 from tools.report import write_report
@@ -51,10 +52,14 @@ def samples(out: Path) -> None:
         files[index]
 
 
+def evaluated(out: Path) -> None:
+    evaluate_output(EvaluateOptions(out=str(out), long=2, pairs=1), progress=False)
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "sheet": draw_sheet,
     "report": lambda out: write_report(out, images=2),
-    "evaluate": lambda out: evaluate_output(str(out), long=2, pairs=1, progress=False),
+    "evaluate": evaluated,
     "dataset": samples,
 }
 

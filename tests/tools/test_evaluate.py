@@ -19,7 +19,7 @@ from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
 from recipes.schema import Output
-from tools.cli import evaluate
+from tools.cli import EvaluateOptions
 from tools.evaluate import evaluate_output
 from tools.output import write_json
 
@@ -30,6 +30,10 @@ FLICKER = 8 / 255
 
 def camera_of(name, frame):
     return driving_camera(frame, name=name, yaw=CAMERAS[name])
+
+
+def measure(out, **options):
+    return evaluate_output(EvaluateOptions(out=str(out), **options), progress=False)
 
 
 @functools.cache
@@ -96,7 +100,7 @@ def walls(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def facts(walls):
-    return evaluate_output(walls, progress=False)
+    return measure(walls)
 
 
 def test_a_clean_wall_has_the_errors_of_its_files(facts):
@@ -135,14 +139,15 @@ def test_command(walls, tmp_path, capsys):
     generator = torch.Generator().manual_seed(1)
     tensors = {n: torch.randn(s, generator=generator).abs() / 50 for n, s in shapes.items()}
     save_file(tensors, tmp_path / "alex.safetensors")
-    code = evaluate(
-        str(walls),
+    options = EvaluateOptions(
+        out=str(walls),
         pairs=2,
         recipes="flood",
         lpips=tmp_path / "alex.safetensors",
         pictures=tmp_path / "worst",
         json_file=tmp_path / "facts.json",
     )
+    code = options.run()
     out = capsys.readouterr().out
     assert code == 0
     assert "1 frame apart" in out and "7 frames apart" in out and "Neighbouring cameras" in out
@@ -162,27 +167,25 @@ def test_command(walls, tmp_path, capsys):
 
 def test_frames_that_are_not_consecutive_have_no_pairs(tmp_path):
     write_walls(tmp_path / "out", frames=(0, 2, 4))
-    facts = evaluate_output(tmp_path / "out", progress=False)
+    facts = measure(tmp_path / "out")
     clear = facts["recipes"][0]
     assert clear["short"] is None and clear["long"] is None and clear["cameras"]["pairs"] == 3
-    two = evaluate_output(tmp_path / "out", short=2, long=4, progress=False)["recipes"][0]
+    two = measure(tmp_path / "out", short=2, long=4)["recipes"][0]
     assert two["short"]["pairs"] + two["short"]["left_out"] == 6
     write_json(tmp_path / "f.json", facts)  # None and numbers only
 
 
 def test_errors_say_what_to_do(walls, tmp_path):
     with pytest.raises(OutputError, match="nothing in it is finished yet"):
-        evaluate_output(tmp_path)
+        measure(tmp_path)
     with pytest.raises(OutputError, match=r"no recipe \['snow'\]; finished are: clear, flood"):
-        evaluate_output(walls, recipes=["snow"])
-    with pytest.raises(OutputError, match="1 <= short < long"):
-        evaluate_output(walls, short=7, long=7)
+        measure(walls, recipes="snow")
     write_walls(tmp_path / "flat", frames=(0, 1), depth=False)
     with pytest.raises(OutputError, match=r"has no depth images.*depth: median"):
-        evaluate_output(tmp_path / "flat", progress=False)
+        measure(tmp_path / "flat")
     one = tmp_path / "one"
     row = make_row("wall", "clear", 0, 0, "ahead", width=64, height=48)
     write_image(one, row)
     write_manifest(one, rows_to_table([row]))
     with pytest.raises(OutputError, match="no two images to compare"):
-        evaluate_output(one, progress=False)
+        measure(one)

@@ -10,18 +10,15 @@ import pytest
 from augment.errors import ClimateGSError
 from augment.jobs.atomic import write_atomic
 from tools.cli import GenerateOptions, main
-from tools.render import ended_by_sigterm, generate_dataset, parse_shard
-
-
-def test_shards() -> None:
-    assert parse_shard("1/1") == (1, 1) and parse_shard("07/8") == (7, 8)
+from tools.render import ended_by_sigterm, generate_dataset
 
 
 def test_what_is_no_shard() -> None:
+    assert GenerateOptions(out="o", status=True, shard="07/8")
     for text in ("", "1", "/", "0/3", "4/3", "-1/3", "1/3/5", "a/b", "1 of 3", "1/", "1.0/2",
                  "1/" + "9" * 5000):  # fmt: skip
         with pytest.raises(ClimateGSError, match="write i/n with i from 1 to n, as in 2/8"):
-            parse_shard(text)
+            GenerateOptions(out="o", status=True, shard=text)
 
 
 def test_sigterm_is_as_ctrl_c() -> None:
@@ -38,7 +35,7 @@ def test_a_job_whose_scenes_cannot_be_opened(tmp_path: Path, capsys: pytest.Capt
     said = capsys.readouterr().err
     assert "none of its scenes can be used" in said and str(tmp_path / "missing") in said
     with pytest.raises(ClimateGSError, match="none of its scenes"):
-        generate_dataset(GenerateOptions(job, str(out), executor="serial", dry_run=True))
+        generate_dataset(GenerateOptions(job=job, out=str(out), executor="serial", dry_run=True))
 
 
 def test_a_damaged_plan_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -415,10 +415,9 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(render_tools, "open_scene", lambda _: scene)
     monkeypatch.setattr(render_tools, "run_job", job)
-    monkeypatch.setattr(render_tools, "warm_up", lambda *_: 0.0)
-    options = RenderOptions(str(fog), "", out, sheet=False, layout="source")
-    half = dataclasses.replace(options, scale=0.5, frames="1:3")
-    assert render_tools.render_recipe(half) == 0
+    monkeypatch.setattr(render_tools, "warm_up", lambda *_: None)
+    asked = {"recipes": (str(fog),), "scene": "", "out": out, "sheet": False, "layout": "source"}
+    assert RenderOptions(**asked, scale=0.5, frames="1:3").run() == 0
     said = capsys.readouterr().out
     assert f"dataset: {out / 'source/fog-000/002'}" in said
     assert "  4 were rendered at another size and resized, such as 12x8 to 24x16 pixels" in said
@@ -426,7 +425,7 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
     assert sorted(path.suffix for path in (out / "street").rglob("00000?.*")) == [".png"] * 4
     path = tmp_path / "path.json"
     with pytest.raises(ClimateGSError, match=r"--camera-path .*path\.json shows frames that"):
-        render_tools.render_recipe(dataclasses.replace(options, camera_path=path))
+        RenderOptions(**asked, camera_path=path).run()
     monkeypatch.setattr(render_tools, "open_scene", lambda _: open_fake("fake:street"))
     with pytest.raises(AdapterError, match="has no dataset's folder"):
-        render_tools.render_recipe(options)
+        RenderOptions(**asked).run()
