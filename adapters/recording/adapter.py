@@ -59,7 +59,7 @@ from augment.effects.lidar.beam import intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError, OutputError
 from augment.jobs.files import decode_png, depth_in_metres
-from augment.jobs.layout import folder_name
+from augment.jobs.layout import SWEEPS, folder_name
 from augment.jobs.tables import ATTRIBUTE_PREFIX, is_ours, read_boxes, read_lidar, read_table
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
@@ -130,8 +130,10 @@ def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
 
 
 def lidar_files(root: Path) -> dict[int, Path]:
-    """The sweeps' files by frame number."""
-    return numbered_files(root, "lidar", (".parquet",))
+    """The sweeps' files by frame number: of a variant that a job wrote, those of its scene where
+    the weather has changed none."""
+    is_variant = (root / "recipe.yaml").is_file() and not (root / SWEEPS).is_dir()
+    return numbered_files(root.parent if is_variant else root, SWEEPS, (".parquet",))
 
 
 def all_boxes(root: Path) -> dict[int, TimedBoxes]:

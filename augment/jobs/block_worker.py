@@ -10,7 +10,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -25,6 +25,7 @@ from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
 from augment.jobs.files import box_tables
 from augment.jobs.layout import (
     STATE_FOLDER,
+    SWEEPS,
     folder_name,
     item_paths,
     path_kinds,
@@ -32,12 +33,13 @@ from augment.jobs.layout import (
     variant_folder,
 )
 from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
+from augment.jobs.pools import OnOutcome
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
 from augment.jobs.quality import resolve_quality_for
 from augment.jobs.render_job import RenderJob, SceneLoader, file_folders, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
-from augment.jobs.worker import Outcome, Renderer, WorkTimes, describe
+from augment.jobs.worker import Outcome, Renderer, TaskFailed, WorkTimes, describe
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -193,6 +195,7 @@ def clear_files_of(store: Store, block: Block) -> None:
     """Delete what was half-way into the output when a worker at this block was killed."""
     if store.local_dir is not None:
         remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
+        remove_temporaries(store.local_dir / folder_name(block.scene) / SWEEPS)
 
 
 # ---- The worker ----------------------------------------------------------------------------------
@@ -212,6 +215,13 @@ class WorkSetup:
     backend: str
     open_scene: SceneLoader
     renderer: Renderer | None = None
+
+    @property
+    def output(self) -> str:
+        return self.store_uri
+
+    def worker(self, on_outcome: OnOutcome) -> BlockWorker:
+        return BlockWorker(self, on_outcome)
 
 
 @dataclass(frozen=True)
@@ -270,21 +280,7 @@ class ResolvedRecipes:
     recipes: tuple[Recipe, ...]
 
 
-@dataclass(frozen=True)
-class TaskFailed:
-    """The task could not be done. is_output: nothing can be written, so that all others would fail.
-    of_scene: the scene could not be opened, so that its other blocks would fail too. of_memory: it
-    may succeed while no other worker takes any.
-    """
-
-    text: str
-    is_output: bool = False
-    of_scene: bool = False
-    of_memory: bool = False
-
-
 Result = SceneRecord | ResolvedRecipes | BlockDone | TaskFailed
-OnOutcome = Callable[[Outcome], None]
 
 
 class BlockWorker:

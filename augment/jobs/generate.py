@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 from tqdm import tqdm
@@ -27,14 +27,12 @@ from tqdm import tqdm
 import augment
 from augment.errors import OutputError
 from augment.jobs.atomic import refusals_of
-from augment.jobs.block_pools import Event, Lost, ProcessPool, RayPool, SerialPool, Tick, WorkerPool
 from augment.jobs.block_worker import (
     BlockDone,
     BlockTask,
     IndexTask,
     ResolvedRecipes,
     ResolveTask,
-    TaskFailed,
     WorkSetup,
     clear_leftovers,
 )
@@ -55,11 +53,12 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
+from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.quality import Question, recorded
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.store import Store, StoredFileMissing, open_store
-from augment.jobs.worker import WORKERS, Outcome
+from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene
@@ -108,16 +107,12 @@ class BlockQueue:
         self._images[block.scene] = self._images.get(block.scene, 0) + block.images
 
 
-# ---- The scheduler -------------------------------------------------------------------------------
+# ---- Blocks and what comes before them, as work for a pool ---------------------------------------
 
-WAIT_S = 1.0
 MAX_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
 ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
-_RESOLVING = "choosing the settings of its recipes"
 _log = logging.getLogger(__name__)
 
-MakePool = Callable[[Callable[[int, Outcome], None]], WorkerPool]
-_First = TypeVar("_First", IndexTask, ResolveTask)
 FailBlock = Callable[[Block, str], None]
 
 
@@ -139,147 +134,116 @@ class Tally:
         self.seconds.update(done.seconds or {})
 
 
-class Scheduler:
-    """Runs tasks in a pool. on_image: told how many images are done, and how many of them failed.
-    idle: called now and then between events.
+class SceneWork(Work):
+    """Tasks that open scenes, before there are blocks; `each` gets a task's result, or a text that
+    says why there is none. doing: what they do. opened: the scene that each slot has open.
     """
 
     def __init__(
         self,
-        make_pool: MakePool,
-        *,
+        tasks: Iterable[Any],
+        each: Callable[[Any, Any], None],
+        doing: str,
+        opened: dict[int, str],
+    ) -> None:
+        self._tasks, self._each, self._doing = deque(tasks), each, doing
+        self._opened = opened
+
+    def take(self, slot: int) -> Any:
+        return self._tasks.popleft() if self._tasks else None
+
+    def done(self, slot: int, task: Any, result: Any) -> None:
+        if isinstance(result, SceneRecord):
+            self._opened[slot] = result.name
+        self._each(task, result.text if isinstance(result, TaskFailed) else result)
+
+    def lost(self, slot: int, task: Any, how: str) -> None:
+        self._each(task, f"the worker {how} while {self._doing}, alone too")
+
+
+class BlockWork(Work):
+    """Renders and publishes blocks. names: by scene, what the job calls it. opened: the scene that
+    each slot has open. fail: records all images of a block as failed. on_image: told how many
+    images are done, and how many of them failed. A block whose worker dies is tried once more, each
+    of its images in a process of its own.
+    """
+
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        names: Mapping[str, str | None],
+        opened: dict[int, str],
+        fail: FailBlock,
         on_image: Callable[[int, int], None] = lambda done, failed: None,
-        idle: Callable[[], None] = lambda: None,
     ) -> None:
         self.tally = Tally()
+        self._queue, self._names = BlockQueue(blocks), names
+        self._fail, self._on_image = fail, on_image
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
-        self._on_image, self._idle = on_image, idle
-        self._pool = make_pool(self._tick)
-        self.slots, self.close = self._pool.slots, self._pool.close
-        self._open: list[str | None] = [None] * self.slots  # the scene of every slot
-        self._busy: dict[int, BlockTask] = {}  # by slot
-        self._trials: list[Block] = []  # whose worker died: tried once more, alone
+        self._opened = opened
+        self._busy: set[int] = set()
         self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
         self._later: list[tuple[float, Block]] = []  # another process is at them
 
-    def do_first(
-        self,
-        tasks: Sequence[_First],
-        each: Callable[[_First, Any], None],
-        *,
-        one_by_one: bool = False,
-    ) -> None:
-        """What comes before the blocks; `each` gets a task's result, or a text that says why there
-        is none. A task whose worker dies is tried once more while no other worker is busy.
-        one_by_one: so that none disturbs another's frame times.
-        """
-        slots = 1 if one_by_one else self.slots
-        waiting, alone = deque(tasks), deque[_First]()
-        busy: dict[int, _First] = {}
-        tried_alone: set[_First] = set()
-        while waiting or alone or busy:
-            for slot in range(slots):
-                if waiting and slot not in busy:
-                    busy[slot] = waiting.popleft()
-                    self._pool.give(slot, busy[slot])
-            if alone and not busy:
-                busy[0] = alone.popleft()
-                tried_alone.add(busy[0])
-                self._pool.give(0, busy[0])
-            for event in self._pool.wait(WAIT_S):
-                task = busy.pop(event.slot)
-                if _wants_memory(event) and task not in tried_alone:
-                    alone.append(task)
-                elif isinstance(event, Lost):
-                    doing = "opening the scene" if isinstance(task, IndexTask) else _RESOLVING
-                    each(task, f"the worker {event.how} while {doing}, alone too")
-                elif isinstance(event.result, TaskFailed):
-                    _raise_if_output(event.result)
-                    each(task, event.result.text)
-                else:
-                    if isinstance(event.result, SceneRecord):
-                        self._open[event.slot] = event.result.name
-                    each(task, event.result)
-
-    def render(
-        self, blocks: Sequence[Block], names: Mapping[str, str | None], fail: FailBlock
-    ) -> None:
-        """Render and publish the blocks. names: by scene, what the job calls it. fail: records all
-        images of a block as failed. A block whose worker dies is tried once more while no other
-        worker is busy, each of its images in a process of its own.
-        """
-        self._queue, self._names, self._fail = BlockQueue(blocks), names, fail
-        while self._dispatch():
-            for event in self._pool.wait(WAIT_S):
-                self._collect(event)
-            self._idle()
-
-    def _tick(self, slot: int, outcome: Outcome) -> None:
+    def tick(self, slot: int, outcome: Outcome) -> None:
         partial = self._partial[slot]
         partial[0] += 1
         partial[1] += outcome.status == FAILED
         self._report()
 
-    def _report(self) -> None:
-        tally, partial = self.tally, list(self._partial.values())
-        done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial)
-        self._on_image(done, tally.failed + sum(p[1] for p in partial))
-
-    def _dispatch(self) -> bool:
-        """Give work to idle workers; False when there is none left, in hand or waiting."""
+    def take(self, slot: int) -> BlockTask | None:
         now = time.monotonic()
         for when, block in list(self._later):
             if when <= now:
                 self._later.remove((when, block))
                 self._queue.put_back(block)
-        if self._trials and not self._busy:  # alone: memory may be what it died of
-            self._give(0, self._trials.pop(0), is_trial=True)
-        if self._trials or any(task.is_trial for task in self._busy.values()):
-            return True
-        for slot in range(self.slots):
-            if slot not in self._busy:
-                others = [name for s in self._busy if (name := self._open[s])]
-                block = self._queue.take(self._open[slot], others)
-                if block is not None:
-                    self._give(slot, block)
-        if not self._busy and self._later:
-            time.sleep(min(WAIT_S, max(0.0, self._later[0][0] - now)))
-        return bool(self._busy or self._later or len(self._queue))
+        block = self._queue.take(self._opened.get(slot), {self._opened[s] for s in self._busy})
+        if block is None:
+            return None
+        self._opened[slot] = block.scene
+        self._busy.add(slot)
+        return BlockTask(block, self._names.get(block.scene))
 
-    def _give(self, slot: int, block: Block, *, is_trial: bool = False) -> None:
-        task = BlockTask(block, self._names.get(block.scene), is_trial)
-        self._busy[slot], self._open[slot] = task, block.scene
-        self._pool.give(slot, task)
+    def later_s(self) -> float | None:
+        return max(0.0, self._later[0][0] - time.monotonic()) if self._later else None
 
-    def _collect(self, event: Event) -> None:
-        task = self._busy.pop(event.slot)
-        self._partial.pop(event.slot, None)
-        block = task.block
-        if isinstance(event, Lost):
-            self._open[event.slot] = None
-        if _wants_memory(event) and not task.is_trial:
-            _log.warning("%s is tried once more, alone: %s", block.key, _why(event))
-            self._trials.append(block)
-        elif isinstance(event, Lost):
-            self._lost_alone[block.scene] += 1
-            is_hopeless = self._lost_alone[block.scene] == MAX_LOST
-            others = self._queue.take_all(block.scene) if is_hopeless else []
-            self._give_up(
-                [block, *others],
-                f"the worker {event.how} while at this block of images, and again when it was "
-                f"tried alone; if memory ran out, use fewer workers or a machine with more",
-            )
-        elif isinstance(event.result, TaskFailed):
-            _raise_if_output(event.result)
-            others = self._queue.take_all(block.scene) if event.result.of_scene else []
-            self._give_up([block, *others], event.result.text)
+    def retry(self, slot: int, task: BlockTask, why: str) -> list[BlockTask]:
+        _log.warning("%s is tried once more, alone: %s", task.block.key, why)
+        self._free(slot)
+        return [replace(task, is_trial=True)]
+
+    def done(self, slot: int, task: BlockTask, result: BlockDone | TaskFailed) -> None:
+        self._free(slot)
+        if isinstance(result, TaskFailed):
+            others = self._queue.take_all(task.block.scene) if result.of_scene else []
+            self._give_up([task.block, *others], result.text)
+        elif result.is_elsewhere:
+            self._later.append((time.monotonic() + ELSEWHERE_S, task.block))
         else:
-            assert isinstance(event.result, BlockDone)
-            if event.result.is_elsewhere:
-                self._later.append((time.monotonic() + ELSEWHERE_S, block))
-            else:
-                self.tally.add(event.result)
+            self.tally.add(result)
         self._report()
+
+    def lost(self, slot: int, task: BlockTask, how: str) -> None:
+        self._free(slot)
+        scene = task.block.scene
+        self._opened.pop(slot, None)
+        self._lost_alone[scene] += 1
+        others = self._queue.take_all(scene) if self._lost_alone[scene] == MAX_LOST else []
+        self._give_up(
+            [task.block, *others],
+            f"the worker {how} while at this block of images, and again when it was tried alone; "
+            f"if memory ran out, use fewer workers or a machine with more",
+        )
+        self._report()
+
+    def _free(self, slot: int) -> None:
+        self._busy.discard(slot)
+        self._partial.pop(slot, None)
+
+    def _report(self) -> None:
+        tally, partial = self.tally, list(self._partial.values())
+        done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial)
+        self._on_image(done, tally.failed + sum(p[1] for p in partial))
 
     def _give_up(self, blocks: Sequence[Block], message: str) -> None:
         for block in blocks:
@@ -287,24 +251,6 @@ class Scheduler:
             self.tally.failed += block.images
             name = f"{block.scene}/{block.variant}, {block.images} images"
             self.tally.failures.append(f"{name}: {message}")
-
-
-def _wants_memory(event: Event) -> bool:
-    """Whether the task may succeed alone: its worker died, or ran out of memory."""
-    if isinstance(event, Lost):
-        return True
-    return isinstance(event.result, TaskFailed) and event.result.of_memory
-
-
-def _why(event: Event) -> str:
-    if isinstance(event, Lost):
-        return f"its worker {event.how}"
-    return event.result.text if isinstance(event.result, TaskFailed) else ""
-
-
-def _raise_if_output(failed: TaskFailed) -> None:
-    if failed.is_output:  # nothing can be written any more
-        raise OutputError(failed.text)
 
 
 # ---- What the qualities of a job's recipes choose in its scenes, before there is a plan ----------
@@ -317,13 +263,7 @@ Choices = dict[tuple[str, str], Recipe | str]
 
 
 def resolve_recipes(
-    job: GenerateJob,
-    store: Store,
-    scheduler: Scheduler,
-    found: Found,
-    *,
-    progress: bool,
-    keep: bool,
+    job: GenerateJob, store: Store, workers: Workers, found: Found, *, progress: bool, keep: bool
 ) -> Choices:
     """By scene and variant: the recipes that had to choose, resolved, or why they could not. found:
     the scene of every URI and name. keep: whether new choices are kept in the output.
@@ -364,7 +304,9 @@ def resolve_recipes(
         number, count = job.shard
         start = (number - 1) * len(tasks) // count
         turned = [*tasks][start:] + [*tasks][:start]
-        scheduler.do_first(turned, each, one_by_one=timed)
+        doing = "choosing the settings of its recipes"
+        # Timed ones one by one, so that none disturbs another's frame times.
+        workers.do(SceneWork(turned, each, doing, workers.opened), slots=1 if timed else None)
     return choices
 
 
@@ -531,20 +473,29 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     """The job's plan, for which its scenes are opened that have not been; writes nothing."""
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
-    scheduler = Scheduler(lambda tick: make_pool(job, tick))
-    with contextlib.closing(scheduler):
-        return _plan(job, store, scheduler, progress, keep=False)
+    with contextlib.closing(Workers(job)) as workers:
+        return _plan(job, store, workers, progress, keep=False)
 
 
-def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
-    """The workers that the job asks for."""
+class Workers:
+    """The workers that a job asks for. opened: the scene that each has open, by slot."""
+
+    def __init__(self, job: GenerateJob) -> None:
+        self.pool, self.opened = _make_pool(job), dict[int, str]()
+        self.slots, self.close = self.pool.slots, self.pool.close
+
+    def do(self, work: Work, **options: Any) -> None:
+        run_tasks(self.pool, work, **options)
+
+
+def _make_pool(job: GenerateJob) -> WorkerPool:
     if job.executor == "serial":
-        return SerialPool(job.setup, tick)
+        return SerialPool(job.setup)
     if job.executor == "ray":
-        return RayPool(job.setup, tick, job.workers)
+        return RayPool(job.setup, job.workers)
     # Several processes would share one GPU, and each have a copy of its scene there.
     default = 1 if renders_on_gpu(job.setup.backend) else available_cores()
-    return ProcessPool(job.setup, tick, job.workers or default)
+    return ProcessPool(job.setup, job.workers or default)
 
 
 def _with_backend(job: GenerateJob) -> GenerateJob:
@@ -587,29 +538,24 @@ class _Generation:
         self._store = open_store(job.setup.store_uri)
         self._merged_at, self._merge_s = time.monotonic(), 0.0
         self._timings: dict[str, float] = {}
-        self._rendering_s = 0.0
 
     def go(self) -> GenerateResult:
         started = time.perf_counter()
-        self._scheduler = Scheduler(
-            lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
-        )
-        with contextlib.closing(self._scheduler):
-            self._plan = plan = _plan(
-                self._job, self._store, self._scheduler, self._progress, keep=True
-            )
+        with contextlib.closing(Workers(self._job)) as workers:
+            plan = _plan(self._job, self._store, workers, self._progress, keep=True)
+            self._plan = plan
             self._timings["plan"] = time.perf_counter() - started
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
             self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
-            done = sum(b.images for b in blocks) - sum(b.images for b in pending)
-            self._scheduler.tally.skipped = done
+            work = BlockWork(pending, plan.names, workers.opened, self._fail, self._show)
+            total = sum(block.images for block in blocks)
+            work.tally.skipped = total - sum(block.images for block in pending)
             begun = time.perf_counter()
-            self._render(pending, total=sum(block.images for block in blocks))
+            self._render(workers, work, pending, total)
             self._timings["render_wall"] = time.perf_counter() - begun
-            self._timings[WORKERS] = self._rendering_s * self._scheduler.slots
         self._merge(wait=True)
-        tally = self._scheduler.tally
+        tally = work.tally
         return GenerateResult(
             tally.written,
             tally.skipped,
@@ -633,31 +579,27 @@ class _Generation:
         clear_leftovers(self._store, self._job.setup.scratch, published)
         return pending
 
-    def _render(self, pending: Sequence[Block], total: int) -> None:
+    def _render(
+        self, workers: Workers, work: BlockWork, pending: Sequence[Block], total: int
+    ) -> None:
         if pending:
             records = self._plan.records
             with_lidar = [block for block in pending if records[block.scene].has_lidar]
             for note in lidar_notes({b.variant: b.recipe for b in with_lidar}.values()):
                 _log.warning("note: %s", note)
             self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
-        self._bar = tqdm(
-            total=total,
-            initial=self._scheduler.tally.skipped,
-            unit="image",
-            disable=not self._progress,
-        )
+        skipped, started = work.tally.skipped, time.perf_counter()
+        self._bar = tqdm(total=total, initial=skipped, unit="image", disable=not self._progress)
         with self._bar:
             try:
-                if pending:
-                    started = time.perf_counter()
-                    self._scheduler.render(pending, dict(self._plan.names), self._fail)
-                    self._rendering_s = time.perf_counter() - started
+                workers.do(work, idle=self._merge_at_times)
             except KeyboardInterrupt:
-                self._scheduler.close()
+                workers.close()
                 self._merge(wait=True)
                 raise KeyboardInterrupt(
                     "stopped; start the same job again to go on from there"
                 ) from None
+        self._timings[WORKERS] = (time.perf_counter() - started) * workers.slots
 
     def _show(self, done: int, failed: int) -> None:
         if failed:
@@ -709,9 +651,7 @@ class _Generation:
         self._merge_s = self._merged_at - started
 
 
-def _plan(
-    job: GenerateJob, store: Store, scheduler: Scheduler, progress: bool, *, keep: bool
-) -> Plan:
+def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool) -> Plan:
     found: dict[tuple[str, str | None], SceneRecord | str] = {}
     for entry in job.scenes:
         record = None if job.rescan else _known(store, entry)
@@ -728,8 +668,9 @@ def _plan(
                 store.write(_record_path(task.uri, task.name), record.to_json())
             bar.update()
 
-        scheduler.do_first(list(dict.fromkeys(tasks)), each)
-    resolved = resolve_recipes(job, store, scheduler, found, progress=progress, keep=keep)
+        opening = SceneWork(dict.fromkeys(tasks), each, "opening the scene", workers.opened)
+        workers.do(opening)
+    resolved = resolve_recipes(job, store, workers, found, progress=progress, keep=keep)
     return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved)
 
 

@@ -18,6 +18,7 @@ from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
+SWEEPS = "lidar"  # the folder of sweeps, of a variant or, untouched by weather, of its scene
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -98,7 +99,9 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
         if getattr(output, name):
             used[name] = f"{base}/{name}/{stem}.png"
     if recipe.lidar:
-        used["lidar"] = f"{base}/lidar/{frame:06d}.parquet"
+        # What no weather changes, the variants of a scene share.
+        place = base if recipe.lidar == "weather" else folder_name(scene)
+        used["lidar"] = f"{place}/{SWEEPS}/{frame:06d}.parquet"
     if output.labels:
         used["labels"] = f"{base}/labels/boxes.parquet"
     return {kind: used.get(kind) for kind in path_kinds()}

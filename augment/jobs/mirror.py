@@ -14,14 +14,15 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+from pydantic import BaseModel
 from tqdm import tqdm
 
 from augment.cameras import Frame
@@ -41,10 +42,11 @@ from augment.jobs.atomic import (
     write_atomic,
 )
 from augment.jobs.files import WritePump, decode_image, encode_image
-from augment.jobs.layout import folder_name, resolve_inside
+from augment.jobs.layout import folder_name, reading_back, resolve_inside
 from augment.jobs.manifest import OK
 from augment.jobs.tables import read_lidar
 from augment.labels import LabelSource, StoresLidar
+from augment.scene import Scene
 from recipes.schema import Output
 
 # ---- The files of a dataset, as a copy of it in another place has to have them -------------------
@@ -141,18 +143,16 @@ class SourceFolder(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """How much a dataset is. images: camera images among the files."""
+    """How many files a dataset has, and how many of them are camera images."""
 
     files: int
-    size: int
     images: int
 
 
 def survey(tree: SourceTree) -> Survey:
     """Look at all that belongs to a dataset, reading no file."""
-    files = [file for folder in walk(tree) for file in folder.files]
-    size = sum(file.facts.st_size for file in files)
-    return Survey(len(files), size, sum(tree.is_image(file.relative) for file in files))
+    are_images = [tree.is_image(file.relative) for folder in walk(tree) for file in folder.files]
+    return Survey(len(are_images), sum(are_images))
 
 
 def walk(tree: SourceTree) -> Iterator[SourceFolder]:
@@ -284,19 +284,28 @@ def _facts(path: str) -> os.stat_result | None:
 # ---- Where the copy of a dataset lies, and the file beside it that says what stands in it --------
 
 MIRROR_FOLDER = "source"
-_IMAGE, _SWEEP = ("scene", "image", "sha256"), ("scene", "sweep")
 
 
-@dataclass(frozen=True)
-class MirrorRecord:
-    """scenes: facts by name. replaced: by place in the dataset, the image that stands there: its
-    scene, its path relative to the output folder and its SHA-256. sweeps: likewise, scene and path
-    of the weathered sweep in a file of returns; none in older records.
+class Shown(BaseModel, frozen=True):
+    """What of a scene stands in a recorded file's place: an image or a sweep, by its path relative
+    to the output folder. sha256: of the image.
     """
 
-    scenes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    replaced: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    sweeps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    scene: str
+    image: str | None = None
+    sha256: str | None = None
+    sweep: str | None = None
+
+
+class MirrorRecord(BaseModel, frozen=True):
+    """folder: the dataset's. scenes: facts by name. replaced, replaced_sweeps: what is shown in the
+    place of recorded files, by their places in the dataset.
+    """
+
+    folder: str
+    scenes: dict[str, dict[str, Any]] = {}
+    replaced: dict[str, Shown] = {}
+    replaced_sweeps: dict[str, Shown] = {}
 
 
 def mirror_folder(out_dir: Path, variant: str) -> Path:
@@ -316,92 +325,19 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
     """
     path = next((path for path in record_names(tree, folder) if path.is_file()), None)
     if path is None:
-        return MirrorRecord()
-    try:
-        content = json.loads(path.read_bytes())
-        root = os.path.realpath(content["folder"])
-        record = MirrorRecord(
-            {name: dict(facts) for name, facts in content["scenes"].items()},
-            _entries(content["replaced"], _IMAGE),
-            _entries(content.get("replaced_sweeps", {}), _SWEEP),
-        )
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        return MirrorRecord(folder=str(tree.root))
+    advice = "Delete it and build the copy again, once for each scene whose images are in it"
+    with reading_back(str(path), advice):
+        record = MirrorRecord.model_validate_json(path.read_bytes())
+    if os.path.realpath(record.folder) != os.path.realpath(tree.root):
         raise OutputError(
-            f"{path} is damaged ({error!r}). Delete it and build the copy again, once for each "
-            f"scene whose images are in it"
-        ) from error
-    if root != os.path.realpath(tree.root):
-        raise OutputError(
-            f"{folder / tree.root.name} is the copy of {root}, not of {tree.root}: choose another "
-            f"output folder, or delete that copy"
+            f"{folder / tree.root.name} is the copy of {record.folder}, not of {tree.root}: choose "
+            f"another output folder, or delete that copy"
         )
     return record
 
 
-def _entries(content: Any, keys: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    return {place: {key: str(entry[key]) for key in keys} for place, entry in content.items()}
-
-
-# ---- Weathered LiDAR sweeps in the place and form of a dataset's own -----------------------------
-
-
-@dataclass(frozen=True)
-class WeatheredSweep:
-    """A weathered sweep for one of the dataset's files of a frame's returns. scene: whose sweep it
-    is. path: of our sweep. name: the same, relative to the output folder. content: makes the
-    file's bytes; None where only another scene's labels could.
-    """
-
-    scene: str
-    path: Path
-    name: str
-    content: Callable[[], bytes] | None = None
-
-    @staticmethod
-    def of_row(out_dir: Path, row: Mapping[str, Any]) -> WeatheredSweep:
-        """The sweep of a manifest's row."""
-        name = row["lidar_path"]
-        return WeatheredSweep(row["scene"], resolve_inside(out_dir, name), name)
-
-
-def weathered_sweeps(
-    out_dir: Path, rows: Iterable[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
-) -> tuple[dict[str, WeatheredSweep], list[str]]:
-    """The dataset's files that a variant's weathered sweeps change, by their place in it, and a
-    sentence for the sweeps that change none. Lost returns are left out of the files.
-    """
-    frames = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
-    found: dict[str, WeatheredSweep] = {}
-    unplaced = []
-    for frame, row in sorted(frames.items()):
-        files = labels.lidar_files(frame) if isinstance(labels, StoresLidar) else ()
-        places = [tree.relative(file) for file in files]
-        if not files or None in places:
-            unplaced.append(frame)
-            continue
-        assert isinstance(labels, StoresLidar)
-        for file, place in zip(files, places, strict=True):
-            sweep = WeatheredSweep.of_row(out_dir, row)
-            content = partial(_content, labels, frame, file, sweep.path)
-            found[str(place)] = replace(sweep, content=content)
-    if not unplaced:
-        return found, []
-    return found, [
-        f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no file "
-        f"of their own in the dataset: its copy keeps the recorded ones, and {out_dir} has these"
-    ]
-
-
-def is_weathered(row: Mapping[str, Any]) -> bool:
-    """Whether the row of an image names a sweep that has met the weather."""
-    return row["lidar"] == "weather" and row["lidar_path"] is not None
-
-
-def _content(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
-    return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
-
-
-# ---- Weathered images in the form of a dataset's recorded ones: file format, size, channels ------
+# ---- What stands in the place of recorded files: images and sweeps in their form -----------------
 
 FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
 
@@ -414,68 +350,74 @@ class ImageForm(NamedTuple):
     height: int
     is_grey: bool = False
 
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
 
-@dataclass(frozen=True)
-class Weathered:
-    """A finished image. scene: whose image it is. path: of the file. name: the same, relative to
-    the output folder. checksum: its SHA-256. jpeg_quality: for writing it anew.
+
+class Weathered(NamedTuple):
+    """A finished image, or a weathered sweep, for a recorded file's place. path: of our file. form:
+    the image's, None of a sweep. content: makes the bytes for the place of a recorded image of
+    another form, or for one of a sweep's files; None where only another scene's labels could.
     """
 
-    scene: str
     path: Path
-    name: str
-    form: ImageForm
-    checksum: str
-    jpeg_quality: int
+    shown: Shown
+    form: ImageForm | None
+    content: Callable[[ImageForm | None], bytes] | None
 
     @staticmethod
-    def of_row(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
-        """The image of a manifest's row."""
+    def image(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
+        """The image of a manifest's row. jpeg_quality: for writing it anew."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", row["width"], row["height"])
         path = resolve_inside(out_dir, name)
-        return Weathered(row["scene"], path, name, form, row["checksum"], jpeg_quality)
+        shown = Shown(scene=row["scene"], image=name, sha256=row["checksum"])
+        return Weathered(path, shown, form, partial(_fitted, path, jpeg_quality))
+
+    @staticmethod
+    def sweep(
+        out_dir: Path,
+        row: Mapping[str, Any],
+        content: Callable[[ImageForm | None], bytes] | None = None,
+    ) -> Weathered:
+        """The sweep of a manifest's row."""
+        path = resolve_inside(out_dir, row["lidar_path"])
+        return Weathered(path, Shown(scene=row["scene"], sweep=row["lidar_path"]), None, content)
 
 
-def image_form(path: str | Path) -> ImageForm | None:
-    """Of an image file by its first bytes; None where it is neither PNG nor JPEG."""
-    header = read_image_header(path)
-    if header is None or header.format not in FORMATS:
-        return None
-    return ImageForm(FORMATS[header.format], header.width, header.height, header.is_grey)
+def is_weathered(row: Mapping[str, Any]) -> bool:
+    """Whether the row of an image names a sweep that has met the weather."""
+    return row["lidar"] == "weather" and row["lidar_path"] is not None
 
 
-def dataset_format(frames: Iterable[Frame]) -> str:
-    """The format in which to render so that the dataset's images are of it: that of the recorded
-    ones, png where they are of several.
+def weathered_files(
+    out_dir: Path,
+    rows: Sequence[Mapping[str, Any]],
+    scene: Scene,
+    tree: SourceTree,
+    jpeg_quality: int,
+) -> tuple[dict[str, Weathered], list[str]]:
+    """The finished images and weathered sweeps of a variant's rows by their place in the dataset,
+    and sentences for those that have none.
     """
-    suffixes = {Path(path).suffix.lower() for f in frames for path in f.image_paths.values()}
-    formats = {{".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(suffix) for suffix in suffixes}
-    formats.discard(None)
-    if not formats:
-        raise AdapterError(
-            f"the scene knows no recorded image in PNG or JPEG (found: {sorted(suffixes) or 'none'}"
-            f"); a dataset's copy replaces those"
-        )
-    return "jpg" if formats == {"jpg"} else "png"
+    rows = [row for row in rows if row["status"] == OK]
+    images, notes = _images(out_dir, rows, scene.frames, tree, jpeg_quality)
+    sweeps, further = _sweeps(out_dir, rows, scene.labels, tree)
+    return images | sweeps, notes + further
 
 
-def weathered_images(
+def _images(
     out_dir: Path,
     rows: Sequence[Mapping[str, Any]],
     frames: Sequence[Frame],
     tree: SourceTree,
     jpeg_quality: int,
 ) -> tuple[dict[str, Weathered], list[str]]:
-    """The finished images of a variant's rows by their place in the dataset, and a sentence for
-    those that have none.
-    """
     recorded = {frame.index: frame.image_paths for frame in frames}
     found: dict[str, Weathered] = {}
     unplaced, doubled = [], []
     for row in rows:
-        if row["status"] != OK:
-            continue
         path = recorded.get(row["frame"], {}).get(row["camera"])
         place = None if path is None else tree.relative(path)
         if place is None:
@@ -483,7 +425,7 @@ def weathered_images(
             continue
         if place in found:
             doubled.append(place)
-        found[place] = Weathered.of_row(out_dir, row, jpeg_quality)
+        found[place] = Weathered.image(out_dir, row, jpeg_quality)
     notes = []
     if unplaced:
         notes.append(
@@ -498,17 +440,47 @@ def weathered_images(
     return found, notes
 
 
-def fitted(image: Weathered, recorded: ImageForm) -> bytes:
+def _sweeps(
+    out_dir: Path, rows: Sequence[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
+) -> tuple[dict[str, Weathered], list[str]]:
+    """Of a frame the dataset may have several files. Lost returns are left out of them."""
+    frames = {row["frame"]: row for row in rows if is_weathered(row)}
+    stored = labels if isinstance(labels, StoresLidar) else None
+    found: dict[str, Weathered] = {}
+    unplaced = []
+    for frame, row in sorted(frames.items()):
+        places = {tree.relative(f): f for f in (stored.lidar_files(frame) if stored else ())}
+        if stored is None or not places or None in places:
+            unplaced.append(frame)
+            continue
+        sweep = resolve_inside(out_dir, row["lidar_path"])
+        for place, file in places.items():
+            content = partial(_returns, stored, frame, file, sweep)
+            found[str(place)] = Weathered.sweep(out_dir, row, content)
+    if not unplaced:
+        return found, []
+    return found, [
+        f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no file "
+        f"of their own in the dataset: its copy keeps the recorded ones, and {out_dir} has these"
+    ]
+
+
+def _returns(
+    labels: StoresLidar, frame: int, file: Path, sweep: Path, _: ImageForm | None
+) -> bytes:
+    return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
+
+
+def _fitted(path: Path, jpeg_quality: int, recorded: ImageForm | None) -> bytes:
     """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines."""
+    assert recorded is not None
     try:
-        rgb = decode_image(image.path.read_bytes())
+        rgb = decode_image(path.read_bytes())
     except OSError as error:
-        raise output_error(image.path, error) from error
+        raise output_error(path, error) from error
     except ValueError as error:
-        raise OutputError(
-            f"{image.path} is damaged ({error}); delete it and render again"
-        ) from error
-    size = (recorded.width, recorded.height)
+        raise OutputError(f"{path} is damaged ({error}); delete it and render again") from error
+    size = recorded.size
     if (rgb.shape[1], rgb.shape[0]) != size:
         is_smaller = size[0] < rgb.shape[1] and size[1] < rgb.shape[0]
         method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
@@ -517,8 +489,31 @@ def fitted(image: Weathered, recorded: ImageForm) -> bytes:
         done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
         assert done
         return data.tobytes()
-    settings = {"image": recorded.format, "jpeg_quality": image.jpeg_quality}
+    settings = {"image": recorded.format, "jpeg_quality": jpeg_quality}
     return encode_image(rgb, Output.model_validate(settings))
+
+
+def image_form(path: str | Path) -> ImageForm | None:
+    """Of an image file by its first bytes; None where it is neither PNG nor JPEG."""
+    header = read_image_header(path)
+    if header is None or header.format not in FORMATS:
+        return None
+    return ImageForm(FORMATS[header.format], header.width, header.height, header.is_grey)
+
+
+def dataset_format(frames: Sequence[Frame]) -> str:
+    """The format in which to render so that the dataset's images are of it: that of the recorded
+    ones, png where they are of several.
+    """
+    suffixes = {Path(path).suffix.lower() for f in frames for path in f.image_paths.values()}
+    formats = {{".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(suffix) for suffix in suffixes}
+    formats.discard(None)
+    if not formats:
+        raise AdapterError(
+            f"the scene knows no recorded image in PNG or JPEG (found: {sorted(suffixes) or 'none'}"
+            f"); a dataset's copy replaces those"
+        )
+    return "jpg" if formats == {"jpg"} else "png"
 
 
 # ---- The copy ------------------------------------------------------------------------------------
@@ -545,17 +540,41 @@ class Mirrored:
     copied_size: int = 0
     links: int = 0
     images: int = 0
-    replaced: dict[str, dict[str, Any]] = field(default_factory=dict)
+    replaced: dict[str, Shown] = field(default_factory=dict)
     new: int = 0
     new_size: int = 0
     resized: list[tuple[tuple[int, int], tuple[int, int]]] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
     sweeps: int = 0
-    weathered: dict[str, dict[str, str]] = field(default_factory=dict)
+    weathered: dict[str, Shown] = field(default_factory=dict)
     outdated: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     changed: int = 0
+
+    def record(self, tree: SourceTree, links: Links, scenes: Mapping[str, Any]) -> str:
+        """The text of the file beside a complete copy, which `read_record` reads."""
+        content = {
+            "folder": str(tree.root),
+            "links": links,
+            "scenes": scenes,
+            "files": {
+                **{"linked": self.linked, "copied": self.copied, "symbolic_links": self.links},
+                **{"camera_images": self.images, "replaced_images": len(self.replaced)},
+                **{"lidar_sweeps": self.sweeps, "replaced_lidar_files": len(self.weathered)},
+            },
+            "bytes": {
+                **{"linked": self.linked_size, "copied": self.copied_size},
+                "new_images": self.new_size,
+            },
+            "replaced": _described(self.replaced),
+            "replaced_sweeps": _described(self.weathered),
+        }
+        return json.dumps(content, indent=1) + "\n"
+
+
+def _described(shown: Mapping[str, Shown]) -> dict[str, dict[str, str]]:
+    return {place: each.model_dump(exclude_none=True) for place, each in shown.items()}
 
 
 def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
@@ -570,26 +589,25 @@ def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
 def mirror_dataset(
     tree: SourceTree,
     folder: Path,
-    images: Mapping[str, Weathered],
+    weathered: Mapping[str, Weathered],
     scenes: Mapping[str, Any],
     *,
     extent: Survey,
-    sweeps: Mapping[str, WeatheredSweep] | None = None,
     links: Links = "hard",
     progress: bool = True,
 ) -> Mirrored:
     """Build the copy of a dataset in a folder, or bring it up to date; needs the lock of the output
-    folder. images, sweeps: by place in the dataset, all that shall stand in the copy. scenes: facts
-    of those that the images are of, in JSON's types, for the record. extent: `survey(tree)`. links:
-    hard, or copy for a copy that shares nothing with source and images. Raises AdapterError: a file
-    of the source cannot be read, or a link leads out of it. OutputError: the system refused, or a
-    link is in the way; no file is left half-written.
+    folder. weathered: by place in the dataset, all that shall stand in the copy. scenes: facts of
+    those that they are of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or
+    copy for a copy that shares nothing with source and images. Raises AdapterError: a file of the
+    source cannot be read, or a link leads out of it. OutputError: the system refused, or a link is
+    in the way; no file is left half-written.
     """
     check_disjoint(tree, folder)
-    run = _Mirroring(tree, folder, images, sweeps or {}, links)
+    run = _Mirroring(tree, folder, weathered, links == "hard")
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         run.go(bar)
-    run.finish(scenes)
+    run.finish(run.done.record(tree, links, scenes).encode())
     return run.done
 
 
@@ -599,15 +617,13 @@ class _Mirroring:
 
     tree: SourceTree
     folder: Path
-    images: Mapping[str, Weathered]
-    sweeps: Mapping[str, WeatheredSweep]
-    links: Links
+    weathered: Mapping[str, Weathered]
+    may_link: bool
     changed_folders: set[str] = field(default_factory=set)
-    fitted: list[str] = field(default_factory=list)
+    encoded: list[str] = field(default_factory=list)  # images of another form than ours
     is_begun: bool = False
 
     def __post_init__(self) -> None:
-        self.may_link = self.links == "hard"
         self.record, self.begun_record = record_names(self.tree, self.folder)
         self.done = Mirrored(self.folder / self.tree.root.name)
         self.root = str(self.done.folder)
@@ -623,94 +639,96 @@ class _Mirroring:
         finally:
             self.pump.close()
         done = self.done
-        done.new += len(self.fitted)
-        done.new_size += sum(os.lstat(path).st_size for path in self.fitted)
-        done.missing = sorted(self.images.keys() - done.replaced.keys() - set(done.unusable))
+        done.new += len(self.encoded)
+        done.new_size += sum(os.lstat(path).st_size for path in self.encoded)
+        images = {place for place, each in self.weathered.items() if each.form is not None}
+        done.missing = sorted(images - done.replaced.keys() - set(done.unusable))
 
-    def finish(self, scenes: Mapping[str, Any]) -> None:
+    def finish(self, record: bytes) -> None:
         """Make the names durable, then say that the copy is complete."""
         with refusals_of(self.folder):
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
-        text = json.dumps(self._described(scenes), indent=1) + "\n"
-        if not (self.record.is_file() and self.record.read_bytes() == text.encode()):
-            write_atomic(self.record, text.encode())
+        if not (self.record.is_file() and self.record.read_bytes() == record):
+            write_atomic(self.record, record)
         with refusals_of(self.begun_record):
             self.begun_record.unlink(missing_ok=True)
 
     def _fill(self, folder: SourceFolder) -> None:
-        path = self._target(folder.relative)
+        path, done = self._target(folder.relative), self.done
         entries = [*folder.files, *folder.folders, *folder.links]
-        expected = {os.path.basename(entry[0]) for entry in entries}
-        others = others_in(path, expected)
+        others = others_in(path, {os.path.basename(entry[0]) for entry in entries})
         if not folder.relative:  # other drives, which the copy has from other scenes
             others = [name for name in others if not os.path.lexists(self.tree.root / name)]
-        self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
+        done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
         for inner, _ in folder.folders:
             self._own(self._target(inner))
         for file in folder.files:
-            self.done.images += self.tree.is_image(file.relative)
-            self.done.sweeps += self.tree.is_sweep(file.relative)
-            image, sweep = self.images.get(file.relative), self.sweeps.get(file.relative)
-            is_put = image is not None and self._replace(file, image)
-            if not is_put and (sweep is None or not self._put_sweep(file, sweep)):
+            done.images += self.tree.is_image(file.relative)
+            done.sweeps += self.tree.is_sweep(file.relative)
+            ours = self.weathered.get(file.relative)
+            if ours is None or not self._replace(file, ours):
                 self._keep(file)
         for name, text in folder.links:
-            self.done.links += 1
+            done.links += 1
+            self._begin()
             if put_link(text, self._target(name)):
-                self._begin()
                 self._changed(path)
 
     def _keep(self, file: SourceFile) -> None:
         """Put the source's own file in place."""
-        how = self._place(file.path, file.facts, self._target(file.relative))
-        if how == LINKED:
+        if self._place(file.path, file.facts, file.relative) == LINKED:
             self.done.linked += 1
             self.done.linked_size += file.facts.st_size
         else:
             self.done.copied += 1
             self.done.copied_size += file.facts.st_size
 
-    def _replace(self, file: SourceFile, image: Weathered) -> bool:
-        """Put a weathered image in place; False where the recorded one is none that we write."""
-        try:
-            recorded = image_form(file.path)
-        except OSError as error:
-            raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
-        if recorded is None:
-            self.done.unusable.append(file.relative)
-            return False
-        rendered = _facts_of(image.path)
-        target = self._target(file.relative)
-        if image.form != recorded:
-            self._fit(image, recorded, target, rendered.st_mtime_ns)
-        elif self._place(str(image.path), rendered, target) == COPIED:
-            self.done.new += 1
-            self.done.new_size += rendered.st_size
-        facts = (image.scene, image.name, image.checksum)
-        self.done.replaced[file.relative] = dict(zip(_IMAGE, facts, strict=True))
-        if image.form[1:3] != recorded[1:3]:
-            self.done.resized.append((image.form[1:3], recorded[1:3]))
-        return True
-
-    def _put_sweep(self, file: SourceFile, sweep: WeatheredSweep) -> bool:
-        """Write the file of a weathered sweep, where the one there is not: its time would be ours.
-        False where only another scene could write it.
+    def _replace(self, file: SourceFile, ours: Weathered) -> bool:
+        """Put what is weathered in place; False where the recorded file has to stay: an image that
+        is none that we write, or a sweep that only another scene could write.
         """
-        mtime_ns, target = _facts_of(sweep.path).st_mtime_ns, self._target(file.relative)
-        content = sweep.content
-        if not _is_written(target, mtime_ns):
-            if content is None:
-                self.done.outdated.append(file.relative)
+        done, recorded = self.done, None
+        if ours.form is not None:
+            try:
+                recorded = image_form(file.path)
+            except OSError as error:
+                raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
+            if recorded is None:
+                done.unusable.append(file.relative)
                 return False
-            self._begin()
-            self.pump.submit(lambda: write_file(content(), target, mtime_ns))
-            self._changed(os.path.dirname(target))
-        self.done.weathered[file.relative] = {"scene": sweep.scene, "sweep": sweep.name}
+            if ours.form.size != recorded.size:
+                done.resized.append((ours.form.size, recorded.size))
+        rendered = _facts_of(ours.path)
+        if ours.form is not None and ours.form == recorded:
+            if self._place(str(ours.path), rendered, file.relative) == COPIED:
+                done.new += 1
+                done.new_size += rendered.st_size
+        elif not self._encode(ours, recorded, file.relative, rendered.st_mtime_ns):
+            done.outdated.append(file.relative)
+            return False
+        (done.weathered if ours.form is None else done.replaced)[file.relative] = ours.shown
         return True
 
-    def _place(self, original: str, facts: os.stat_result, target: str) -> str:
+    def _encode(
+        self, ours: Weathered, recorded: ImageForm | None, relative: str, mtime_ns: int
+    ) -> bool:
+        """Write what is not as we have it, where the file there is not that already: its time and
+        form would be ours. False where we cannot.
+        """
+        target, content = self._target(relative), ours.content
+        if recorded is not None:
+            self.encoded.append(target)
+        if _is_written(target, mtime_ns, recorded):
+            return True
+        if content is None:
+            return False
+        self._put(target, lambda: write_file(content(recorded), target, mtime_ns))
+        return True
+
+    def _place(self, original: str, facts: os.stat_result, relative: str) -> str:
         """Link or copy, where that has not been done; says which."""
+        target = self._target(relative)
         found = found_as(target, facts)
         if found == COPIED or (found == LINKED and self.may_link):
             return found
@@ -718,17 +736,12 @@ class _Mirroring:
         if self.may_link and link_file(original, target):
             self._changed(os.path.dirname(target))
             return LINKED
-        self.pump.submit(lambda: copy_file(original, target))
-        self._changed(os.path.dirname(target))
+        self._put(target, lambda: copy_file(original, target))
         return COPIED
 
-    def _fit(self, image: Weathered, recorded: ImageForm, target: str, mtime_ns: int) -> None:
-        """Encode anew, where the file there is not this image's: its time and form would be."""
-        self.fitted.append(target)
-        if _is_written(target, mtime_ns, recorded):
-            return
+    def _put(self, target: str, write: Callable[[], None]) -> None:
         self._begin()
-        self.pump.submit(lambda: write_file(fitted(image, recorded), target, mtime_ns))
+        self.pump.submit(write)
         self._changed(os.path.dirname(target))
 
     def _begin(self) -> None:
@@ -753,25 +766,6 @@ class _Mirroring:
     def _target(self, relative: str) -> str:
         return os.path.join(self.root, relative) if relative else self.root
 
-    def _described(self, scenes: Mapping[str, Any]) -> dict[str, Any]:
-        done = self.done
-        return {
-            "folder": str(self.tree.root),
-            "links": self.links,
-            "scenes": scenes,
-            "files": {
-                **{"linked": done.linked, "copied": done.copied, "symbolic_links": done.links},
-                **{"camera_images": done.images, "replaced_images": len(done.replaced)},
-                **{"lidar_sweeps": done.sweeps, "replaced_lidar_files": len(done.weathered)},
-            },
-            "bytes": {
-                **{"linked": done.linked_size, "copied": done.copied_size},
-                "new_images": done.new_size,
-            },
-            "replaced": done.replaced,
-            "replaced_sweeps": done.weathered,
-        }
-
 
 def _facts_of(path: Path) -> os.stat_result:
     try:
@@ -782,7 +776,7 @@ def _facts_of(path: Path) -> os.stat_result:
         ) from error
 
 
-def _is_written(target: str, mtime_ns: int, form: ImageForm | None = None) -> bool:
+def _is_written(target: str, mtime_ns: int, form: ImageForm | None) -> bool:
     """Whether a file of ours stands there: of that time, and of that form, if it is an image."""
     try:
         is_ours = os.lstat(target).st_mtime_ns == mtime_ns

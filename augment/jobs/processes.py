@@ -417,6 +417,17 @@ def share_scene(scene: Scene, frames: Sequence[Frame], folder: Path) -> SharedSc
     return SharedScene(str(path), skeleton.getvalue())
 
 
+def check_sendable(renderer: object) -> None:
+    """Raise ValueError where other processes cannot be sent a job's renderer."""
+    try:
+        ForkingPickler.dumps(renderer)
+    except (AttributeError, TypeError, pickle.PicklingError) as error:
+        raise ValueError(
+            f"renderer {renderer!r} cannot be sent to worker processes: {error}; use a function "
+            f"defined at the top of a module, or workers=1"
+        ) from error
+
+
 class _ScenePickler(pickle.Pickler):
     """Writes tensors to a file and keeps only where they lie."""
 

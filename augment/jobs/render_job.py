@@ -15,7 +15,7 @@ import re
 import shutil
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
@@ -27,7 +27,7 @@ from tqdm import tqdm
 import augment
 from augment.cameras import Frame
 from augment.effects import Sharing, share_effects
-from augment.errors import OutputError
+from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import (
     flush_folder,
     make_folder,
@@ -51,6 +51,7 @@ from augment.jobs.files import (
 from augment.jobs.layout import (
     MANIFEST,
     STATE_FOLDER,
+    SWEEPS,
     box_weather_files,
     folder_name,
     item_paths,
@@ -73,7 +74,14 @@ from augment.jobs.manifest import (
     shown_words,
     write_manifest,
 )
-from augment.jobs.processes import OutputLock, choose_backend, share_scene
+from augment.jobs.pools import ProcessPool, SerialPool, Work, WorkerPool, run_tasks
+from augment.jobs.processes import (
+    OutputLock,
+    SharedScene,
+    check_sendable,
+    choose_backend,
+    share_scene,
+)
 from augment.jobs.quality import resolve_quality_for
 from augment.jobs.store import open_store
 from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
@@ -82,11 +90,11 @@ from augment.jobs.worker import (
     Chunk,
     Outcome,
     Renderer,
+    SceneSetup,
     Setup,
+    TaskFailed,
     WorkTimes,
     describe,
-    run_in_processes,
-    run_serially,
 )
 from augment.memo import memo_of
 from augment.scene import Scene
@@ -332,6 +340,7 @@ class JobState:
         mine = {variant.folder for variant in self.variants}
         for folder in sorted(mine | set(logged_variants(self.out_dir))):
             remove_temporaries(self.out_dir / folder)
+        remove_temporaries(self.out_dir / folder_name(self.index.name) / SWEEPS)
 
     def _row(self, variant: VariantState, outcome: Outcome, frame: Frame) -> dict[str, Any]:
         recipe, index = variant.recipe, self.index
@@ -565,6 +574,7 @@ def _safe_name(path: str) -> str:
 # ---- The job -------------------------------------------------------------------------------------
 
 SceneLoader = Callable[[str], Scene]
+TASK_IMAGES = 32  # at most that a worker process gets at a time: between, its threads have no work
 
 
 @dataclass(frozen=True, eq=False)
@@ -658,6 +668,68 @@ def run_job(
     )
 
 
+class _ImageWork(Work):
+    """The images of a job as tasks: all of them for one worker, else a few frames at a time. Where
+    a worker dies, what it had in hand is tried once more, each image alone.
+    """
+
+    def __init__(
+        self,
+        chunks: Sequence[Chunk],
+        workers: int,
+        deliver: Callable[[Outcome], None],
+        times: WorkTimes,
+    ) -> None:
+        images = sum(len(chunk.cameras) for chunk in chunks)
+        most = images if workers == 1 else max(1, min(TASK_IMAGES, images // (4 * workers)))
+        self._tasks: deque[tuple[Chunk, ...]] = deque(_tasks(chunks, most))
+        self._deliver, self._times = deliver, times
+        self._done: set[tuple[int, int, str]] = set()
+
+    def tick(self, slot: int, outcome: Outcome) -> None:
+        self._done.add((outcome.variant, outcome.frame, outcome.camera))
+        self._deliver(outcome)
+
+    def take(self, slot: int) -> tuple[Chunk, ...] | None:
+        return self._tasks.popleft() if self._tasks else None
+
+    def retry(self, slot: int, task: tuple[Chunk, ...], why: str) -> list[tuple[Chunk, ...]]:
+        left = self._left(task)
+        _log.warning("%d images are tried once more, alone: %s", len(left), why)
+        return [(image,) for image in left]
+
+    def done(self, slot: int, task: tuple[Chunk, ...], result: Any) -> None:
+        if isinstance(result, TaskFailed):
+            raise ClimateGSError(result.text)
+        self._times.update(result)
+
+    def lost(self, slot: int, task: tuple[Chunk, ...], how: str) -> None:
+        message = (
+            f"the worker process {how} while rendering this image, and again when it was tried "
+            f"alone; if memory ran out, use fewer workers"
+        )
+        for image in self._left(task):
+            name = image.cameras[0]
+            self._deliver(Outcome(image.variant, image.frame, name, FAILED, message))
+
+    def _left(self, task: tuple[Chunk, ...]) -> list[Chunk]:
+        """A chunk for each image that has not been delivered."""
+        images = [replace(chunk, cameras=(name,)) for chunk in task for name in chunk.cameras]
+        return [i for i in images if (i.variant, i.frame, i.cameras[0]) not in self._done]
+
+
+def _tasks(chunks: Sequence[Chunk], most: int) -> Iterator[tuple[Chunk, ...]]:
+    """Runs of chunks, each of about so many images."""
+    run: list[Chunk] = []
+    for chunk in chunks:
+        run.append(chunk)
+        if sum(len(own.cameras) for own in run) >= most:
+            yield tuple(run)
+            run = []
+    if run:
+        yield tuple(run)
+
+
 class _Run:
     """One call of run_job."""
 
@@ -729,31 +801,33 @@ class _Run:
             labelled=self.index.labelled,
             instances=self.index.instances,
             memo=memo_of(self.scene).shared(),
+            overwrite=self.job.overwrite,
         )
         if not chunks:
             return
-        if self.job.workers == 1:
-            spent = run_serially(
-                self.scene, self.index.frames, setup, chunks, self.renderer, self._deliver
-            )
-            self.times.update(spent)
-            return
-        with self.times.spent("share"):
-            shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
-        self.scene = None  # this process needs no more of it than the index
+        shared = None
+        if self.job.workers > 1:
+            check_sendable(self.renderer)
+            with self.times.spent("share"):
+                shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
+            self.scene = None  # this process needs no more of it than the index
+        work = _ImageWork(chunks, self.job.workers, self._deliver, self.times)
         try:
-            spent = run_in_processes(
-                setup,
-                chunks,
-                workers=self.job.workers,
-                shared=shared,
-                renderer=self.renderer,
-                deliver=self._deliver,
-                lock=lock,
-            )
+            with contextlib.closing(self._pool(setup, shared, lock)) as pool:
+                run_tasks(pool, work)
         finally:
-            shared.remove()
-        self.times.update(spent)
+            if shared is not None:
+                shared.remove()
+
+    def _pool(self, setup: Setup, shared: SharedScene | None, lock: OutputLock) -> WorkerPool:
+        """This process, or several that open the shared scene."""
+        workers = self.job.workers
+        if shared is None:
+            assert self.scene is not None
+            opened = (self.scene, self.index.frames)
+            return SerialPool(SceneSetup(setup, lambda: opened, self.renderer))
+        own = SceneSetup(setup, shared.open, self.renderer, lock.inherited(), workers)
+        return ProcessPool(own, workers)
 
     def _resolved(self, recipe: Recipe) -> Recipe:
         """The recipe with the settings that its quality chooses here, or has chosen before."""

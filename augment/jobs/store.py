@@ -6,19 +6,20 @@ Paths are relative to the folder, with forward slashes. A file is there whole or
 from __future__ import annotations
 
 import contextlib
-import itertools
+import importlib
 import os
 import re
-import secrets
+import shutil
+import stat
+import sys
+import tempfile
 import threading
-import time
 import urllib.parse
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from random import SystemRandom
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from augment.errors import OutputError
 from augment.jobs.atomic import (
@@ -31,10 +32,6 @@ from augment.jobs.atomic import (
     write_atomic,
 )
 from augment.jobs.layout import path_below, relative_parts
-from augment.jobs.processes import uninterrupted
-
-if TYPE_CHECKING:
-    from pyarrow.fs import FileSystem
 
 _UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
 
@@ -54,8 +51,7 @@ class StoredFile:
 @runtime_checkable
 class Store(Protocol):
     """Files below one folder. All methods raise OutputError, and may be called by any thread. A
-    store can be pickled and used after a fork: each process opens its own connections. A child of
-    os.fork that used S3 must end by os._exit: at a normal exit, pyarrow waits for threads it lacks.
+    store can be pickled and used after a fork: each process opens its own connections.
     """
 
     @property
@@ -124,6 +120,8 @@ def stored_path(path: str, uri: str) -> str:
 
 
 # ---- An output folder on this machine, or on a file system that it has mounted -------------------
+# obstore's local store flushes nothing to the disk, makes no hard links of files elsewhere, and its
+# temporary names cannot be told from a dead process's; so files are written by `atomic`.
 
 _MAX_RACES = 100  # times that others delete a folder in which a file is just being made
 
@@ -144,13 +142,11 @@ class LocalStore:
 
     def read(self, path: str) -> bytes:
         file = self._file(path)
-        try:
-            with _reading(file):
+        with _reading(file):
+            try:
                 return file.read_bytes()
-        except OutputError as error:
-            if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
+            except (FileNotFoundError, NotADirectoryError):
                 raise StoredFileMissing(f"{file} is missing") from None
-            raise
 
     def write(self, path: str, data: bytes) -> None:
         file = self._file(path)
@@ -158,15 +154,11 @@ class LocalStore:
 
     def put_file(self, path: str, source: Path) -> None:
         """A hard link where the system can, else a copy; either way flushed to the disk."""
-        file = self._file(path)
+        self._file(path)
         with _reading(source):
             original = source.resolve(strict=True)
-            descriptor = os.open(original, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        _with_folder(lambda: _link_or_copy(original, file))
+            flush_folder(original)  # or a file
+        self.put_files({path: original})
 
     def put_files(self, files: Mapping[str, Path]) -> None:
         """As put_file, for files that are durable already; each folder is flushed once, at the end.
@@ -174,7 +166,7 @@ class LocalStore:
         """
         placed = {self._file(path): source for path, source in files.items()}
         for file, source in placed.items():
-            _with_folder(lambda file=file, source=source: _link_or_copy(source, file, flush=False))
+            _with_folder(lambda file=file, source=source: _link_or_copy(source, file))
         for folder in sorted({file.parent for file in placed}):
             with refusals_of(folder):
                 flush_folder(folder)
@@ -183,7 +175,14 @@ class LocalStore:
         top = self.root if folder == "" else self._file(folder)
         found: dict[str, StoredFile] = {}
         with _reading(top):
-            _scan(top, "" if folder == "" else f"{stored_path(folder, self.uri)}/", found)
+            for place, _, names in os.walk(top, onerror=_unless_missing):
+                for name in names:
+                    file = f"{place}/{name}"
+                    with contextlib.suppress(FileNotFoundError):  # deleted since
+                        facts = os.stat(file)
+                        if stat.S_ISREG(facts.st_mode) and not name.endswith(TEMPORARY_SUFFIX):
+                            path = file[len(self.uri) :].lstrip("/")
+                            found[path] = StoredFile(facts.st_size, facts.st_mtime)
         return dict(sorted(found.items()))
 
     def exists(self, path: str) -> bool:
@@ -215,19 +214,9 @@ class LocalStore:
         return path_below(self.root, tuple(stored_path(path, self.uri).split("/")))
 
 
-def _scan(folder: Path | str, prefix: str, found: dict[str, StoredFile]) -> None:
-    try:
-        entries = os.scandir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    with entries:
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                _scan(entry.path, f"{prefix}{entry.name}/", found)
-            elif entry.is_file() and not entry.name.endswith(TEMPORARY_SUFFIX):
-                with contextlib.suppress(FileNotFoundError):  # deleted since
-                    facts = entry.stat()
-                    found[prefix + entry.name] = StoredFile(facts.st_size, facts.st_mtime)
+def _unless_missing(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError | NotADirectoryError):
+        raise error
 
 
 def _with_folder(write: Callable[[], None]) -> None:
@@ -240,13 +229,11 @@ def _with_folder(write: Callable[[], None]) -> None:
                 raise
 
 
-def _link_or_copy(original: Path, file: Path, *, flush: bool = True) -> None:
+def _link_or_copy(original: Path, file: Path) -> None:
     with refusals_of(file):
         make_folder(file.parent)
         if not link_file(str(original), str(file)):
             copy_file(str(original), str(file))
-        if flush:
-            flush_folder(file.parent)
 
 
 @contextlib.contextmanager
@@ -259,239 +246,132 @@ def _reading(path: Path) -> Iterator[None]:
         ) from error
 
 
-# ---- An output folder in the cloud, through pyarrow's file systems -------------------------------
-# pyarrow's streams commit what they hold when an exception passes them, or when they are merely
-# dropped: an upload that stops half-way would replace an object by half of another one. So data is
-# complete before a stream is opened, the stream lives in one uninterruptible step, and the size of
-# what arrived is checked.
+# ---- An output folder in the cloud, by obstore ---------------------------------------------------
 
-# An object of these appears once its upload is complete; elsewhere a file grows under its name.
-_OBJECT_STORES = ("s3", "gs", "gcs")
-_KINDS = (*_OBJECT_STORES, "abfs", "abfss", "hdfs", "viewfs")
+_GOOGLE, _AZURE = ("gs", "gcs"), ("az", "abfs", "abfss")
+_KINDS = ("s3", *_GOOGLE, *_AZURE)
 _S3_OPTIONS = ("endpoint_override", "scheme", "region",
                "force_virtual_addressing", "tls_ca_file_path")  # fmt: skip
-_SECRET_OPTION = re.compile(r"key|secret|token|password|credential|signature|^sig$", re.IGNORECASE)
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-_CONNECT_TIMEOUT_S = 10
+_ANONYMOUS = "anonymous"  # as the user: requests are not signed
+_PARTS_AT_ONCE = 4  # of a large upload
+_T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
-class RemoteUri:
-    """A URI in parts; `public` is the same without its secrets, which repr leaves out."""
+class _Place(NamedTuple):
+    """A URI in parts. public: the URI without its credentials. host: the bucket."""
 
     public: str
     scheme: str
-    _uri: str = field(repr=False)
-    _secrets: tuple[str, ...] = field(repr=False)
-
-    @classmethod
-    def parse(cls, uri: str) -> RemoteUri:
-        """Take a URI apart."""
-        try:
-            parsed = urllib.parse.urlsplit(uri)
-            query = urllib.parse.parse_qsl(parsed.query, strict_parsing=bool(parsed.query))
-        except ValueError as error:
-            raise OutputError(f"{uri.partition(':')[0]}://... is no URI: {error}") from None
-        user, _, host = parsed.netloc.rpartition("@")
-        if parsed.scheme in ("abfs", "abfss") or user == "anonymous":  # a container, nobody
-            user, host = "", parsed.netloc
-        shown = [(name, value) for name, value in query if not _SECRET_OPTION.search(name)]
-        hidden = [value for name, value in query if _SECRET_OPTION.search(name)]
-        path, options = parsed.path.rstrip("/"), urllib.parse.urlencode(shown)
-        public = urllib.parse.urlunsplit((parsed.scheme, host, path, options, ""))
-        _check_kind(parsed.scheme, host, public)
-        _check_folder(path, parsed.fragment, public)
-        if parsed.scheme == "s3":
-            _check_s3_options([name for name, _ in query], public)
-        secrets = {*user.split(":"), *map(urllib.parse.unquote, user.split(":")), *hidden}
-        return cls(public, parsed.scheme, uri, tuple(sorted(secrets - {""}, key=len, reverse=True)))
-
-    @property
-    def writes_whole(self) -> bool:
-        """Whether a file appears under its name only when it is complete."""
-        return self.scheme in _OBJECT_STORES
-
-    def without_secrets(self, text: str) -> str:
-        """The text with user names, passwords and keys of this URI blotted out."""
-        for secret in self._secrets:
-            text = text.replace(secret, "***")
-        return text
-
-    def open(self, timeout_s: float) -> FileSystem:
-        """A new file system whose root is the URI's folder; it does not try again by itself. Raises
-        OSError: there is no such bucket, no answer ...; others of pyarrow.
-        """
-        from pyarrow.fs import FileSystem, FileType, SubTreeFileSystem
-
-        if self.scheme == "s3":
-            system, root = self._open_s3(timeout_s)
-        else:
-            system, root = FileSystem.from_uri(self._with_limits(timeout_s))
-        bucket = root.split("/")[0]
-        if self.writes_whole and system.get_file_info(bucket).type == FileType.NotFound:
-            raise OSError(f"there is no bucket {bucket!r}")
-        return SubTreeFileSystem(root, system)
-
-    def _with_limits(self, timeout_s: float) -> str:
-        """Google's library would try for a quarter of an hour."""
-        if self.scheme not in ("gs", "gcs") or "retry_limit_seconds=" in self._uri:
-            return self._uri
-        mark = "&" if "?" in self._uri else "?"
-        return f"{self._uri}{mark}retry_limit_seconds={timeout_s:g}"
-
-    def _open_s3(self, timeout_s: float) -> tuple[FileSystem, str]:
-        from pyarrow.fs import AwsStandardS3RetryStrategy, S3FileSystem
-
-        parsed = urllib.parse.urlsplit(self._uri)
-        options: dict[str, Any] = dict(urllib.parse.parse_qsl(parsed.query))
-        virtual = options.pop("force_virtual_addressing", "false").lower() in ("true", "1")
-        user, _, bucket = parsed.netloc.rpartition("@")
-        if user:
-            name, _, password = user.partition(":")
-            options["access_key"] = urllib.parse.unquote(name)
-            options["secret_key"] = urllib.parse.unquote(password)
-        system = S3FileSystem(
-            **options,
-            force_virtual_addressing=virtual,
-            request_timeout=timeout_s,
-            connect_timeout=min(timeout_s, _CONNECT_TIMEOUT_S),
-            retry_strategy=AwsStandardS3RetryStrategy(max_attempts=1),
-            # A small object takes one request instead of three.
-            allow_delayed_open=True,
-            # Without it, closing after a part has failed completes an upload that lacks the part.
-            background_writes=True,
-        )
-        return system, (bucket + urllib.parse.unquote(parsed.path)).rstrip("/")
+    host: str
+    folder: str
+    options: dict[str, str]
+    user: str
+    password: str
 
 
-def _check_kind(scheme: str, host: str, public: str) -> None:
-    if scheme not in _KINDS and not scheme.startswith("fsspec+"):
+def _parse(uri: str) -> _Place:
+    try:
+        parsed = urllib.parse.urlsplit(uri)
+        options = dict(urllib.parse.parse_qsl(parsed.query, strict_parsing=bool(parsed.query)))
+    except ValueError:  # whose text may hold a password
+        scheme = uri.partition(":")[0]
+        raise OutputError(f"{scheme}://... is no URI of the form kind://bucket/folder") from None
+    scheme, (user, _, host) = parsed.scheme, parsed.netloc.rpartition("@")
+    user, colon, password = map(urllib.parse.unquote, user.partition(":"))
+    if scheme in _AZURE and not colon:  # a container of an account
+        user, host = "", parsed.netloc
+    at = f"{_ANONYMOUS}@" if user == _ANONYMOUS else ""
+    path = parsed.path.rstrip("/")
+    public = urllib.parse.urlunsplit((scheme, at + host, path, "", ""))
+    folder = urllib.parse.unquote(path).removeprefix("/")
+    known = _S3_OPTIONS if scheme == "s3" else ()
+    unknown = [name for name in options if name not in known]
+    if scheme not in _KINDS:
         raise OutputError(
             f"{public}: there are no stores of the kind {scheme!r}; use a path of this machine, "
             f"or one of {', '.join(_KINDS)}"
         )
-    if scheme in _OBJECT_STORES and not host:
+    if not host:
         raise OutputError(f"{public} names no bucket; expected {scheme}://bucket/folder")
-
-
-def _check_folder(path: str, fragment: str, public: str) -> None:
-    folder = urllib.parse.unquote(path).removeprefix("/")
-    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _CONTROL.search(folder)
-    if fragment or not is_clean:
+    if unknown or (user and not at and scheme != "s3"):
+        raise OutputError(
+            f"{public}: there is no option {unknown[0] if unknown else 'user@'!r} here; the "
+            f"options are {', '.join(known) or 'none'}. Credentials come from the environment "
+            f"({_CREDENTIALS[scheme]})"
+        )
+    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _UNSAFE.search(folder)
+    if parsed.fragment or not is_clean:
         raise OutputError(
             f"{public}: the folder must be named without '.', '..', '#', backslashes and double "
             f"slashes; write a sign that has a meaning in URIs as %23 and so on"
         )
-
-
-def _check_s3_options(names: list[str], public: str) -> None:
-    for name in names:
-        if name not in _S3_OPTIONS:
-            raise OutputError(
-                f"{public}: S3 has no option {name!r} here; the options are "
-                f"{', '.join(_S3_OPTIONS)}. Credentials come from the environment "
-                f"(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY) or ~/.aws"
-            )
-
-
-# ---- What pyarrow's failures of remote file systems mean: whether they pass, and what to do ------
-# pyarrow says it in words only: `AWS Error ACCESS_DENIED during PutObject operation: ...`.
-
-_DENIED = re.compile(
-    r"ACCESS_DENIED|INVALID_ACCESS_KEY|SIGNATURE_DOES_NOT_MATCH|INVALID_CLIENT_TOKEN|EXPIRED_TOKEN"
-    r"|ExpiredToken|UNRECOGNIZED_CLIENT|INVALID_SIGNATURE|MISSING_AUTHENTICATION_TOKEN"
-    r"|NOT_INITIALIZED|REQUEST_TIME_TOO_SKEWED|PERMISSION_DENIED|UNAUTHENTICATED|credentials"
-    r"|AuthorizationHeaderMalformed|HTTP status 40[13]"
-)
-_NOWHERE = re.compile(
-    r"NO_SUCH_BUCKET|no bucket|RESOURCE_NOT_FOUND|NOT_FOUND|PermanentRedirect|HTTP status 30\d"
-)
-_REFUSED = re.compile(r"HTTP status 4(?!08|29)\d\d|EntityTooLarge|INVALID_PARAMETER|MALFORMED")
-
-_CREDENTIALS = {
-    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (or AWS_PROFILE), the region",
-    "gs": "GOOGLE_APPLICATION_CREDENTIALS",
-    "gcs": "GOOGLE_APPLICATION_CREDENTIALS",
-}
-_ENDPOINT = {"s3": ", the region, and the endpoint (endpoint_override or AWS_ENDPOINT_URL)"}
-
-
-def is_permanent(failure: Exception) -> bool:
-    """Whether trying again is of no use."""
-    if isinstance(failure, FileNotFoundError | PermissionError | IsADirectoryError):
-        return True
-    if not isinstance(failure, OSError):  # arguments that pyarrow refuses, what it cannot do ...
-        return True
-    text = str(failure)
-    return any(pattern.search(text) for pattern in (_DENIED, _NOWHERE, _REFUSED))
-
-
-def advice(failure: Exception, scheme: str) -> str:
-    """What to do about it."""
-    text = str(failure)
-    if isinstance(failure, PermissionError) or _DENIED.search(text):
-        named = _CREDENTIALS.get(scheme, "the credentials")
-        return f"check {named}, and that they may read, write, list and delete there"
-    if isinstance(failure, FileNotFoundError) or _NOWHERE.search(text):
-        return f"check the bucket's name, that it exists{_ENDPOINT.get(scheme, '')}"
-    if is_permanent(failure):
-        return "the store refuses this for good: check its address and options"
-    return (
-        f"check the network{_ENDPOINT.get(scheme, '')}, then run the same command again: "
-        f"every file there is whole"
-    )
-
-
-_DELETES_AT_ONCE = 8
-_of_parents: list[FileSystem | None] = []
-_random = SystemRandom()  # the jitter of processes with one seed must differ
-_T = TypeVar("_T")
+    query = urllib.parse.urlencode(options)
+    return _Place(f"{public}?{query}" if query else public, scheme, host, folder, options,
+                  user, password)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How failures that pass (timeouts, lost connections, 500, 503) are waited out. Before attempt
-    n + 1 it waits a random time up to first_wait_s * 2^(n - 1), at most longest_wait_s. One request
-    may stand still for timeout_s.
+    """How long failures that pass (timeouts, lost connections, 500, 503) are waited out. A request
+    may stand still for timeout_s, and none begins after give_up_s. Between two is a random wait that
+    doubles each time.
     """
 
-    attempts: int = 6
+    retries: int = 6
     first_wait_s: float = 0.5
     longest_wait_s: float = 10.0
     timeout_s: float = 30.0
+    give_up_s: float = 40.0
+
+    @property
+    def longest_s(self) -> float:
+        """No small request is under way for longer."""
+        return self.give_up_s + self.timeout_s
 
 
 PATIENCE = Patience()
 
 
+@dataclass(frozen=True)
+class StoredVersion:
+    """What an object holds at one moment. mark: tells it from the object's other versions.
+    modified_s: see StoredFile; 0 where it is not known.
+    """
+
+    data: bytes
+    mark: dict[str, str]
+    modified_s: float = 0.0
+
+
 class RemoteStore:
-    """Files below a place that a URI names; see Store."""
+    """Files below a place that a URI names; see Store. An upload is there whole or not at all, and
+    its bytes are signed, so a store refuses those that were cut short.
+    """
 
     local_dir = None
 
-    def __init__(self, uri: str, patience: Patience | None = None) -> None:
-        self._place = RemoteUri.parse(uri)
-        self._patience = patience or PATIENCE
-        self._reset()
-
-    @property
-    def uri(self) -> str:
-        return self._place.public
+    def __init__(self, uri: str, patience: Patience = PATIENCE) -> None:
+        self._place = _parse(uri)
+        self.uri = self._place.public
+        self.patience = patience
+        self._uri = uri
+        self._opened: tuple[int, Any] = (0, None)
 
     def __repr__(self) -> str:
         return f"RemoteStore({self.uri!r})"
 
     def __reduce__(self) -> tuple:
-        return (_restored, (self._place, self._patience))
+        return (RemoteStore, (self._uri, self.patience))
 
     def read(self, path: str) -> bytes:
         path = stored_path(path, self.uri)
-        return self._persist("read", path, lambda system: _read(system, path))
+        return self._call("read", path, lambda obs, at: bytes(obs.get(at, path).bytes()))
 
     def write(self, path: str, data: bytes) -> None:
         path = stored_path(path, self.uri)
-        put = _put if self._place.writes_whole else _put_and_move
-        self._persist("write", path, lambda system: put(system, path, data))
+        self._call(
+            "write", path, lambda obs, at: obs.put(at, path, data, max_concurrency=_PARTS_AT_ONCE)
+        )
 
     def put_file(self, path: str, source: Path) -> None:
         """The file is read into memory first: one that fails to be read must not be uploaded."""
@@ -501,138 +381,222 @@ class RemoteStore:
         self.write(path, data)
 
     def list(self, folder: str) -> dict[str, StoredFile]:
-        from pyarrow.fs import FileSelector, FileType
-
         path = "" if folder == "" else stored_path(folder, self.uri)
-        selector = FileSelector(path, allow_not_found=True, recursive=True)
-        infos = self._persist("list", path, lambda system: system.get_file_info(selector))
+        objects = self._call("list", path, lambda obs, at: obs.list(at, path or None).collect())
         found = {}
-        for info in infos:
-            name = info.path
+        for meta in objects:
+            name = meta["path"]
             # Whoever else writes there: what cannot be a path of ours cannot be read either.
             with contextlib.suppress(OutputError):
-                is_file = info.type == FileType.File and not name.endswith(TEMPORARY_SUFFIX)
-                if is_file and stored_path(name, self.uri) == name:
-                    modified = info.mtime.timestamp() if info.mtime is not None else 0.0
-                    found[name] = StoredFile(info.size, modified)
-        return dict(sorted(found.items()))
+                if name != path and stored_path(name, self.uri) == name:
+                    found[name] = StoredFile(meta["size"], meta["last_modified"].timestamp())
+        folders = {name.rpartition("/")[0] for name in found}
+        markers = {name for name in folders & found.keys() if found[name].size == 0}
+        return {name: found[name] for name in sorted(found.keys() - markers)}
 
     def exists(self, path: str) -> bool:
         path = stored_path(path, self.uri)
-        return self._persist("look up", path, lambda system: system.get_file_info(path).is_file)
+        try:
+            self._call("look up", path, lambda obs, at: obs.head(at, path))
+        except StoredFileMissing:
+            return False
+        return True
 
     def delete(self, paths: Iterable[str]) -> None:
-        """Object stores know no folders; but pyarrow leaves an empty marker of the folder."""
         names = [stored_path(path, self.uri) for path in paths]
-        if len(names) < 2:  # at the end of a process no thread can be started
+        try:
+            if names:
+                self._call("delete", names[0], lambda obs, at: obs.delete(at, names))
+        except StoredFileMissing:  # not of S3: one that is missing hides the others
             for name in names:
-                self._delete(name)
-            return
-        with ThreadPoolExecutor(min(len(names), _DELETES_AT_ONCE)) as pool:
-            list(pool.map(self._delete, names))
+                with contextlib.suppress(StoredFileMissing):
+                    self._call("delete", name, lambda obs, at, name=name: obs.delete(at, name))
 
-    def _delete(self, path: str) -> None:
-        def delete(system: FileSystem) -> None:
-            with contextlib.suppress(FileNotFoundError):
-                system.delete_file(path)
+    def read_version(self, path: str) -> StoredVersion | None:
+        """What the object holds now; None where there is none."""
 
-        self._persist("delete", path, delete)
+        def read(obs: Any, at: Any) -> StoredVersion:
+            result = obs.get(at, path)
+            modified_s = result.meta["last_modified"].timestamp()
+            return StoredVersion(bytes(result.bytes()), _mark(result.meta), modified_s)
 
-    def _persist(self, operation: str, path: str, call: Callable[[FileSystem], _T]) -> _T:
-        """What the call returns, tried again while it fails for reasons that pass."""
-        patience = self._patience
-        for attempt in itertools.count(1):
+        try:
+            return self._call("read", path, read)
+        except StoredFileMissing:
+            return None
+
+    def put_if(self, path: str, data: bytes, there: StoredVersion | None) -> StoredVersion | None:
+        """Put the bytes in place of the version `there`, or where there is nothing. Returns what is
+        there now: `data`, or what another one has put or deleted meanwhile. data: unlike any that
+        were ever there, so that a request whose answer was lost is told from another one's.
+        """
+        mode = "create" if there is None else there.mark
+        for attempts_left in (2, 1, 0):
+            is_refused = False
             try:
-                return call(self._system())
-            except FileNotFoundError as error:
-                if operation == "read":
-                    raise StoredFileMissing(f"{self._where(path)} is missing") from None
-                failure = error
-            except Exception as error:  # OSError of pyarrow, or whatever another library raises
-                failure = error
-            cause = self._place.without_secrets(" ".join(str(failure).split()))
-            if is_permanent(failure) or attempt == patience.attempts:
-                if isinstance(failure, _WrongSizeError):  # half a file is worse than none
-                    with contextlib.suppress(Exception):
-                        self._system().delete_file(path)
-                times = "" if attempt == 1 else f" after {attempt} attempts"
-                # Without its cause, whose text may hold credentials.
-                raise OutputError(
-                    f"cannot {operation} {self._where(path)}{times}: {cause}; "
-                    f"{advice(failure, self._place.scheme)}"
-                ) from None
-            longest = min(patience.first_wait_s * 2 ** (attempt - 1), patience.longest_wait_s)
-            time.sleep(_random.uniform(0, longest))
+                put = lambda obs, at: obs.put(at, path, data, mode=mode)  # noqa: E731
+                return StoredVersion(data, _mark(self._call("write", path, put)))
+            except (_OtherVersionError, StoredFileMissing):
+                is_refused = True
+            except OutputError:  # obstore does not know whether it arrived
+                if attempts_left == 0:
+                    raise
+            found = self.read_version(path)
+            if is_refused or (found is not None and found.data == data):
+                return found
         raise AssertionError
 
-    def _system(self) -> FileSystem:
-        """This process's connections. Those of a parent process must not be used after a fork."""
-        if self._process != os.getpid():
-            # Closing them here would end the parent's: both share the sockets.
-            _of_parents.append(self._opened)
-            self._reset()
-        with self._lock:
-            if self._opened is None:
-                self._opened = self._place.open(self._patience.timeout_s)
-            return self._opened
-
-    def _reset(self) -> None:
-        self._lock = threading.Lock()  # a new one: a thread of the parent may hold the old one
-        self._opened: FileSystem | None = None
-        self._process = os.getpid()
-
-    def _where(self, path: str) -> str:
-        base, _, options = self.uri.partition("?")
-        name = "/".join(filter(None, (base.rstrip("/"), path)))
-        return f"{name} ({options})" if options else name
-
-
-class _WrongSizeError(OSError):
-    """What was stored is not what was sent."""
-
-
-def _restored(place: RemoteUri, patience: Patience) -> RemoteStore:
-    store = RemoteStore.__new__(RemoteStore)
-    store._place, store._patience = place, patience
-    store._reset()
-    return store
+    def _call(self, operation: str, path: str, call: Callable[[Any, Any], _T]) -> _T:
+        """What the call of obstore returns, at this process's connections."""
+        obs = _load_obstore()
+        try:
+            if self._opened[0] != os.getpid():
+                _of_parents.append(self._opened)  # to close them here is not safe
+                self._opened = (os.getpid(), _open(obs, self._place, self.patience))
+            return call(obs, self._opened[1])
+        except Exception as error:
+            cause, base = _cause(error), self.uri.partition("?")[0]
+            where = f"{base}/{path}" if path else base
+            if isinstance(error, FileNotFoundError) and not _NO_BUCKET.search(cause):
+                raise StoredFileMissing(f"{where} is missing") from None
+            if isinstance(
+                error, obs.exceptions.AlreadyExistsError | obs.exceptions.PreconditionError
+            ):
+                raise _OtherVersionError from None
+            for secret in (self._place.user, self._place.password):
+                cause = cause.replace(secret, "***") if secret else cause
+            # Without its cause, whose text may hold credentials.
+            raise OutputError(
+                f"cannot {operation} {where}: {cause}; {_advice(error, cause, self._place.scheme)}"
+            ) from None
 
 
-def _read(system: FileSystem, path: str) -> bytes:
-    with system.open_input_file(path) as file:
-        size = file.size()
-        data = file.read(size)
-    if len(data) != size:
-        raise OSError(f"{len(data)} bytes of {size} arrived")
-    return data
+class _OtherVersionError(OutputError):
+    """The object is no longer the version that was to be replaced."""
 
 
-def _put(system: FileSystem, path: str, data: bytes) -> None:
-    def upload() -> None:
-        with system.open_output_stream(path, compression=None) as stream:
-            stream.write(data)
-
-    uninterrupted(upload)
-    _check_size(system, path, len(data))
+def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
+    return {name: facts[name] for name in ("e_tag", "version") if facts[name] is not None}
 
 
-def _put_and_move(system: FileSystem, path: str, data: bytes) -> None:
-    folder, _, name = path.rpartition("/")
-    hidden = f".{name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}"
-    temporary = f"{folder}/{hidden}" if folder else hidden
-    if folder:
-        system.create_dir(folder, recursive=True)
-    try:
-        _put(system, temporary, data)
-        system.move(temporary, path)
-    except BaseException:
-        with contextlib.suppress(Exception):
-            system.delete_file(temporary)
-        raise
-    _check_size(system, path, len(data))
+def _open(obs: Any, place: _Place, patience: Patience) -> Any:
+    """obstore's store of the place."""
+    client: dict[str, Any] = {
+        "connect_timeout": timedelta(seconds=min(patience.timeout_s, 10.0)),
+        "read_timeout": timedelta(seconds=patience.timeout_s),
+        "timeout": timedelta(days=1),  # of a whole download
+    }
+    wait = {
+        "init_backoff": timedelta(seconds=patience.first_wait_s),
+        "max_backoff": timedelta(seconds=patience.longest_wait_s),
+        "base": 2,
+    }
+    settings: dict[str, Any] = {
+        "client_options": client,
+        "retry_config": {
+            "max_retries": patience.retries,
+            "retry_timeout": timedelta(seconds=patience.give_up_s),
+            "backoff": wait,
+        },
+    }
+    if place.scheme in _AZURE:
+        return obs.store.AzureStore.from_url(place.public, **settings)
+    settings["prefix"] = place.folder
+    if place.user == _ANONYMOUS:
+        settings["skip_signature"] = True
+    if place.scheme in _GOOGLE:
+        return obs.store.GCSStore(place.host, **settings)
+    if place.user not in ("", _ANONYMOUS):
+        settings |= {"access_key_id": place.user, "secret_access_key": place.password}
+    options = place.options
+    if "region" in options:
+        settings["region"] = options["region"]
+    if "tls_ca_file_path" in options:
+        file = Path(options["tls_ca_file_path"])
+        with _reading(file):
+            client["root_certificate"] = file.read_bytes()
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
+    if "endpoint_override" in options:
+        scheme, _, host = options["endpoint_override"].rpartition("://")
+        is_virtual = options.get("force_virtual_addressing", "").lower() in ("true", "1")
+        bucket = f"{place.host}." if is_virtual else ""
+        endpoint = f"{scheme or options.get('scheme', 'https')}://{bucket}{host}"
+        settings |= {"endpoint": endpoint, "virtual_hosted_style_request": is_virtual}
+    client["allow_http"] = endpoint.startswith("http://")
+    # Not every server knows requests that delete many.
+    return obs.store.S3Store(place.host, disable_bulk_delete=True, **settings)
 
 
-def _check_size(system: FileSystem, path: str, expected: int) -> None:
-    size = system.get_file_info(path).size
-    if size != expected:
-        raise _WrongSizeError(f"{size} bytes of {expected} arrived")
+_of_parents: list[Any] = []
+_loading = threading.Lock()
+_loaded: tuple[int, Any] = (0, None)  # the process, and obstore as it may use it
+
+
+def _load_obstore() -> Any:
+    """obstore, whose threads do not survive a fork (in a child its calls never return), and which
+    it cannot start again: a forked process loads a copy of it under another path.
+    """
+    global _loaded
+    with _loading:
+        process, obs = _loaded
+        if process == 0:
+            obs = importlib.import_module("obstore")
+        elif process != os.getpid():
+            with tempfile.TemporaryDirectory() as folder:
+                shutil.copytree(Path(obs.__file__).parent, Path(folder, "obstore"))
+                for name in [name for name in sys.modules if name.split(".")[0] == "obstore"]:
+                    del sys.modules[name]
+                sys.path.insert(0, folder)
+                try:
+                    obs = importlib.import_module("obstore")
+                finally:
+                    sys.path.remove(folder)
+        _loaded = (os.getpid(), obs)
+        return obs
+
+
+def _after_fork() -> None:
+    global _loading
+    _loading = threading.Lock()  # a thread of the parent may hold the other
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+# ---- What obstore's failures mean, and what to do ------------------------------------------------
+
+_NO_BUCKET = re.compile("NoSuchBucket|bucket does not exist|ContainerNotFound")
+_CREDENTIALS = {
+    "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION",
+    **dict.fromkeys(_GOOGLE, "GOOGLE_APPLICATION_CREDENTIALS"),
+    **dict.fromkeys(_AZURE, "AZURE_STORAGE_ACCOUNT_NAME, AZURE_STORAGE_ACCOUNT_KEY"),
+}
+_ENDPOINT = {"s3": ", the region, and the endpoint (endpoint_override or AWS_ENDPOINT_URL)"}
+_ADVICE = {
+    "PermissionDenied|Unauthenticated|(?i:credential)|169\\.254\\.|AuthorizationHeaderMalformed": (
+        "check {credentials}, and that they may read, write, list and delete there"
+    ),
+    f"{_NO_BUCKET.pattern}|PermanentRedirect|status code: 30": (
+        "check the bucket's name, that it exists{endpoint}"
+    ),
+    "NotSupported|501 Not Implemented": (
+        "the store lacks such requests; claims need puts with If-None-Match and If-Match"
+    ),
+    "InvalidPath": "delete what others have put there",
+    "status code: 4(?!08|29)": "the store refuses this for good: check its address and options",
+    "": "check the network{endpoint}, then run the same command again: every file there is whole",
+}
+
+
+def _cause(error: Exception) -> str:
+    """The failure without obstore's debugging output; of an answer in XML, its code."""
+    text, _, details = str(error).partition("\n\nDebug source")
+    text = re.sub(r"<\?xml.*<Code>(.*?)</Code>.*", r"\1", text, flags=re.DOTALL)
+    kind = re.search(r"HttpError \{\s*kind: (\w+)", details)
+    return " ".join(text.split()) + (f" ({kind[1]})" if kind else "")
+
+
+def _advice(error: Exception, cause: str, scheme: str) -> str:
+    text = f"{type(error).__name__} {cause}"
+    advice = next(advice for pattern, advice in _ADVICE.items() if re.search(pattern, text))
+    return advice.format(credentials=_CREDENTIALS[scheme], endpoint=_ENDPOINT.get(scheme, ""))

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import pickle
 import threading
 import time
-from collections import Counter, defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from multiprocessing import reduction
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -24,7 +21,7 @@ import numpy as np
 
 from augment.boxes import Instances
 from augment.cameras import Camera, Frame
-from augment.errors import ClimateGSError, GpuLost, OutputError
+from augment.errors import GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.files import (
     BoxWeather,
@@ -38,21 +35,11 @@ from augment.jobs.files import (
 from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
 from augment.jobs.processes import (
-    READY,
-    ChildProcess,
-    Ended,
     InheritedLock,
-    OutputLock,
-    SharedScene,
     available_cores,
-    failed_start,
     gpu_is_lost,
-    inbox_of,
-    limit_threads,
     quick_turns,
-    receive,
     renders_on_gpu,
-    sender,
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note
 from augment.labels import Boxes, LidarSweep
@@ -199,7 +186,7 @@ class Pending(Protocol):
 class Setup:
     """What rendering needs besides scene and frames; small, and picklable. labelled: numbers of the
     frames whose labels and LiDAR pass through. instances: of the scene's objects. memo: what
-    the recipes' images share; the scene to render takes it over.
+    the recipes' images share; the scene to render takes it over. overwrite: sweeps that are there.
     """
 
     out_dir: str
@@ -208,6 +195,7 @@ class Setup:
     labelled: frozenset[int]
     instances: Instances
     memo: Mapping[Hashable, Any] = field(default_factory=dict)
+    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -232,6 +220,19 @@ class Outcome:
     lidar: str | None = None
     lidar_note: str | None = None
     box_weather: BoxWeather = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TaskFailed:
+    """A worker's task could not be done. is_output: nothing can be written, so that all others
+    would fail. of_scene: the scene could not be opened, so that its other blocks would fail too.
+    of_memory: it may succeed while no other worker takes any.
+    """
+
+    text: str
+    is_output: bool = False
+    of_scene: bool = False
+    of_memory: bool = False
 
 
 class PassedLidar(NamedTuple):
@@ -299,15 +300,11 @@ class FrameRunner:
         self._in_flight: tuple[_Drawn, Pending] | None = None
         self._times, self._started = WorkTimes(), time.perf_counter()
 
-    def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Render the chunk's images; those not begun when `stopped()` turns true are left. The last
-        may stay in flight until `land` or the next one.
-        """
+    def run(self, chunk: Chunk) -> None:
+        """Render the chunk's images. The last may stay in flight until `land` or the next one."""
         recipe = self._setup.recipes[chunk.variant]
         lidar = self._submit(lambda: self._pass_lidar(chunk, recipe))
         for name in chunk.cameras:
-            if stopped():
-                return
             self._render(chunk, recipe, name, lidar)
 
     def land(self) -> None:
@@ -431,7 +428,7 @@ class FrameRunner:
             return PassedLidar()
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         target = Path(self._setup.out_dir) / (paths["lidar"] or "")
-        if target.exists():
+        if target.exists() and not self._setup.overwrite:
             with contextlib.suppress(OutputError):  # a damaged one is written anew
                 return _passed(recipe, read_lidar_note(target))
         with self._times.spent(LIDAR):
@@ -475,218 +472,60 @@ def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
     return PassedLidar("clean", f"{recipe.lidar_note('clean')}: {fault}")
 
 
-# ---- Two ways to run a job's chunks: in this process, or in several worker processes -------------
-# The parent hands workers its open scene (`SharedScene`); it alone decides what runs where, and
-# writes the progress logs. A worker sends READY, an Outcome for each image, and, once it is told
-# to stop, its seconds by kind of work.
-
-STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
-CHUNKS_AHEAD = 2  # one being rendered and one waiting, so that no worker idles
-Deliver = Callable[[Outcome], None]
+# ---- What a worker of one open scene does --------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Failure:
-    """The worker cannot go on. is_output: what it could not do is write."""
+class SceneSetup:
+    """What workers of one scene share. scene: opens it, with its frames, in the worker's process.
+    lock: only held: the output stays the job's until its last worker ends. workers: how many.
+    """
 
-    is_output: bool
-    text: str
+    setup: Setup
+    scene: Callable[[], tuple[Scene, Sequence[Frame]]]
+    renderer: Renderer | None
+    lock: InheritedLock | None = None
+    workers: int = 1
+
+    @property
+    def backend(self) -> str:
+        return self.setup.backend
+
+    @property
+    def output(self) -> str:
+        return self.setup.out_dir
+
+    def worker(self, on_outcome: Callable[[Outcome], None]) -> SceneWorker:
+        return SceneWorker(self, on_outcome)
 
 
-def worker_main(
-    connection: Connection,
-    setup: Setup,
-    shared: SharedScene,
-    renderer: Renderer | None,
-    threads: int,
-    lock: InheritedLock,
-) -> None:
-    """Serve chunks until told to stop. `lock` is only held: the folder stays ours until we end."""
-    limit_threads(threads)
-    stopped = threading.Event()
-    inbox = inbox_of(connection, stopped.set)
-    send = sender(connection)
-    try:
-        scene, frames = shared.open()
-        memo_of(scene).update(setup.memo)
-    except Exception as error:
-        send(Failure(False, describe(error, "taking over the scene in a worker process")))
-        return
-    send(READY)
-    on_gpu = renders_on_gpu(setup.backend)
-    # On a CPU one thread and little waiting: the memory of a view counts once per worker.
-    pump = WritePump.beside(setup.backend, threads) if on_gpu else WritePump(threads=1, waiting=2)
-    runner = FrameRunner(scene, frames, setup, renderer, send, pump)
-    try:
+class SceneWorker:
+    """Renders chunks: a task is a tuple of them, its result the seconds by kind of work."""
+
+    def __init__(self, setup: SceneSetup, on_outcome: Callable[[Outcome], None]) -> None:
+        self._setup, self._on_outcome = setup, on_outcome
+        self._opened: tuple[Scene, Sequence[Frame]] | None = None
+
+    def do(self, task: tuple[Chunk, ...]) -> dict[str, float] | TaskFailed:
+        try:
+            return self._render(task)
+        except OutputError as error:
+            return TaskFailed(str(error), is_output=True)
+
+    def _render(self, task: tuple[Chunk, ...]) -> dict[str, float]:
+        own, on_gpu = self._setup, renders_on_gpu(self._setup.backend)
+        if self._opened is None:
+            self._opened = own.scene()
+            memo_of(self._opened[0]).update(own.setup.memo)
+        if own.workers == 1 or on_gpu:
+            pump = WritePump.beside(own.backend, max(1, available_cores() // own.workers))
+        else:  # one thread and little waiting: the memory of a view counts once per worker
+            pump = WritePump(threads=1, waiting=2)
+        runner = FrameRunner(*self._opened, own.setup, own.renderer, self._on_outcome, pump)
         with quick_turns(on_gpu):
             try:
-                while True:
-                    if inbox.empty():  # the next chunk may depend on what becomes of the last view
-                        runner.land()
-                    if (chunk := inbox.get()) is None:
-                        break
-                    runner.run(chunk, stopped.is_set)
+                for chunk in task:
+                    runner.run(chunk)
             finally:
                 seconds = runner.close()
-        send(seconds)
-    except OutputError as error:
-        send(Failure(True, str(error)))
-    except GpuLost:  # as any death of a worker: another one tries what this has in hand
-        raise
-    except Exception as error:
-        send(Failure(False, describe(error, "in a worker process")))
-
-
-def run_serially(
-    scene: Scene,
-    frames: Sequence[Frame],
-    setup: Setup,
-    chunks: Sequence[Chunk],
-    renderer: Renderer | None,
-    deliver: Deliver,
-) -> dict[str, float]:
-    """Render in this thread, encode and write in others; seconds by kind of work."""
-    pump = WritePump.beside(setup.backend, available_cores())
-    runner = FrameRunner(scene, frames, setup, renderer, deliver, pump)
-    with quick_turns(renders_on_gpu(setup.backend)):
-        try:
-            for chunk in chunks:
-                runner.run(chunk)
-        finally:
-            seconds = runner.close()
-    return seconds
-
-
-def run_in_processes(
-    setup: Setup,
-    chunks: Sequence[Chunk],
-    *,
-    workers: int,
-    shared: SharedScene,
-    renderer: Renderer | None,
-    deliver: Deliver,
-    lock: OutputLock,
-) -> dict[str, float]:
-    """Render in `workers` processes; `deliver` is called in this thread. Returns seconds by kind of
-    work, without those of workers that died. What a dead worker had in hand is tried once more,
-    each image alone; if its process dies again the image is recorded as failed. Raises ValueError:
-    the renderer cannot be sent to another process. OutputError: a worker could not write.
-    ClimateGSError: one could not start.
-    """
-    try:
-        reduction.ForkingPickler.dumps(renderer)
-    except (AttributeError, TypeError, pickle.PicklingError) as error:
-        raise ValueError(
-            f"renderer {renderer!r} cannot be sent to worker processes: {error}; use a function "
-            f"defined at the top of a module, or workers=1"
-        ) from error
-    count = min(workers, len(chunks))
-    threads = max(1, available_cores() // count)
-
-    def start() -> _Worker:
-        arguments = (setup, shared, renderer, threads, lock.inherited())
-        return _Worker(worker_main, *arguments, threads=threads, daemon=True)
-
-    pool = _Pool(start, deliver, deque(chunks))
-    pool.run(count)
-    return dict(pool.seconds)
-
-
-class _Worker(ChildProcess):
-    """A worker process as its parent sees it. on_trial: at one image whose worker died before."""
-
-    on_trial = False
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.in_hand: list[Chunk] = []
-
-    def give(self, chunk: Chunk) -> None:
-        self.in_hand.append(chunk)
-        self.send(chunk)
-
-    def take(self, outcome: Outcome) -> None:
-        """Strike a finished image off what the worker has in hand."""
-        for position, chunk in enumerate(self.in_hand):
-            if (chunk.variant, chunk.frame) == (outcome.variant, outcome.frame):
-                rest = tuple(name for name in chunk.cameras if name != outcome.camera)
-                if len(rest) < len(chunk.cameras):
-                    kept = [replace(chunk, cameras=rest)] if rest else []
-                    self.in_hand[position : position + 1] = kept
-                    self.on_trial = self.on_trial and bool(kept)
-                    return
-
-
-@dataclass
-class _Pool:
-    start: Callable[[], _Worker]
-    deliver: Deliver
-    waiting: deque[Chunk]
-    retries: deque[Chunk] = field(default_factory=deque)
-    workers: list[_Worker] = field(default_factory=list)
-    seconds: Counter[str] = field(default_factory=Counter)
-    is_stopping: bool = False
-
-    def run(self, count: int) -> None:
-        try:
-            self.workers += [self.start() for _ in range(count)]
-            while self._feed():
-                for worker, message in receive(self.workers, None):
-                    self._take(worker, message)
-        finally:
-            self._stop()
-
-    def _feed(self) -> bool:
-        """Hand out work; False when there is none left, in hand or waiting."""
-        for worker in self.workers:
-            while self.waiting and not worker.on_trial and len(worker.in_hand) < CHUNKS_AHEAD:
-                worker.give(self.waiting.popleft())
-            if self.retries and not worker.in_hand:
-                worker.on_trial = True
-                worker.give(self.retries.popleft())
-        return any(worker.in_hand for worker in self.workers)
-
-    def _take(self, worker: _Worker, message: Any) -> None:
-        if isinstance(message, Ended):
-            self.workers.remove(worker)
-            if not self.is_stopping:
-                self._replace(worker, message.how)
-        elif isinstance(message, Failure):
-            raise (OutputError if message.is_output else ClimateGSError)(message.text)
-        elif isinstance(message, dict):
-            self.seconds.update(message)
-        else:
-            worker.take(message)
-            self.deliver(message)
-
-    def _replace(self, worker: _Worker, ending: str) -> None:
-        """Decide about what a worker that died had in hand."""
-        if not worker.is_ready:
-            raise failed_start(ending)
-        _log.warning("a worker process %s; its images are tried once more", ending)
-        for chunk in worker.in_hand:
-            for name in chunk.cameras:
-                if worker.on_trial:
-                    message = (
-                        f"the worker process {ending} while rendering this image, and again when "
-                        f"it was tried alone; if memory ran out, use fewer workers"
-                    )
-                    self.deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
-                else:
-                    self.retries.append(replace(chunk, cameras=(name,)))
-        if self.waiting or self.retries:
-            self.workers.append(self.start())
-
-    def _stop(self) -> None:
-        """Let every worker finish the image it is at, and take it in; kill what does not end."""
-        self.is_stopping, deadline = True, time.monotonic() + STOP_S
-        try:
-            for worker in self.workers:
-                worker.send(None)
-            while self.workers and time.monotonic() < deadline:
-                for worker, message in receive(self.workers, 1.0):
-                    with contextlib.suppress(ClimateGSError):  # the first is on its way
-                        self._take(worker, message)
-        finally:
-            for worker in self.workers:
-                worker.kill()
+        return seconds

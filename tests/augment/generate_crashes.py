@@ -43,8 +43,9 @@ from generate_jobs import (
 from tqdm import tqdm
 
 import augment.jobs.generate as drive
+import augment.jobs.pools as pools
 from augment.errors import OutputError
-from augment.jobs.block_pools import Finished, ProcessPool
+from augment.jobs.pools import Finished, ProcessPool
 from augment.jobs.block_worker import IndexTask
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.jobs.manifest import read_finished
@@ -66,9 +67,9 @@ def main(folder: Path, names: list[str]) -> None:
     tqdm.set_lock(threading.RLock())
     faulthandler.register(signal.SIGUSR1)
     take_notes(folder / "notes")
-    start_fork_server("generate_jobs", "augment.jobs.block_pools")
+    start_fork_server("generate_jobs", "augment.jobs.pools")
     keep_in_forks()
-    drive.ELSEWHERE_S = drive.WAIT_S = 0.05
+    drive.ELSEWHERE_S = pools.WAIT_S = 0.05
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))
     run_generate(make_job(folder / "warm"), progress=False)  # imports what is imported late
     gc.collect()
@@ -366,7 +367,7 @@ def kill_an_idle_worker(folder: Path) -> dict:
     setup = make_job(folder / "idle").setup
 
     def work() -> None:
-        pool, task = ProcessPool(setup, lambda slot, outcome: None, 1), IndexTask("fake:a", None)
+        pool, task = ProcessPool(setup, 1), IndexTask("fake:a", None)
         for _ in range(2):
             pool.give(0, task)
             (event,) = pool.wait(60)

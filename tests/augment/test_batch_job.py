@@ -97,7 +97,7 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "depth_path": "street/fog-000/depth/front/000002.png",
         "semantic_path": "street/fog-000/semantic/front/000002.png",
         "instance_path": "street/fog-000/instance/front/000002.png",
-        "lidar_path": "street/fog-000/lidar/000002.parquet",
+        "lidar_path": "street/lidar/000002.parquet",
         "labels_path": "street/fog-000/labels/boxes.parquet",
         "calibration_path": "street/fog-000/calibration.json",
         "width": SIZE[0],
@@ -149,11 +149,11 @@ def test_labels_and_lidar_pass_through_to_the_bit(tmp_path: Path) -> None:
             assert_same_column(got.attributes[name], expected.attributes[name])
     for number in range(3):
         expected = FakeLabels().lidar(number)
-        got = read_lidar(folder / "lidar" / f"{number:06d}.parquet")
+        got = read_lidar(folder.parent / "lidar" / f"{number:06d}.parquet")
         assert list(got.columns) == list(expected.columns)
         for name in expected.columns:
             assert_same_column(got.columns[name], expected.columns[name])
-    assert not (folder / "lidar" / "000003.parquet").exists()
+    assert not (folder.parent / "lidar" / "000003.parquet").exists()
 
 
 def test_calibration_is_in_the_datasets_world(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     """The third promise: workers take over the job's bed and maps. What they found themselves would
     show.
     """
-    start_fork_server("batch_scenes", "augment.jobs.worker")
+    start_fork_server("batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
     monkeypatch.setattr(
         "augment.effects.snow.support.place_snow_support", lambda *_, **__: make_bed(3.0)
@@ -55,7 +55,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     result = run_job(job, scene_loader=open_fake, renderer=render_dying_at_frame_2, progress=False)
     assert (result.written, result.failed) == (7, 1)
     assert "was killed by SIGKILL while rendering this image, and again" in result.failures[0]
-    assert "a worker process was killed by SIGKILL; its images are tried once more" in caplog.text
+    assert "images are tried once more, alone: its worker was killed by SIGKILL" in caplog.text
     failed = [r for r in read_manifest(job.out_dir).to_pylist() if r["status"] == "failed"]
     assert [(row["frame"], row["camera"]) for row in failed] == [(2, "front")]
 
@@ -69,7 +69,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
 
 def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, monkeypatch) -> None:
     """They have it in flight when they have no more to do, and the job waits for it."""
-    start_fork_server("batch_scenes", "augment.jobs.worker")
+    start_fork_server("batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
     job = RenderJob("fake:street", [make_recipe()], tmp_path / "begun", workers=2)
     result = run_job(job, scene_loader=open_fake, renderer=begin_fake, progress=False)
@@ -132,7 +132,7 @@ def test_labels_that_cannot_be_sent_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_cannot_start_ends_the_job(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("augment.jobs.worker.worker_main", os.abort)
+    monkeypatch.setattr("augment.jobs.pools._main", os.abort)
     job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0], workers=2)
     with pytest.raises(ClimateGSError, match=r"worker process ended with exit code 1 while start"):
         run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)

@@ -28,7 +28,7 @@ from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.blocks import Block, read_status
 from augment.jobs.files import WritePump, encode_depth, encode_image
-from augment.jobs.generate import GenerateJob, Scheduler, make_pool, plan_job, run_generate
+from augment.jobs.generate import BlockWork, GenerateJob, Workers, plan_job, run_generate
 from augment.jobs.layout import variant_name
 from augment.jobs.manifest import compact
 from augment.jobs.store import open_store
@@ -164,17 +164,19 @@ def _generate(job: GenerateJob, executor: str, workers: int, out: Path) -> float
     setup = dataclasses.replace(job.setup, store_uri=str(out))
     run = dataclasses.replace(job, setup=setup, executor=executor, workers=workers)
     plan = plan_job(run, progress=False)
-    scheduler = Scheduler(lambda tick: make_pool(run, tick))
-    with contextlib.closing(scheduler):
-        first, rest = plan.blocks[:workers], plan.blocks[workers:]
-        scheduler.render(first, dict(plan.names), _refuse_failure)
+    with contextlib.closing(Workers(run)) as own:
+        first, rest = (
+            BlockWork(blocks, plan.names, own.opened, _refuse_failure)
+            for blocks in (plan.blocks[:workers], plan.blocks[workers:])
+        )
+        own.do(first)
         started = time.perf_counter()
-        scheduler.render(rest, dict(plan.names), _refuse_failure)
+        own.do(rest)
         compact(open_store(out))
         took = time.perf_counter() - started
-    if scheduler.tally.failed or scheduler.tally.written != plan.images:
-        raise RuntimeError(f"the job did not do what is measured: {scheduler.tally}")
-    return took / sum(block.images for block in rest)
+    if first.tally.written + rest.tally.written != plan.images:
+        raise RuntimeError(f"the job did not do what is measured: {first.tally}, {rest.tally}")
+    return took / rest.tally.written
 
 
 def _refuse_failure(block: Block, message: str) -> None:

@@ -1,4 +1,8 @@
-"""Workers that do one task each at a time: in this process, in several, or on a Ray cluster."""
+"""Workers that do one task each at a time: in this process, in several, or on a Ray cluster; and
+the loop that gives them work.
+
+What a job's workers do is its setup's: `setup.worker(on_outcome)` makes one, where it runs.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any, Protocol, runtime_checkable
 
 import augment
-from augment.errors import ClimateGSError
-from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
+from augment.errors import ClimateGSError, OutputError
 from augment.jobs.processes import (
     READY,
     ChildProcess,
@@ -31,9 +35,36 @@ from augment.jobs.processes import (
     receive,
     sender,
 )
-from augment.jobs.store import open_store
-from augment.jobs.worker import Outcome
+from augment.jobs.worker import Outcome, TaskFailed
 from augment.render.buffers import CUDA
+
+OnOutcome = Callable[[Outcome], None]
+
+
+@runtime_checkable
+class Worker(Protocol):
+    """Does one task after the other. An error that concerns the task alone is its result, a
+    TaskFailed; one that is raised ends the process.
+    """
+
+    def do(self, task: Any) -> Any: ...
+
+
+@runtime_checkable
+class WorkerSetup(Protocol):
+    """What all workers of a job share; picklable. on_outcome: hears of every image, from several
+    threads.
+    """
+
+    @property
+    def backend(self) -> str: ...
+
+    @property
+    def output(self) -> str:
+        """The output, to name it."""
+        ...
+
+    def worker(self, on_outcome: OnOutcome) -> Worker: ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +72,7 @@ class Finished:
     """The worker has done its task."""
 
     slot: int
-    result: Result
+    result: Any
 
 
 @dataclass(frozen=True)
@@ -53,19 +84,18 @@ class Lost:
 
 
 Event = Finished | Lost
-Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker is done with
 
 
 @runtime_checkable
 class WorkerPool(Protocol):
-    """Workers are numbered 0 to slots - 1; each has at most one task. A pool reports finished
-    images to the `tick` that it was made with, in the thread that waits; a SerialPool in several
-    threads.
+    """Workers are numbered 0 to slots - 1; each has at most one task. A pool tells `tick` of
+    finished images, in the thread that waits; a SerialPool in several threads.
     """
 
     slots: int
+    tick: Callable[[int, Outcome], None]
 
-    def give(self, slot: int, task: Task) -> None:
+    def give(self, slot: int, task: Any) -> None:
         """Start a task in a worker that has none."""
 
     def wait(self, timeout_s: float) -> list[Event]:
@@ -76,21 +106,111 @@ class WorkerPool(Protocol):
         """End all workers: each finishes the images it has at hand, and what they hold is free."""
 
 
+# ---- Tasks given to the workers of a pool, and tried once more where a worker died ---------------
+
+WAIT_S = 1.0
+
+
+class Work:
+    """Tasks for `run_tasks`, and what becomes of them."""
+
+    def tick(self, slot: int, outcome: Outcome) -> None:
+        """Hear of an image that a worker is done with."""
+
+    def take(self, slot: int) -> Any:
+        """The next task for an idle worker; None where there is none for now."""
+        raise NotImplementedError
+
+    def later_s(self) -> float | None:
+        """In how many seconds to ask again although no worker is busy; None: all is done."""
+        return None
+
+    def retry(self, slot: int, task: Any, why: str) -> Sequence[Any]:
+        """What to try, each while no other worker is busy, after the task's worker died or memory
+        ran out.
+        """
+        return [task]
+
+    def done(self, slot: int, task: Any, result: Any) -> None:
+        """The task's result, or a TaskFailed."""
+        raise NotImplementedError
+
+    def lost(self, slot: int, task: Any, how: str) -> None:
+        """The task's worker died when it was tried alone, too."""
+        raise NotImplementedError
+
+
+def run_tasks(
+    pool: WorkerPool,
+    work: Work,
+    *,
+    slots: int | None = None,
+    idle: Callable[[], None] = lambda: None,
+) -> None:
+    """Do all of the work. slots: of so many workers only. idle: called now and then between events.
+    Raises OutputError: a worker could not write.
+    """
+    pool.tick = work.tick
+    trials: deque[Any] = deque()
+    busy: dict[int, Any] = {}  # by slot
+    is_trial = False  # the one task that is being done
+    while True:
+        if trials and not busy:  # alone: memory may be what it died of
+            busy[0], is_trial = trials.popleft(), True
+            pool.give(0, busy[0])
+        for slot in range(slots or pool.slots):
+            if trials or is_trial:
+                break
+            if slot not in busy and (task := work.take(slot)) is not None:
+                busy[slot] = task
+                pool.give(slot, task)
+        if not busy:
+            later_s = work.later_s()
+            if later_s is None:
+                return
+            time.sleep(min(WAIT_S, later_s))
+        for event in pool.wait(WAIT_S) if busy else ():
+            slot, task = event.slot, busy.pop(event.slot)
+            result = event.result if isinstance(event, Finished) else None
+            failed = result if isinstance(result, TaskFailed) else None
+            if failed and failed.is_output:  # nothing can be written any more
+                raise OutputError(failed.text)
+            if isinstance(event, Lost) and is_trial:
+                work.lost(slot, task, event.how)
+            elif isinstance(event, Lost):
+                trials += work.retry(slot, task, f"its worker {event.how}")
+            elif failed and failed.of_memory and not is_trial:
+                trials += work.retry(slot, task, failed.text)
+            else:
+                work.done(slot, task, result)
+        is_trial = is_trial and bool(busy)
+        idle()
+
+
+def _untold(slot: int, outcome: Outcome) -> None:
+    """For a pool that does no work yet."""
+
+
+# ---- This process alone --------------------------------------------------------------------------
+
+
 class SerialPool:
     """One worker, which is this process; it works while it is waited for."""
 
     slots = 1
 
-    def __init__(self, setup: WorkSetup, tick: Tick) -> None:
-        self._worker_state = BlockWorker(setup, lambda outcome: tick(0, outcome))
-        self._task: Task | None = None
+    tick: Callable[[int, Outcome], None] = _untold
 
-    def give(self, slot: int, task: Task) -> None:
+    def __init__(self, setup: WorkerSetup) -> None:
+        self._worker = setup.worker(lambda outcome: self.tick(0, outcome))
+        self._task: Any = None
+
+    def give(self, slot: int, task: Any) -> None:
         self._task = task
 
     def wait(self, timeout_s: float) -> list[Event]:
         task, self._task = self._task, None
-        return [] if task is None else [Finished(0, self._worker_state.do(task))]
+        return [] if task is None else [Finished(0, self._worker.do(task))]
 
     def close(self) -> None:
         self._task = None
@@ -112,14 +232,14 @@ class ProcessPool:
     ended while starting, and none has ever started.
     """
 
-    def __init__(self, setup: WorkSetup, tick: Tick, slots: int) -> None:
-        self.slots = slots
-        self._setup, self._tick = setup, tick
+    def __init__(self, setup: WorkerSetup, slots: int) -> None:
+        self.slots, self.tick = slots, _untold
+        self._setup = setup
         self._threads = max(1, available_cores() // slots)
         self._workers: dict[int, _Worker] = {}  # by slot
         self._has_started = False  # any of them
 
-    def give(self, slot: int, task: Task) -> None:
+    def give(self, slot: int, task: Any) -> None:
         worker = self._workers.get(slot)
         if worker is None:
             # No daemon: on trial it has processes of its own. It ends when the connection does.
@@ -150,7 +270,7 @@ class ProcessPool:
                 source = worker.connection
                 with contextlib.suppress(EOFError, OSError):
                     while (left := deadline - time.monotonic()) > 0 and source.poll(left):
-                        source.recv()
+                        self._event_of(worker, source.recv())
         finally:
             for worker in workers:
                 worker.kill()
@@ -162,18 +282,18 @@ class ProcessPool:
                 raise failed_start(message.how)
             return Lost(worker.slot, message.how) if worker.has_task else None
         if isinstance(message, Outcome):
-            self._tick(worker.slot, message)
+            self.tick(worker.slot, message)
             return None
         worker.has_task = False
         return Finished(worker.slot, message)
 
 
-def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
+def _main(connection: Connection, setup: WorkerSetup, threads: int) -> None:
     limit_threads(threads)
     send = sender(connection)
     # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    worker = BlockWorker(setup, send)
+    worker = setup.worker(send)
     working = threading.Event()
     inbox = inbox_of(connection, lambda: _thread.interrupt_main() if working.is_set() else None)
     send(READY)
@@ -232,7 +352,9 @@ def connect(ray: Any, slots: int | None) -> bool:
                 "env_vars": {"PYTHONPATH": os.pathsep.join(p or "." for p in sys.path)}
             },
         }
-    with _own_sigterm(), _no_usage_statistics():
+    # What Ray starts sends nothing home, unless the user has said that it may.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    with _own_sigterm():
         try:
             ray.init(**options)
         except (ConnectionError, RuntimeError, ValueError) as error:
@@ -254,19 +376,6 @@ def _own_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextlib.contextmanager
-def _no_usage_statistics() -> Iterator[None]:
-    """What Ray starts inside sends nothing home, unless the user has said that it may."""
-    name = "RAY_USAGE_STATS_ENABLED"
-    was_set = name in os.environ
-    os.environ.setdefault(name, "0")
-    try:
-        yield
-    finally:
-        if not was_set:
-            del os.environ[name]
-
-
 def last_line(error: Exception) -> str:
     """The end of an error's text, where a remote traceback says what happened."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -283,21 +392,21 @@ class RayPool:
     GPU.
     """
 
-    def __init__(self, setup: WorkSetup, tick: Tick, slots: int | None) -> None:
+    def __init__(self, setup: WorkerSetup, slots: int | None) -> None:
         self._ray = import_ray()
-        self._setup, self._tick = setup, tick
+        self._setup, self.tick = setup, _untold
         on_gpu = setup.backend == CUDA
         self._is_ours = connect(self._ray, None if on_gpu else slots)
         self._cpus, self._gpus = (_cpus_of_a_gpu(self._ray), 1) if on_gpu else (1, 0)
         of_all = self._ray.cluster_resources().get("GPU" if on_gpu else "CPU", 1)
         self.slots = slots or max(1, int(of_all))
         self._workers: list[_ActorHandle | None] = [None] * self.slots
-        self._given: dict[int, Task] = {}  # by slot, for want of a worker that is ready
+        self._given: dict[int, Any] = {}  # by slot, for want of a worker that is ready
         self._lost_starts = 0
         self._quiet_since = time.monotonic()
         self._warn_of_local_output()
 
-    def give(self, slot: int, task: Task) -> None:
+    def give(self, slot: int, task: Any) -> None:
         self._given[slot] = task
         if self._workers[slot] is None:
             self._workers[slot] = self._start()
@@ -387,7 +496,7 @@ class RayPool:
             self._workers[slot] = self._start()
             return None
         if isinstance(message, Outcome):
-            self._tick(slot, message)
+            self.tick(slot, message)
             return None
         worker.stream = None
         if message is None:
@@ -439,12 +548,12 @@ class RayPool:
 
     def _warn_of_local_output(self) -> None:
         nodes = [node for node in self._ray.nodes() if node["Alive"]]
-        if len(nodes) > 1 and open_store(self._setup.store_uri).local_dir is not None:
+        if len(nodes) > 1 and "://" not in self._setup.output:
             _log.warning(
                 "the Ray cluster has %d machines and the output is a folder, %s: it has to be a "
                 "shared one, the same on all of them; else write to an object store (s3://...)",
                 len(nodes),
-                self._setup.store_uri,
+                self._setup.output,
             )
 
 
@@ -469,18 +578,18 @@ class _Actor:
     its own, which can be interrupted: Ray's main thread cannot.
     """
 
-    def __init__(self, setup: WorkSetup, threads: int) -> None:
+    def __init__(self, setup: WorkerSetup, threads: int) -> None:
         limit_threads(threads)
-        self._inbox: SimpleQueue[Task] = SimpleQueue()
-        self._outbox: SimpleQueue[Outcome | Result | None] = SimpleQueue()
-        self._worker_state = BlockWorker(setup, self._outbox.put)
+        self._inbox: SimpleQueue[Any] = SimpleQueue()
+        self._outbox: SimpleQueue[Any] = SimpleQueue()
+        self._worker = setup.worker(self._outbox.put)
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def version(self) -> str:
         return augment.__version__
 
-    def do(self, task: Task) -> Iterator[Outcome | Result]:
+    def do(self, task: Any) -> Iterator[Any]:
         """Images as they are finished, then the result; that is missing where it was stopped."""
         self._inbox.put(task)
         while (message := self._outbox.get()) is not None:
@@ -496,7 +605,7 @@ class _Actor:
     def _work(self) -> None:
         try:
             while True:
-                self._outbox.put(self._worker_state.do(self._inbox.get()))
+                self._outbox.put(self._worker.do(self._inbox.get()))
         except KeyboardInterrupt:
             pass
         finally:
