@@ -14,7 +14,7 @@ The tiers of `quality` follow by a rule from the figures of docs/trade/*.json:
    reference, over all recipes and scenes in which it changes the picture.
 2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
    of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes
-   and views (augment.jobs.quality.within_flip).
+   and views (augment.jobs.quality.search).
 
     python -m tools.bench.trade [TABLE.json=SCENE_URI ...]
 
@@ -49,7 +49,7 @@ from augment.cameras import Camera
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
-from augment.jobs.quality import Cost, Settings, Trial, render_trial, useful, within_flip
+from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, useful
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import CLOSE_M, flip, ssim
 from augment.render.buffers import CPU, CUDA
@@ -619,12 +619,12 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
         """Of the values that are within the bound alone."""
         return min(cost.ms for cost in ladders[path] if cost.flip <= bound)
 
-    chosen = within_flip(
-        {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=min_ms)},
-        bound,
-        lambda path, value: flips[path][value],
-        lambda settings: whole_flip(rows, settings) > bound,
-    )
+    def keeps(settings: Settings) -> bool:
+        alone = (flips[path][value] for path, value in settings.items())
+        return all(flip <= bound for flip in alone) and whole_flip(rows, settings) <= bound
+
+    values = {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=min_ms)}
+    chosen = search(values, keeps)
     return {path: value for path, value in chosen.items() if value != KNOBS[path].reference}
 
 

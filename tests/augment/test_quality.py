@@ -1,8 +1,7 @@
-"""Settings chosen by rendering, recorded in an output, and found there again."""
+"""Settings chosen by rendering, kept in an output, and found there again."""
 
 from __future__ import annotations
 
-import functools
 import json
 import multiprocessing
 import time
@@ -11,26 +10,30 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 from batch_scenes import FakeView, make_camera, open_fake
 from generate_jobs import make_job, make_recipes
+from hypothesis import given
+from hypothesis import strategies as st
 
+from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs import quality as record
 from augment.jobs.generate import plan_job, run_generate
 from augment.jobs.manifest import read_manifest
 from augment.jobs.quality import (
+    Cost,
     Question,
-    Report,
-    Resolved,
-    Settings,
     calibration_views,
     recipes_to_try,
     recorded,
     render_trial,
     resolve_quality,
-    resolve_quality_once,
+    resolve_quality_for,
     resolved_recipe,
+    search,
+    steps_back,
     upsampled,
+    useful,
 )
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
@@ -40,7 +43,132 @@ from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.fields import found
 from recipes.load import load_recipe, parse_recipe
-from recipes.schema import Recipe, as_reference, free_knobs
+from recipes.schema import Recipe, as_reference
+
+# ---- The search, in tables of errors and times ---------------------------------------------------
+
+LADDERS = {"a": (1, 2, 3), "b": ("fast", "slow"), "c": (0.5, 1.0)}  # the last are the reference
+SINGLE = [(path, value) for path, values in LADDERS.items() for value in values[:-1]]
+ERRORS = st.fixed_dictionaries(dict.fromkeys(SINGLE, st.floats(0, 0.2)))
+TIMES = st.fixed_dictionaries(dict.fromkeys(SINGLE, st.floats(-10, 30)))
+
+
+def total(table: dict, settings: dict) -> float:
+    return sum(table.get(item, 0.0) for item in settings.items())
+
+
+def chosen_by_error(errors: dict, bound: float, synergy: float = 1.0) -> dict:
+    return search(LADDERS, lambda settings: synergy * total(errors, settings) <= bound)
+
+
+def chosen_by_time(errors: dict, saved: dict, budget_ms: float) -> dict:
+    costs = {
+        path: [
+            Cost(v, 100 - saved.get((path, v), 0), errors.get((path, v), 0.0)) for v in values
+        ]
+        for path, values in LADDERS.items()
+    }  # fmt: skip
+    ladders, steps = steps_back(costs)
+    return search(ladders, lambda settings: 100 - total(saved, settings) <= budget_ms, steps)
+
+
+def test_each_knob_takes_its_fastest_value_within_the_bound() -> None:
+    errors = {("a", 1): 0.05, ("a", 2): 0.01, ("b", "fast"): 0.3, ("c", 0.5): 0.02}
+    assert chosen_by_error(errors, 0.04) == {"a": 2, "b": "slow", "c": 0.5}
+
+
+def test_the_first_knobs_have_first_call_on_the_error() -> None:
+    errors = {("a", 1): 0.03, ("a", 2): 0.02, ("b", "fast"): 0.025, ("c", 0.5): 0.01}
+    assert chosen_by_error(errors, 0.04) == {"a": 1, "b": "slow", "c": 0.5}
+
+
+def test_errors_that_only_appear_together_lead_to_reference() -> None:
+    errors = dict.fromkeys(SINGLE, 0.01)
+    assert chosen_by_error(errors, 0.04, synergy=9) == {"a": 3, "b": "slow", "c": 1.0}
+
+
+@given(ERRORS, st.floats(0.1, 4), st.floats(0.001, 0.3))
+def test_what_is_chosen_is_within_the_bound(errors, synergy: float, bound: float) -> None:
+    chosen = chosen_by_error(errors, bound, synergy)
+    assert synergy * total(errors, chosen) <= bound
+    assert chosen_by_error(errors, bound, synergy) == chosen
+
+
+@pytest.mark.parametrize(
+    ("budget_ms", "chosen"),
+    [
+        (100, (3, "slow", 1.0)),
+        (95, (3, "fast", 1.0)),
+        (45, (3, "fast", 0.5)),
+        (30, (2, "fast", 0.5)),
+        (0, (1, "fast", 0.5)),
+    ],
+)
+def test_a_budget_first_undoes_what_errs_most_for_its_time(budget_ms: float, chosen) -> None:
+    errors = {("a", 1): 0.2, ("a", 2): 0.05, ("b", "fast"): 0.01, ("c", 0.5): 0.1}
+    saved = {("a", 1): 40, ("a", 2): 15, ("b", "fast"): 10, ("c", 0.5): 50}
+    # Error undone per ms: a to 2 0.006, a to 3 0.0033, c 0.002, b 0.001.
+    assert tuple(chosen_by_time(errors, saved, budget_ms).values()) == chosen
+
+
+@given(ERRORS, TIMES, st.floats(0, 100))
+def test_a_budget_is_kept_where_the_fastest_keeps_it(errors, saved, budget_ms: float) -> None:
+    chosen = chosen_by_time(errors, saved, budget_ms)
+    fastest = chosen_by_time(errors, saved, -1)
+    assert 100 - total(saved, chosen) <= max(budget_ms, 100 - total(saved, fastest))
+    assert total(errors, chosen) <= total(errors, fastest)
+
+
+def test_values_that_save_nothing_are_left_out() -> None:
+    reference, noise, slower = Cost("exact", 100, 0), Cost("noise", 99, 0.01), Cost("s", 120, 0.02)
+    good, worse, equal = Cost("good", 80, 0.03), Cost("worse", 85, 0.05), Cost("equal", 90, 0.03)
+    fastest, free = Cost("fastest", 50, 0.2), Cost("free", 80, 0)
+    costs = [fastest, worse, equal, good, slower, noise, reference]
+    assert useful(costs) == [reference, good, fastest]
+    assert useful([free, reference]) == [reference, free]  # as accurate as reference, and faster
+
+
+# ---- Views and trials ----------------------------------------------------------------------------
+
+
+def picked(frames: int, cameras: int, count: int = 3) -> list[tuple[int, str]]:
+    held = {f"c{number}": make_camera(f"c{number}", 0, 0.0) for number in range(cameras)}
+    eye = torch.eye(4, dtype=torch.float64)
+    each = [Frame(index, index, eye, dict(held)) for index in range(frames)]
+    views = calibration_views(each, count)
+    assert calibration_views(each[::-1], count) == views
+    return [(view.frame, view.name) for view in views]
+
+
+def test_views_are_spread_over_frames_and_cameras() -> None:
+    assert picked(6, 6) == [(1, "c0"), (3, "c2"), (5, "c4")]
+    assert picked(1, 2) == [(0, "c0"), (0, "c1")]
+    assert picked(1, 1) == [(0, "c0")]
+    assert picked(100, 1, 2) == [(25, "c0"), (75, "c0")]
+    assert len(picked(2, 1, 5)) == 2  # no image twice
+    with pytest.raises(ValueError, match="none of the 2 frames"):
+        picked(2, 0)
+
+
+def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
+    picture = np.zeros((2, 2, 3), np.uint8)
+    picture[:, 1] = 200
+    assert upsampled(picture, 2, 2) is picture
+    wide = upsampled(picture, 4, 2)
+    assert wide[0, :, 0].tolist() == [0, 50, 150, 200]
+    assert upsampled(wide, 2, 2)[0, :, 0].tolist() == [25, 175]  # means over areas
+
+    def render(scene, camera, recipe, *, backend: str) -> FakeView:
+        return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32))
+
+    given = (open_fake("fake:a"), make_camera("front", 0, 0.0), Recipe())
+    trial = render_trial(*given, renderer=render, size=(4, 4))
+    assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]
+    own_size = render_trial(*given, renderer=render)
+    assert own_size.picture.shape == (16, 24, 3)
+
+
+# ---- The choice in a scene -----------------------------------------------------------------------
 
 PLAIN = "output: {depth: none, labels: false, lidar: false}\n"
 
@@ -55,9 +183,6 @@ class Workbench:
 
     def __init__(self) -> None:
         self.now_s, self.rendered, self.slowness = 0.0, 0, 1.0
-
-    def clock(self) -> float:
-        return self.now_s
 
     def render(self, scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
         make_plan(recipe, scene)  # as the real one, refuses what is not settled
@@ -78,75 +203,61 @@ def _mean_error(picture: np.ndarray, truth: np.ndarray) -> float:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
-    """Its clock is the one that jobs time their choices with; errors are plain ones, as FLIP takes
-    a tenth of a second however small the picture is.
+    """Choices are timed with its clock; errors are plain ones, as FLIP takes a tenth of a second
+    however small the picture is.
     """
     bench = Workbench()
     monkeypatch.setattr("augment.jobs.quality.flip", _mean_error)
-    monkeypatch.setattr(
-        record, "resolve_quality", functools.partial(resolve_quality, clock=bench.clock)
-    )
+    monkeypatch.setattr("augment.jobs.quality.perf_counter", lambda: bench.now_s)
     return bench
 
 
 def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
     recipe, scene = open_recipe("max_flip: 0.06"), open_fake("fake:street")
-    settled = resolve_quality(recipe, scene)
-    assert resolve_quality(recipe, scene).recipe == settled.recipe
-    report = settled.report
-    assert report is not None and report.is_met and report.ms is None
-    assert settled.recipe.quality.settled and not settled.recipe.quality.is_open
-    assert settled.recipe.quality.words == "max_flip 0.06"
+    chosen = resolve_quality(recipe, scene)
+    assert resolve_quality(recipe, scene).recipe == chosen.recipe
+    assert chosen.is_met and chosen.ms is None
+    assert chosen.recipe.quality.settled and not chosen.recipe.quality.is_open
+    assert chosen.recipe.quality.words == "max_flip 0.06"
     errors = []
     for view in calibration_views(scene.frames):
-        truth = render_view(scene, view.camera, as_reference(settled.recipe)).rgb
-        got = render_view(scene, view.camera, settled.recipe).rgb
+        truth = render_view(scene, view.camera, as_reference(chosen.recipe)).rgb
+        got = render_view(scene, view.camera, chosen.recipe).rgb
         errors.append(flip(upsampled(got, view.camera.width, view.camera.height), truth))
-    assert max(errors) == report.flip <= 0.06
-    assert settled.recipe.render.scale < 1 or max(errors) > 0  # something was given up
-    assert len(report.views) == 3 and report.views[0] == (0, "front")
+    assert max(errors) == chosen.flip <= 0.06
+    assert chosen.recipe.render.scale < 1 or max(errors) > 0  # something was given up
+    assert len(chosen.views) == 3 and chosen.views[0] == (0, "front")
 
 
 def test_given_fields_stay_and_are_the_references_too(bench: Workbench) -> None:
     recipe = open_recipe("max_flip: 0.9", "render: {scale: 0.5, transmittance_stop: 0.2}\n")
-    settled = resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
-    assert settled.recipe.render.scale == 0.5 and settled.recipe.render.transmittance_stop == 0.2
-    assert settled.recipe.render.sh_degree == 0
-    assert settled.report is not None
-    assert "render.scale" not in settled.report.settings
-    trial = render_trial(
-        open_fake("fake:street"),
-        make_camera("front", 0, 0.0),
-        settled.recipe,
-        renderer=bench.render,
-    )
-    assert trial.picture.shape == (16, 24, 3) and trial.depth is None  # the camera's own size
+    chosen = resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
+    render = chosen.recipe.render
+    assert (render.scale, render.transmittance_stop, render.sh_degree) == (0.5, 0.2, 0)
+    assert "render.scale" not in chosen.settings
+    same = open_recipe("max_flip: 1e-9", "render: {scale: 0.5, sh_degree: 0}\n")
+    assert resolve_quality(same, open_fake("fake:street"), renderer=bench.render).flip == 0
 
 
 def test_a_budget_takes_as_little_as_it_needs(bench: Workbench) -> None:
-    scene = open_fake("fake:street")
-
     def chosen(budget_ms: float):
         recipe = open_recipe(f"budget_ms: {budget_ms}")
-        settled = resolve_quality(recipe, scene, renderer=bench.render, clock=bench.clock)
-        assert settled.report is not None
-        return settled.recipe.render, settled.report
+        return resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
 
-    render, report = chosen(150)
-    assert (render.scale, render.sh_degree, report.ms) == (1.0, None, pytest.approx(120))
-    assert report.measured == () and report.flip == 0  # nothing had to be given up
-    render, report = chosen(70)
+    enough, half = chosen(150), chosen(70)
+    assert (enough.recipe.render.scale, enough.recipe.render.sh_degree) == (1.0, None)
+    assert enough.ms == enough.reference_ms == pytest.approx(120) and enough.flip == 0
+    render = half.recipe.render
     assert (render.scale, render.sh_degree) == (0.75, None)  # a smooth picture loses little
-    assert report.ms == pytest.approx(67.5) and report.reference_ms == pytest.approx(120)
-    assert report.is_met and 0 < report.flip < 0.1
+    assert half.ms == pytest.approx(67.5) and half.reference_ms == pytest.approx(120)
+    assert half.is_met and 0 < half.flip < 0.1
     assert render.radius_clip_px == 0  # saves nothing
 
 
 def test_a_budget_beyond_reach_says_so(bench: Workbench, caplog: pytest.LogCaptureFixture) -> None:
     recipe = open_recipe("budget_ms: 1")
-    settled = resolve_quality(recipe, open_fake("fake:a"), renderer=bench.render, clock=bench.clock)
-    assert settled.report is not None and not settled.report.is_met
-    assert settled.recipe.render.scale == 0.25
+    chosen = resolve_quality(recipe, open_fake("fake:a"), renderer=bench.render)
+    assert not chosen.is_met and chosen.recipe.render.scale == 0.25
     assert "its frames take 6 ms with the fastest settings" in caplog.text
 
 
@@ -158,8 +269,8 @@ def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
         return FakeView(np.full((16, 24, 3), 99, np.uint8))
 
     recipe = open_recipe("budget_ms: 1e6", "weather: {snow: {depth_m: 0}}\nrender: {scale: 1}\n")
-    settled = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
-    assert found(settled.recipe, "weather.snow.cell_m") == 0.1
+    chosen = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
+    assert found(chosen.recipe, "weather.snow.cell_m") == 0.1
     given = open_recipe("max_flip: 0.1", "weather: {snow: {depth_m: 0, cell_m: 0.05}}\n")
     with pytest.raises(SceneError, match="too many cells"):
         resolve_quality(given, open_fake("fake:a"), renderer=render)
@@ -171,11 +282,13 @@ def test_what_has_not_chosen_is_not_rendered() -> None:
         render_view(scene, make_camera("front", 0, 0.0), recipe)
     tried = recipes_to_try(recipe)
     assert len(tried) > 8 and not any(r.quality.is_open for r in tried)
-    assert (
-        recipes_to_try(tried[0]) == [tried[0]] and resolve_quality(tried[0], scene).report is None
-    )
+    assert recipes_to_try(tried[0]) == [tried[0]]
+    assert resolve_quality(tried[0], scene).recipe is tried[0]
     with pytest.raises(ValueError, match="leaves free render"):
         resolved_recipe(recipe, {"render.near_m": 1.0})
+
+
+# ---- What an output keeps of it ------------------------------------------------------------------
 
 
 def pictures(folder: Path) -> dict[str, bytes]:
@@ -215,33 +328,30 @@ def test_a_job_goes_on_with_its_choice_whatever_the_clock_says(
     assert set(read_manifest(tmp_path / "a")["render_scale"].to_pylist()) == {0.25}
 
 
-@pytest.mark.parametrize("data", [b"", b"[]", b'{"format": 2}', b"\xff"])
-def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path, data: bytes) -> None:
-    store, recipe = open_store(tmp_path), open_recipe("max_flip: 0.5")
-    question = Question(recipe, "a", "fake:a", "recorded", "cpu")
-    store.write(question.path, data)
-    with pytest.raises(OutputError, match=r"recipe fog in scene a, is damaged: .*Delete it"):
-        recorded(store, question)
+def changed(document: dict, part: str, key: str, value) -> bytes:
+    text = json.dumps({**document, part: {**document[part], key: value}})
+    return text.encode()
 
 
-def test_a_changed_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
-    store, recipe = open_store(tmp_path), open_recipe("max_flip: 0.5")
-    question = Question(recipe, "a", "fake:a", "recorded", "cpu")
-    scene = open_fake("fake:a")
-    resolve_quality_once(
-        store, question, lambda: resolve_quality(recipe, scene, renderer=bench.render)
-    )
+def test_a_damaged_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
+    store, recipe, scene = open_store(tmp_path), open_recipe("max_flip: 0.5"), open_fake("fake:a")
+    given = (store, recipe, scene)
+    chosen = resolve_quality_for(*given, backend="cpu", renderer=bench.render)
+    question = Question(recipe, scene.name, scene.source, "recorded", "cpu")
+    assert recorded(store, question) == chosen
     document = json.loads(store.read(question.path))
-    for path, value in (("render.scale", "1"), ("render.near_m", 1.0), ("render.scale", 77.0)):
-        changed = json.loads(json.dumps(document))
-        changed["choice"]["settings"][path] = value
-        store.write(question.path, json.dumps(changed).encode())
-        with pytest.raises(OutputError, match="is damaged"):
-            recorded(store, question)
-    document["asked"]["source"] = "fake:b"
-    store.write(question.path, json.dumps(document).encode())
-    with pytest.raises(OutputError, match="another question"):
-        recorded(store, question)
+    settings = document["choice"]["settings"]
+    wrong = [("render.scale", "1"), ("render.near_m", 1.0), ("render.scale", 77.0)]
+    for data in (
+        *(b"", b"[]", b'{"format": 2}', b"\xff"),
+        *(changed(document, "choice", "settings", settings | {p: v}) for p, v in wrong),
+        changed(document, "choice", "settings", []),
+        changed(document, "asked", "source", "fake:b"),
+    ):
+        store.write(question.path, data)
+        message = r"recipe fog in scene a, is damaged: .*Delete it"
+        with pytest.raises(OutputError, match=message):
+            resolve_quality_for(*given, backend="cpu", renderer=bench.render)
 
 
 def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:
@@ -252,23 +362,23 @@ def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:
     assert len(digests) == 2
 
 
-def _choose_slowly(folder: str, scale: float, answers) -> None:
-    recipe = open_recipe("max_flip: 0.5")
+def _choose_slowly(folder: str, worst_scale: float, answers) -> None:
+    """Pictures below a scale are all wrong."""
 
-    def choose() -> Resolved:
-        time.sleep(0.2)
-        settings: Settings = {knob.path: knob.reference for knob in free_knobs(recipe)}
-        settings["render.scale"] = scale
-        return Resolved(resolved_recipe(recipe, settings), Report(settings, True, 0.0, (), ()))
+    def render(scene, camera, recipe, *, backend: str) -> FakeView:
+        time.sleep(0.01)
+        size = camera.scaled(recipe.render.scale)
+        shade = 0 if recipe.render.scale < worst_scale else 255
+        return FakeView(np.full((size.height, size.width, 3), shade, np.uint8))
 
-    question = Question(recipe, "a", "fake:a", "recorded", "cpu")
-    answers.put(resolve_quality_once(open_store(folder), question, choose).render.scale)
+    recipe, store = open_recipe("max_flip: 0.5"), open_store(folder)
+    given = {"backend": "cpu", "renderer": render}
+    answers.put(resolve_quality_for(store, recipe, open_fake("fake:a"), **given).render.scale)
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork")
+    context, scales = multiprocessing.get_context("fork"), (0.25, 0.5)
     answers = context.Queue()
-    scales = (0.25, 0.5)
     children = [
         context.Process(target=_choose_slowly, args=(str(tmp_path), s, answers)) for s in scales
     ]
@@ -341,21 +451,3 @@ def test_rows_from_before_qualities_have_none(bench: Workbench, tmp_path: Path) 
     assert table.select(columns).to_pylist() == [dict.fromkeys(columns)] * 8
     at = table.column_names.index("style_method")
     assert table.column_names[at + 1 : at + 4] == columns
-
-
-def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
-    picture = np.zeros((2, 2, 3), np.uint8)
-    picture[:, 1] = 200
-    assert upsampled(picture, 2, 2) is picture
-    wide = upsampled(picture, 4, 2)
-    assert wide[0, :, 0].tolist() == [0, 50, 150, 200]
-    assert upsampled(wide, 2, 2)[0, :, 0].tolist() == [25, 175]  # means over areas
-    scene = open_fake("fake:a")
-
-    def render(scene, camera, recipe, *, backend: str) -> FakeView:
-        return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32))
-
-    trial = render_trial(
-        scene, make_camera("front", 0, 0.0), Recipe(), renderer=render, size=(4, 4)
-    )
-    assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]
