@@ -2,29 +2,49 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
+import subprocess
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from augment.errors import OutputError
 from augment.jobs.atomic import replaced_file, write_atomic
-from augment.jobs.layout import folder_name, resolve_inside
-from augment.jobs.manifest import OK, read_manifest
-from recipes.schema import columns_of_effects
+from augment.jobs.layout import folder_name, reading_back, resolve_inside
+from augment.jobs.manifest import OK, Row, read_manifest
+from augment.jobs.store import Store, open_store
+from recipes.schema import columns_of_effects, parse_frames
+from tools.output import print_note
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_PX, GAP_PX = 42, 8
 Color = tuple[int, int, int]
+Value = TypeVar("Value")
 VIDEO_WIDTH = 1440
-MAX_SHOWN = 12  # scenes and variants in one picture
+MAX_SHOWN, MAX_LINES = 12, 48  # scenes and variants in one picture; rows of a contact sheet
 CELL_WIDTH = 400  # px of one image on a contact sheet
 MARGIN = 6
 CAPTION = 26
 _TITLE_SIZE = 0.6
+# A camera that looks back, or less than 15 degrees past it, is one at the back; axes that differ by
+# less than about 5 degrees are those of a stereo pair.
+BACK_DEG, SAME_AXIS_DEG = 165.0, 5.0
+# What browsers play, from its start on, in the colours of RGB. One thread and nothing of the moment
+# or the version: the same frames give the same bytes.
+H264 = (
+    "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart -threads 1 -fflags +bitexact "
+    "-flags:v +bitexact -vf scale=out_color_matrix=bt709:flags=accurate_rnd+bitexact "
+    "-colorspace bt709 -color_primaries bt709 -color_trc bt709"
+)
 
 
 def write(
@@ -82,26 +102,25 @@ def color_bar(width: int, height: int, color_map: int) -> np.ndarray:
 
 
 def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """At most about `most` round numbers within [low, high]."""
-    span = high - low
-    if not span > 0:
+    """About `most` numbers within [low, high], 1, 2 or 5 times a power of ten apart."""
+    rough = (high - low) / most
+    if not rough > 1e-300:
         return [low]
-    raw = span / most
-    unit = 10.0 ** math.floor(math.log10(raw))
-    step = next(unit * m for m in (1, 2, 2.5, 5, 10) if unit * m >= raw * (1 - 1e-9))
+    unit = 10.0 ** math.floor(math.log10(rough))
+    step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= rough * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [i * step for i in range(first, last + 1)]
 
 
-def log_ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten within [low, high]; powers alone where those are
-    many, and any round numbers where there would be none or one.
+def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
+    """1, 2 and 5 times powers of ten within [low, high]; powers alone where those are more than
+    `most`, and any round numbers where there would be none or one.
     """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for digits in ((1, 2, 5), (1,)):
         ticks = [d * 10.0**e for e in decades for d in digits]
         ticks = [t for t in ticks if low * (1 - 1e-9) <= t <= high * (1 + 1e-9)]
-        if len(ticks) <= 7:
+        if len(ticks) <= most:
             break
     return ticks if len(ticks) > 1 else linear_ticks(low, high)
 
@@ -114,76 +133,84 @@ def short_number(value: float) -> str:
     return f"{value:.6g}"
 
 
-def draw_sheet(out: Path, frame: int | None = None) -> Path:
-    """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera.
+# ---- Images of an output: which of them, and in what order ---------------------------------------
 
-    Of more than MAX_SHOWN variants, as many are shown, evenly spread.
+
+def value_codes(table: pa.Table, *columns: str) -> np.ndarray:
+    """int [rows]: a number for each combination of the columns' values, none of which is null."""
+    joined = pc.binary_join_element_wise(*(table[c].cast(pa.string()) for c in columns), "\0")
+    return pc.dictionary_encode(joined).combine_chunks().indices.to_numpy()
+
+
+def first_of_each(table: pa.Table, *columns: str) -> np.ndarray:
+    """int64: the rows where a combination of the columns' values stands first, in their order."""
+    return np.sort(np.unique(value_codes(table, *columns), return_index=True)[1])
+
+
+def evenly(values: Sequence[Value], most: int) -> list[Value]:
+    """At most `most` of them in their order, from the middles of as many equal parts."""
+    number = min(most, len(values))
+    return [values[(2 * i + 1) * len(values) // (2 * number)] for i in range(number)]
+
+
+def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
+    """The cameras of a manifest's rows as they stand on the car: from above, left to right with the
+    front in the middle, those at the back last. Behind them, by name, cameras of which no
+    calibration tells.
+    """
+    places = {name: (math.inf, 0.0, name) for name in pc.unique(table["camera"]).to_pylist()}
+    read = cache(lambda path: {e["frame"]: e for e in json.loads(store.read(path))["frames"]})
+    placed = table.filter(pc.is_valid(table["calibration_path"]))
+    for row in placed.take(first_of_each(placed, "camera")).to_pylist():
+        name = row["camera"]
+        with suppress(OutputError), reading_back("calibration", ""):
+            entry = read(row["calibration_path"])[row["frame"]]
+            world_from_camera = np.array(entry["cameras"][name]["world_from_camera"], float)
+            ego_from_world = np.linalg.inv(np.array(entry["world_from_ego"], float))
+            x, y, left_m = (ego_from_world @ world_from_camera)[(0, 1, 1), (2, 2, 3)].tolist()
+            from_left_deg = (BACK_DEG - math.degrees(math.atan2(y, x))) % 360
+            places[name] = (round(from_left_deg / SAME_AXIS_DEG), -left_m, name)
+    return sorted(places, key=places.__getitem__)
+
+
+def _finished(out: Path, **chosen: str | list[str] | None) -> pa.Table:
+    """The rows of finished images whose columns have one of the given values each: a list of them,
+    or an option's text, of frames None for the middle one.
 
     Raises:
-        OutputError: there is no manifest, no finished image, or none of the frame.
+        OutputError: there is no finished image, or none of one of the values.
+        ValueError: a text is no frame numbers.
     """
-    rows = _read_rows(out)
-    frames = sorted({row["frame"] for row in rows})
-    frame = frames[len(frames) // 2] if frame is None else frame
-    cameras = list(dict.fromkeys(row["camera"] for row in rows))
-    lines = []
-    for scene, variant in shown_groups(rows):
-        group = {
-            row["camera"]: row
-            for row in rows
-            if (row["scene"], row["variant"], row["frame"]) == (scene, variant, frame)
-        }
-        if group:
-            title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
-            images = [(name, _read(out, group[name])) for name in cameras if name in group]
-            lines.append((title, images))
-    if not lines:
-        raise OutputError(f"{out} holds no image of frame {frame}; it has frames {frames}")
-    path = out / "contact_sheet.png"
-    write_rgb(path, contact_sheet(lines))
-    return path
-
-
-def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
-    """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame."""
-    rows = [row for row in _read_rows(out) if row["camera"] == camera]
-    by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
-    groups = shown_groups(rows)
-    frames = [
-        frame
-        for frame in sorted({row["frame"] for row in rows})
-        if all((*group, frame) in by_key for group in groups)
-    ]
-    pictures = (
-        side_by_side(
-            [(_weather(row), _read(out, row)) for g in groups for row in [by_key[(*g, frame)]]],
-            VIDEO_WIDTH,
-        )
-        for frame in frames
-    )
-    path = out / f"video_{folder_name(camera)}.mp4"
-    write_video(path, pictures, frames_per_second)
-    return path
-
-
-def _read_rows(out: Path) -> list[dict[str, Any]]:
-    """The finished images of an output folder, as manifest rows."""
-    rows = [row for row in read_manifest(out).to_pylist() if row["status"] == OK]
-    if not rows:
+    table = read_manifest(out)
+    table = table.filter(pc.equal(table["status"], OK))
+    if not table.num_rows:
         raise OutputError(f"{out} holds no finished image; run `climategs render` first")
-    return rows
+    for column, given in chosen.items():
+        there = sorted(pc.unique(table[column]).to_pylist())
+        if given == "all":
+            continue
+        values = given.split(",") if isinstance(given, str) else given or [there[len(there) // 2]]
+        if column == "frame" and isinstance(given, str):
+            values = parse_frames(given).select(there, clip=True) or ()
+        if not values or not set(values) <= set(there):
+            wrong = ", ".join(str(v) for v in values if v not in there) or given
+            known = ", ".join(map(str, there[:100])) + ", ..." * (len(there) > 100)
+            raise OutputError(f"{out} holds no image of {column} {wrong}; it has {known}")
+        kind = table.schema.field(column).type
+        table = table.filter(pc.is_in(table[column], pa.array(values, kind)))
+    return table
 
 
-def shown_groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Scene and variant of every row, each once and at most MAX_SHOWN of them: a scene's clearest,
+def shown_variants(table: pa.Table) -> list[Row]:
+    """The first row of every scene and variant, of at most MAX_SHOWN of them: a scene's clearest,
     driest and barest first.
     """
-    weather = {(row["scene"], row["variant"]): _numbers(row) for row in rows}
-    groups = sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))
-    return groups[:: -(-len(groups) // MAX_SHOWN)]
+    rows = table.take(first_of_each(table, "scene", "variant")).to_pylist()
+    rows.sort(key=lambda row: (row["scene"], *_numbers(row), row["variant"]))
+    return rows[:: -(-len(rows) // MAX_SHOWN)]
 
 
-def _numbers(row: dict[str, Any]) -> list[float]:
+def _numbers(row: Row) -> list[float]:
     """What captions tell in numbers; old folders lack some of the columns."""
     told = (c for c in columns_of_effects().values() if c.caption and c.is_number)
     absent = {"all": -math.inf, "nonzero": 0.0}
@@ -191,7 +218,7 @@ def _numbers(row: dict[str, Any]) -> list[float]:
     return [absent[shows or "all"] if math.isnan(n) else n for n, shows in numbers]
 
 
-def _weather(row: dict[str, Any]) -> str:
+def _weather(row: Row) -> str:
     """The variant's name and what its weather means to a person."""
     columns = sorted(columns_of_effects().values(), key=lambda column: column.is_number)
     values = {column.name: row.get(column.name, column.of(None)) for column in columns}
@@ -201,13 +228,73 @@ def _weather(row: dict[str, Any]) -> str:
     return f"{row['variant']} ({', '.join(texts) or 'no weather'})"
 
 
-def _read(out: Path, row: dict[str, Any]) -> np.ndarray:
+def _read(out: Path, row: Row) -> np.ndarray:
     """uint8 [H, W, 3] RGB of a row's image."""
     path = resolve_inside(out, row["image_path"])
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise OutputError(f"cannot read the image {path}: it is missing or damaged")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+# ---- Contact sheets and videos -------------------------------------------------------------------
+
+
+def draw_sheet(
+    out: Path, recipe: str = "all", camera: str = "all", frame: str | None = None
+) -> Path:
+    """Writes OUT/contact_sheet.png, of what `sheet_lines` chooses."""
+    path = out / "contact_sheet.png"
+    write_rgb(path, contact_sheet(sheet_lines(out, recipe, camera, frame)))
+    return path
+
+
+def sheet_lines(
+    out: Path, recipe: str = "all", camera: str = "all", frame: str | None = None
+) -> list[tuple[str, list[tuple[str, np.ndarray]]]]:
+    """A title for every scene, variant and frame, and its images, each with its camera's name.
+
+    recipe, camera: names separated by commas, or all. frame: numbers as `parse_frames` has them, by
+    default the middle one. At most MAX_SHOWN variants and MAX_LINES lines, evenly spread.
+
+    Raises:
+        OutputError: there is no manifest, no finished image of one of these, or no such file.
+    """
+    table = _finished(out, recipe=recipe, camera=camera, frame=frame)
+    cameras = cameras_on_car(open_store(out), table)
+    found: dict[tuple[str, str, int], dict[str, Row]] = {}
+    for row in table.to_pylist():
+        found.setdefault((row["scene"], row["variant"], row["frame"]), {})[row["camera"]] = row
+    shown = [(row["scene"], row["variant"]) for row in shown_variants(table)]
+    lines = []
+    for key in evenly([key for each in shown for key in found if key[:2] == each], MAX_LINES):
+        rows = found[key]
+        title = f"{key[0]}, frame {key[2]}: {_weather(next(iter(rows.values())))}"
+        lines.append((title, [(name, _read(out, rows[name])) for name in cameras if name in rows]))
+    return lines
+
+
+def draw_video(
+    out: Path, camera: str, frames_per_second: float = 10.0, recipe: str = "all"
+) -> Path:
+    """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame.
+
+    Raises:
+        OutputError: as `draw_sheet`; or the variants have no frame in common.
+    """
+    table = _finished(out, recipe=recipe, camera=[camera])
+    groups = [(row["scene"], row["variant"]) for row in shown_variants(table)]
+    rows = {(row["scene"], row["variant"], row["frame"]): row for row in table.to_pylist()}
+    frames = sorted({frame for *_, frame in rows if all((*each, frame) in rows for each in groups)})
+    if not frames:
+        raise OutputError(f"{out}: its scenes and variants have no frame of {camera} in common")
+    pictures = (
+        side_by_side([(_weather(r), _read(out, r)) for g in groups for r in [rows[*g, frame]]])
+        for frame in frames
+    )
+    path = out / f"video_{folder_name(camera)}.mp4"
+    write_video(path, pictures, frames_per_second)
+    return path
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> np.ndarray:
@@ -224,50 +311,69 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) 
     width = MARGIN + max(columns * (CELL_WIDTH + MARGIN), 2 + longest + MARGIN)
     sheet = np.full((row_height * len(rows) + MARGIN, width, 3), 24, np.uint8)
     for r, (title, images) in enumerate(rows):
-        top = MARGIN + r * row_height
-        left, bottom = MARGIN + 2, top + CAPTION - 8
-        write(sheet, title, left, bottom, size=_TITLE_SIZE, color=(255, 255, 255))
+        top = MARGIN + r * row_height + CAPTION
+        write(sheet, title, MARGIN + 2, top - 8, size=_TITLE_SIZE, color=(255, 255, 255))
         for c, (caption, image) in enumerate(images):
             left = MARGIN + c * (CELL_WIDTH + MARGIN)
             small = resized(image, CELL_WIDTH, cv2.INTER_AREA)
-            height = len(small)
-            sheet[top + CAPTION : top + CAPTION + height, left : left + CELL_WIDTH] = small
-            bottom = top + CAPTION + cell_height + CAPTION - 9
+            sheet[top : top + len(small), left : left + CELL_WIDTH] = small
+            bottom = top + cell_height + CAPTION - 9
             write(sheet, caption, left + 2, bottom, size=0.45, color=(190, 190, 190))
     return sheet
 
 
-def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.ndarray:
+def side_by_side(images: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
     """Images of equal size in a row of up to three, else in a square grid, each named."""
     columns = len(images) if len(images) <= 3 else math.ceil(math.sqrt(len(images)))
     source_height, source_width = images[0][1].shape[:2]
-    cell_width = width // columns // 2 * 2  # codecs want even sides
-    cell_height = round(source_height * cell_width / source_width) // 2 * 2
+    width = VIDEO_WIDTH // columns // 2 * 2  # codecs want even sides
+    height = max(2, round(source_height * width / source_width) // 2 * 2)
     lines = -(-len(images) // columns)
-    canvas = np.zeros((lines * cell_height, columns * cell_width, 3), np.uint8)
+    canvas = np.zeros((lines * height, columns * width, 3), np.uint8)
     for number, (caption, image) in enumerate(images):
-        top, left = number // columns * cell_height, number % columns * cell_width
-        small = cv2.resize(image, (cell_width, cell_height), interpolation=cv2.INTER_AREA)
-        canvas[top : top + cell_height, left : left + cell_width] = small
+        top, left = number // columns * height, number % columns * width
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        canvas[top : top + height, left : left + width] = small
         write(canvas, caption, left + 9, top + 23, size=0.55, color=(0, 0, 0))
         write(canvas, caption, left + 8, top + 22, size=0.55, color=(255, 255, 255))
     return canvas
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """An MP4 (MPEG-4 part 2, which OpenCV can always write) of RGB frames of equal size, which are
-    taken one at a time.
+    """An MP4 of RGB frames of equal size, whose sides are even, taken one at a time: H.264 where
+    imageio-ffmpeg is installed, else MPEG-4 part 2, which OpenCV can always write.
+
+    Raises:
+        OutputError: the file cannot be written, or not encoded.
     """
+    first = next(frames := iter(frames))
+    height, width = first.shape[:2]
+    frames = itertools.chain([first], frames)
     with replaced_file(path, ending=path.suffix) as file:
-        writer = None
-        for frame in frames:
-            if writer is None:
-                code, (height, width) = cv2.VideoWriter.fourcc(*"mp4v"), frame.shape[:2]
-                writer = cv2.VideoWriter(file.name, code, frames_per_second, (width, height))
-            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-        if writer is None or not writer.isOpened():
-            raise OutputError(f"cannot write the video {path}: there are no frames, or no encoder")
-        writer.release()
+        try:
+            from imageio_ffmpeg import get_ffmpeg_exe
+        except ImportError:
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            writer = cv2.VideoWriter(file.name, code, frames_per_second, (width, height))
+            for frame in frames:
+                writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            if not writer.isOpened():
+                raise OutputError(f"cannot write the video {path}: OpenCV has no encoder") from None
+            writer.release()
+            print_note(
+                f"{path.name} is MPEG-4 part 2, which browsers refuse; with "
+                f"`pip install 'climategs[video]'` it becomes H.264"
+            )
+            return
+        source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {frames_per_second} -i -"
+        command = [get_ffmpeg_exe(), "-v", "error", "-y", *source.split(), *H264.split(), file.name]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:
+            with suppress(BrokenPipeError):  # what it refuses stands on its stderr
+                for frame in frames:
+                    encoder.stdin.write(frame.tobytes())
+            said = encoder.communicate()[1].decode(errors="replace").strip()
+        if encoder.returncode:
+            raise OutputError(f"cannot write the video {path}: ffmpeg says {said}")
 
 
 def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
