@@ -135,7 +135,7 @@ def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _R
     )
 
     def trainer(steps: int) -> Trainer:
-        return Trainer(scene, source, options.config(steps), device=options.device)
+        return Trainer(scene, source, options, steps, device=options.device)
 
     def estimate(budget_s: float) -> tuple[int, float]:
         print_note("timing a few steps (kernels are compiled first where they are not yet) ...")

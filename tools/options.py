@@ -6,14 +6,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from tyro.conf import Positional, arg
 
+from augment.reconstruct.config import FitConfig
 from tools.output import JsonFile, write_json
 
 if TYPE_CHECKING:
@@ -21,13 +28,9 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
     from adapters.training_views.depth_priors import DepthPriors
-    from augment.effects.style.pairs import PairWeights
-    from augment.effects.style.train import StyleTrainConfig
-    from augment.reconstruct.config import FitConfig
 
 DEFAULT_MINUTES = 10.0
 DEPTH_KINDS = ("sparse", "metric", "relative")
-Densify = Literal["absgrad", "mcmc", "none"]
 Device = Literal["cpu", "cuda"]
 _Value = TypeVar("_Value")
 
@@ -69,8 +72,7 @@ class Command(BaseModel):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class FitOptions:
+class FitOptions(FitConfig, Command):
     """Reconstruct a scene of Gaussians from recorded images, LiDAR and boxes.
 
     Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
@@ -84,11 +86,6 @@ class FitOptions:
         scale: Resolution of the images that are learnt from, relative to the recorded.
         cameras: Camera names separated by commas, or all.
         holdout: Which frames are kept for the report: every-2nd, every-8th, ..., or none.
-        seed: Of everything random.
-        depth_weight: How much depth priors count. 0 switches them off.
-        sh_degree: Highest band of spherical harmonics, 0 to 3.
-        max_splats: Splats are not added beyond this number.
-        densify: How splats are added.
         image_cache_mb: Memory for decoded images. The result does not depend on it.
         depth: Depth priors: none, or kinds separated by commas: lidar, metric:DIR (depth maps as
             render writes them), relative:DIR (monocular networks), sparse:DIR (lidar_depth).
@@ -103,17 +100,12 @@ class FitOptions:
 
     scene: Positional[str]
     out: Path
-    minutes: float | None = None
-    steps: int | None = None
-    scale: float = 0.25
+    minutes: float | None = Field(default=None, gt=0)
+    steps: int | None = Field(default=None, ge=1)
+    scale: float = Field(default=0.25, gt=0, le=1)
     cameras: str = "all"
     holdout: str = "every-2nd"
-    seed: int = 0
-    depth_weight: float | None = None
-    sh_degree: int | None = None
-    max_splats: int | None = None
-    densify: Densify = "absgrad"
-    image_cache_mb: int = 1024
+    image_cache_mb: int = Field(default=1024, ge=0)
     depth: str = "lidar"
     ego_masks: Path | None = None
     truth: str | None = None
@@ -121,21 +113,13 @@ class FitOptions:
     overwrite: bool = False
     json_file: JsonFile = None
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         from adapters.training_views.views import holdout_step
         from augment.errors import ClimateGSError
 
         check_length(self)
         holdout_step(self.holdout)
-        check_range(self, "steps", "a number of steps >= 1", 1)
-        check_range(self, "scale", "above 0 and at most 1", 0, 1, above=True)
-        check_range(self, "seed", ">= 0", 0)
-        check_range(self, "depth_weight", ">= 0 (0 switches it off)", 0)
-        check_range(self, "sh_degree", "0, 1, 2 or 3", 0, 3)
-        check_range(self, "max_splats", "a number of splats >= 1", 1)
-        check_range(self, "image_cache_mb", "megabytes, >= 0", 0)
-        check_choice(self, "densify", get_args(Densify))
-        check_choice(self, "device", get_args(Device))
         if not all(self.cameras.split(",")):
             raise ClimateGSError("--cameras is names separated by commas, or all")
         parse_depth(self.depth)
@@ -145,9 +129,9 @@ class FitOptions:
             open_street(self.truth)
         if self.ego_masks is not None and not self.ego_masks.is_dir():
             raise ClimateGSError(f"--ego-masks: there is no folder {self.ego_masks}")
+        return self
 
     def run(self) -> int:
-        """The command. Returns its exit code."""
         from tools.fit import fit_scene
 
         outcome = fit_scene(self)
@@ -159,50 +143,16 @@ class FitOptions:
         """None for all."""
         return None if self.cameras == "all" else tuple(self.cameras.split(","))
 
-    def config(self, steps: int) -> FitConfig:
-        """The optimiser's configuration for this many steps."""
-        from augment.reconstruct.config import FitConfig
-
-        default = FitConfig()
-        most = value_or(self.max_splats, default.densify.max_splats)
-        growth = dataclasses.replace(default.densify, max_splats=most)
-        if self.densify == "none":
-            # Its part of the run ends before it starts.
-            growth = dataclasses.replace(growth, start=1.0, stop=0.0)
-        else:
-            growth = dataclasses.replace(growth, method=self.densify)
-        depth = value_or(self.depth_weight, default.loss.depth)
-        return dataclasses.replace(
-            default,
-            steps=steps,
-            seed=self.seed,
-            sh_degree=value_or(self.sh_degree, default.sh_degree),
-            loss=dataclasses.replace(default.loss, depth=depth),
-            densify=growth,
-        )
-
     def settings(self) -> dict[str, Any]:
-        """All that decides the result, flat and as JSON keeps it; not how long it is fitted."""
+        """All that decides the result, as JSON keeps it; not how long it is fitted."""
         from adapters.uri import format_uri
 
-        config = dataclasses.asdict(self.config(1))
-        del config["steps"]
-        return {
+        asides = {"out", "minutes", "steps", "image_cache_mb", "truth", "overwrite", "json_file"}
+        return self.model_dump(exclude=asides) | {
             "scene": format_uri(*resolved_uri(self.scene)),
-            "cameras": self.cameras,
-            "scale": self.scale,
-            "holdout": self.holdout,
-            "densify": self.densify,
             "depth": _depth_text(parse_depth(self.depth)),
             "ego_masks": None if self.ego_masks is None else str(self.ego_masks.absolute()),
-            **({} if self.device == "cpu" else {"device": self.device}),
-            **_flat(config),
         }
-
-
-def names_in(text: str) -> tuple[str, ...] | None:
-    """Of names separated by commas; None for all."""
-    return None if text == "all" else tuple(text.split(","))
 
 
 def check_range(
@@ -312,29 +262,31 @@ def value_or(value: _Value | None, default: _Value) -> _Value:
     return default if value is None else value
 
 
-def _flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in nested.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{above}{name}.")
-        else:
-            flat[f"{above}{name}"] = value
-    return flat
-
-
 def _depth_text(priors: DepthPriors) -> str:
     folders = {kind: getattr(priors, f"{kind}_dir") for kind in DEPTH_KINDS}
     named = [f"{kind}:{folder}" for kind, folder in folders.items() if folder is not None]
     return ",".join((["lidar"] if priors.lidar else []) + named) or "none"
 
 
-SIZES_PX = {"small": 128, "b0": 256}  # the small encoder looks at 64 px, whatever it is given
+# By encoder. The small one looks at 32 px, whatever it is given; the paper's rate is B0's.
+SIZES_PX = {"small": 128, "b0": 256}
+LEARNING_RATES = {"small": 1e-3, "b0": 1e-4}
+
+
+def _check_file(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    return path
+
+
 _Files = Annotated[tuple[Path, ...], arg(metavar="PATH [PATH ...]")]
 _Scenes = Annotated[tuple[str, ...], arg(name="scene", metavar="URI [URI ...]")]
+_Weights = Annotated[Path, AfterValidator(_check_file)]
+_Count = Annotated[int, Field(ge=1)]
+_LossWeight = Annotated[float, Field(ge=0)]
 
 
-@dataclass(frozen=True)
-class StyleTrainOptions:
+class StyleTrainOptions(Command):
     """Train the network that turns a style image into a colour map, on photos and scenes.
 
     Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
@@ -347,27 +299,21 @@ class StyleTrainOptions:
         minutes: How long to train, 10 by default.
         steps: How many steps instead. The same steps and seed give the same bytes.
         encoder: The small one for a CPU, or EfficientNet-B0.
-        matrix: 3x4 maps with an offset, or 3x3 as in the paper.
         encoder_weights: EfficientNet-B0's weights, trained on ImageNet.
         vgg: Weights of VGG-19 for the style loss; without them a bank of filters stands in.
         size_px: Of the square pictures; the encoder's usual one by default.
         views: Most views of a scene.
         seed: Of everything random.
         learning_rate: Adam's; the encoder's usual one by default.
-        decay: What the learning rate is multiplied by after each third of the steps.
-        warm_up: Share of the steps that learn the cycle alone.
         style: Weight of the style loss.
         consistency: Weight of the loss in content space.
-        cycle: Weight of the cycle's loss.
+        cycle: Weight of the cycle's loss, which is alone in the first tenth of the steps.
         pairs: Weight of recoloured pairs of photos, whose perfect result is known.
-        pair_weights: Of the losses of pairs, as same=1,look=2; the others keep theirs.
+        pair_range: Weight, among the losses of pairs, of colours that cannot be displayed.
         batch: Transfers a step.
         pair_batch: Pairs a step.
-        scene_share: Share of the transfers whose content is a view of a scene.
         holdout: Every so many photos are kept for scores; 0 for none.
-        half_precision: Write the network's numbers in 16 bits.
-        through: Render mapped Gaussians for every step, or map pictures rendered once.
-        device: Where torch trains: cpu, or cuda, where through renderer renders on the GPU, too.
+        device: Where torch trains: cpu, or cuda.
         overwrite: Begin anew and replace what is there.
         json_file: Also write the report to this file.
     """
@@ -375,126 +321,59 @@ class StyleTrainOptions:
     out: Path
     photos: _Files = ()
     scenes: _Scenes = ()
-    minutes: float | None = None
-    steps: int | None = None
+    minutes: Annotated[float, Field(gt=0)] | None = None
+    steps: _Count | None = None
     encoder: Literal["small", "b0"] = "small"
-    matrix: Literal["3x4", "3x3"] = "3x4"
-    encoder_weights: Path | None = None
-    vgg: Path | None = None
-    size_px: int | None = None
-    views: int = 24
-    seed: int = 0
-    learning_rate: float | None = None
-    decay: float = 0.1
-    warm_up: float = 0.1
-    style: float = 1.0
-    consistency: float = 10.0
-    cycle: float = 10.0
-    pairs: float = 1.0
-    pair_weights: str = ""
-    batch: int = 2
-    pair_batch: int = 4
-    scene_share: float = 0.5
-    holdout: int = 8
-    half_precision: bool = False
-    through: Literal["picture", "renderer"] = "picture"
+    encoder_weights: _Weights | None = None
+    vgg: _Weights | None = None
+    size_px: Annotated[int, Field(ge=16)] | None = None
+    views: _Count = 24
+    seed: Annotated[int, Field(ge=0)] = 0
+    learning_rate: Annotated[float, Field(gt=0)] | None = None
+    style: _LossWeight = 1.0
+    consistency: _LossWeight = 10.0
+    cycle: _LossWeight = 10.0
+    pairs: _LossWeight = 1.0
+    pair_range: _LossWeight = 4.0
+    batch: _Count = 2
+    pair_batch: _Count = 4
+    holdout: Annotated[int, Field(ge=0)] = 8
     device: str = "cpu"
     overwrite: bool = False
     json_file: JsonFile = None
 
-    def __post_init__(self) -> None:
-        from augment.errors import ClimateGSError
-
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
         if not self.scenes and not self.photos:
-            raise ClimateGSError(
+            raise ValueError(
                 "there is nothing to learn from: give --photos FOLDER, --scene URI, or both"
             )
-        check_length(self)
-        check_choice(self, "encoder", tuple(SIZES_PX))
+        if self.minutes is not None and self.steps is not None:
+            raise ValueError("give --minutes or --steps, not both")
         if self.encoder_weights is not None and self.encoder != "b0":
-            raise ClimateGSError("--encoder-weights are EfficientNet-B0's: add --encoder b0")
-        for name in ("encoder_weights", "vgg"):
-            path = getattr(self, name)
-            if path is not None and not path.is_file():
-                raise ClimateGSError(f"--{name.replace('_', '-')}: there is no file {path}")
-        check_choice(self, "matrix", ("3x4", "3x3"))
-        lowest = {"steps": 1, "size_px": 16, "views": 1, "holdout": 0, "seed": 0}
-        for name, low in lowest.items():
-            check_range(self, name, f"at least {low}", low)
-        if self.through == "renderer" and not self.scenes:
-            raise ClimateGSError("--through renderer is for scenes: add --scene URI")
-        try:
-            self.config(self.steps or 1)
-        except ValueError as error:
-            raise ClimateGSError(f"--{error}") from error
+            raise ValueError("--encoder-weights are EfficientNet-B0's: add --encoder b0")
+        if not (self.style or self.consistency or self.cycle or self.pairs):
+            raise ValueError("all losses weigh 0: nothing would be learnt")
+        return self
 
     def run(self) -> int:
-        """The command. Returns its exit code."""
         from tools.style import train_style
 
         outcome = train_style(self)
         write_json(self.json_file, outcome.report)
         return outcome.code
 
-    @property
-    def picture_px(self) -> int:
-        return self.size_px or SIZES_PX[self.encoder]
-
-    def config(self, steps: int) -> StyleTrainConfig:
-        """The trainer's configuration for this many steps."""
-        from augment.effects.style.train import LEARNING_RATES, StyleTrainConfig
-
-        known = {field.name for field in dataclasses.fields(StyleTrainConfig)}
-        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in known}
-        rate = value_or(self.learning_rate, LEARNING_RATES[self.encoder])
-        weights = parse_pair_weights(self.pair_weights)
-        own |= {"steps": steps, "learning_rate": rate, "pair_weights": weights}
-        return StyleTrainConfig(**own)
-
     def settings(self) -> dict[str, Any]:
-        """All that decides the result, flat and as JSON keeps it; not how long it is trained."""
-        config = dataclasses.asdict(self.config(1))
-        del config["steps"]
-        config |= {f"pair_weights.{n}": v for n, v in config.pop("pair_weights").items()}
+        """All that decides the result, as JSON keeps it; not how long it is trained."""
+        weights = {name: getattr(self, name) for name in ("encoder_weights", "vgg")}
         return {
+            **self.model_dump(exclude={"out", "minutes", "steps", "overwrite", "json_file"}),
+            **{name: None if path is None else path.name for name, path in weights.items()},
             "scenes": [uri_text(uri) for uri in self.scenes],
             "photos": [path.resolve().name for path in self.photos],
-            "encoder": self.encoder,
-            "matrix": self.matrix,
-            "encoder_weights": None if self.encoder_weights is None else self.encoder_weights.name,
-            "vgg": None if self.vgg is None else self.vgg.name,
-            "size_px": self.picture_px,
-            "views": self.views,
-            "holdout": self.holdout,
-            "device": self.device,
-            "half_precision": self.half_precision,
-            **config,
+            "size_px": value_or(self.size_px, SIZES_PX[self.encoder]),
+            "learning_rate": value_or(self.learning_rate, LEARNING_RATES[self.encoder]),
         }
-
-
-def parse_pair_weights(text: str) -> PairWeights:
-    """`same=1,look=2`: the default weights but for those.
-
-    Raises:
-        ClimateGSError: not of this form, or a loss of another name.
-    """
-    from augment.effects.style.pairs import PairWeights
-    from augment.errors import ClimateGSError
-
-    weights: dict[str, float] = {}
-    known = [field.name for field in dataclasses.fields(PairWeights)]
-    for item in filter(None, text.split(",")):
-        name, _, number = item.partition("=")
-        try:
-            weights[name] = float(number)
-        except ValueError:
-            name = ""
-        if name not in known:
-            raise ClimateGSError(
-                f"--pair-weights is LOSS=WEIGHT separated by commas, with LOSS one of "
-                f"{', '.join(known)}; got {item!r}"
-            )
-    return PairWeights(**weights)
 
 
 def uri_text(uri: str) -> str:

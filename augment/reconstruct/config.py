@@ -1,8 +1,13 @@
-"""Every number that steers a reconstruction, in one place."""
+"""What steers a reconstruction: what a user may choose, and the numbers behind it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Densify = Literal["absgrad", "none"]
 
 
 @dataclass(frozen=True)
@@ -11,17 +16,32 @@ class LossWeights:
     + depth * mean |1/ED - 1/z| over the pixels with a depth prior (1/m)
     + surface * mean (1 - alpha) over the same pixels, so that ground and walls have no holes
     + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count).
-
-    depth 0 switches depth regularisation off. opacity_decay and scale_decay pull the opacity and
-    the size (1/m) of every splat that a view touches towards 0.
     """
 
     d_ssim: float = 0.2
     depth: float = 2.0
     surface: float = 0.05
     sky: float = 0.05
-    opacity_decay: float = 0.0
-    scale_decay: float = 0.0
+
+
+class FitConfig(BaseModel):
+    """What a user may choose of one reconstruction.
+
+    Args:
+        seed: Of everything random.
+        depth_weight: How much depth priors count. 0 switches them off.
+        sh_degree: Highest band of spherical harmonics, 0 to 3.
+        max_splats: Splats are not added beyond this number.
+        densify: How splats are added.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    seed: int = Field(default=0, ge=0)
+    depth_weight: float = Field(default=LossWeights.depth, ge=0)
+    sh_degree: int = Field(default=1, ge=0, le=3)
+    max_splats: int = Field(default=600_000, ge=1)
+    densify: Densify = "absgrad"
 
 
 @dataclass(frozen=True)
@@ -49,44 +69,27 @@ class LearningRates:
 
 
 @dataclass(frozen=True)
-class DensifyConfig:
-    """How the number of splats grows. method: "absgrad" clones and splits where image gradients
-    are large; "mcmc" moves dead splats onto living ones and adds more in proportion to opacity.
-
-    max_splats: none are added beyond. every: steps between two rounds. start, stop: parts of the
-    run. prune_opacity: fainter splats are removed (absgrad) or moved (mcmc). split: where absgrad's
-    children of large splats go, "sampled" within the parent or side by side on its "long_axis".
-    noise: 1/m, how far mcmc shakes faint splats at every step, decaying as the steps of means do.
+class Growth:
+    """How the number of splats grows. every: steps between two rounds. start, stop: parts of the
+    run. prune_opacity: fainter splats are removed. fraction: of the splats, that a round adds.
     """
 
-    method: str = "absgrad"
-    max_splats: int = 600_000
     every: int = 200
     start: float = 0.05
     stop: float = 0.6
     prune_opacity: float = 0.02
-    grow_fraction: float = 0.05
-    noise: float = 50.0
-    split: str = "long_axis"
+    fraction: float = 0.05
 
 
 @dataclass(frozen=True)
-class FitConfig:
-    """One reconstruction. steps: optimiser updates, one view each. sh_degree: highest band that is
-    learnt; one more every sh_every steps. pose_refinement: whether actors' boxes and
-    cameras may move a little.
-    exposure: whether every camera gets a colour map; exposure_pull draws it to the identity,
-    pose_pull (1/m^2) boxes and cameras to where they were recorded.
+class Tuning:
+    """The numbers that nobody is asked for. sh_every: steps after which one more band is learnt.
+    exposure_pull draws each camera's colour map to the identity, pose_pull (1/m^2) boxes and
+    cameras to where they were recorded. Weights of the loss: see `LossWeights`.
     """
 
-    steps: int = 5000
-    seed: int = 0
-    sh_degree: int = 1
     sh_every: int = 500
-    pose_refinement: bool = True
-    exposure: bool = True
     exposure_pull: float = 0.001
     pose_pull: float = 1e-4
-    loss: LossWeights = field(default_factory=LossWeights)
     rates: LearningRates = field(default_factory=LearningRates)
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    growth: Growth = field(default_factory=Growth)

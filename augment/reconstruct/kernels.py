@@ -577,9 +577,9 @@ GEOMETRY = 16
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.
 R_ROW, R_SH_DC, R_SH_REST, R_BETA1, R_BETA2 = 0, 16, 17, 18, 19
-R_OPACITY_DECAY, R_SCALE_DECAY, R_SMALLEST, R_LARGEST = 20, 21, 22, 23
-R_ABS_UNIT, R_RADIUS_UNIT = 24, 25  # what turns 1/px and px into the units of Splats.grads
-RATES = 26
+R_SMALLEST, R_LARGEST = 20, 21
+R_ABS_UNIT, R_RADIUS_UNIT = 22, 23  # what turns 1/px and px into the units of Splats.grads
+RATES = 24
 
 CORRECTED = 10_000  # updates after which Adam's bias is taken as gone
 
@@ -710,10 +710,7 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, bias, moments, at
     (first, second), (m, v) = bias, moments
     one = np.float32(1)
     o = min(max(opacities[splat], _FAINTEST), _FULLEST)
-    for i in range(U(3)):
-        rows[row + U(G_SCALE) + i] += rates[R_SCALE_DECAY] * scales[U(3) * splat + i]
-    slope = rows[row + U(G_OPACITY)] + rates[R_OPACITY_DECAY] * o
-    rows[row + U(G_OPACITY)] = slope * (one - o)
+    rows[row + U(G_OPACITY)] *= one - o
     low = _adam8(v8.load(rows, row), rates, first, second, m, at, v, at)
     v8.store(work, U(0), low * v8.load(rates, U(R_ROW)))
     high = _adam8(v8.load(rows, row + U(8)), rates, first, second, m, at + U(8), v, at + U(8))

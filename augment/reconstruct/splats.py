@@ -4,10 +4,8 @@ how their number changes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +13,7 @@ import torch
 from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.reconstruct import kernels
-from augment.reconstruct.config import DensifyConfig, FitConfig
+from augment.reconstruct.config import Growth, LearningRates
 from augment.reconstruct.kernels import GEOMETRY
 from augment.render.cpu.backward_kernels import G_MEAN, G_OPACITY, G_QUAT, G_SCALE
 from augment.render.threads import kernel_threads
@@ -162,32 +160,11 @@ def usable(splats: Splats, extent_m: float) -> np.ndarray:
     return sound & ~fog & (largest <= extent_m)
 
 
-def check_some_usable(splats: Splats, good: np.ndarray) -> None:
-    """Raises SceneError where there are splats but none of them is usable."""
-    if len(splats) and not good.any():
-        raise SceneError(
-            f"none of the {len(splats)} splats is finite and of sensible size: the fit has "
-            f"diverged; lower its learning rates, or begin again from an earlier checkpoint"
-        )
-
-
 def rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Vectors [N, 3] turned by unit wxyz quaternions [N, 4], in their dtype."""
     axis = quats[:, 1:]
     twice = 2 * np.cross(axis, vectors)
     return vectors + quats[:, :1] * twice + np.cross(axis, twice)
-
-
-class DensifyReport(NamedTuple):
-    """Counts of one round. cloned, split: parents that became two, in place or side by side.
-    pruned: removed for good. moved: faint ones put onto others. added: new ones.
-    """
-
-    cloned: int
-    split: int
-    pruned: int
-    moved: int
-    added: int
 
 
 # ---- Adaptive control: clones and splits where the image pulls at a splat, removes faint ones ----
@@ -204,31 +181,40 @@ SPLIT_SCALE = 0.01  # of the scene's extent, where no image has shown the splat
 SHRINK = 1.6
 SIDE_SHRINK = 1.2  # the other axes', for a split along the longest
 OFFSET = float(np.sqrt(1 - 1 / SHRINK**2))  # sigmas: the pair keeps the parent's covariance
-SPLITS = ("sampled", "long_axis")
 
 
-def densify_absgrad(
-    splats: Splats, config: DensifyConfig, *, rng: np.random.Generator, extent_m: float, grow: bool
-) -> tuple[Splats, DensifyReport]:
-    """One round: removes the faint and the unusable, then, with `grow`, doubles the best others.
+def densify_due(growth: Growth, step: int, steps: int) -> bool:
+    """Whether a round is due after `step` of `steps` steps."""
+    growing = growth.start * steps <= step <= growth.stop * steps
+    return growing and step > 0 and step % growth.every == 0
 
-    If all splats are faint, only unusable ones go: a scene is never emptied.
+
+def densify(splats: Splats, growth: Growth, *, max_splats: int, extent_m: float) -> Splats:
+    """One round: removes the faint and the unusable, then doubles the best others.
+
+    If all splats are faint, only unusable ones go: a scene is never emptied. extent_m: how far the
+    scene reaches, against which absurd sizes show. The result's arrays are its own, part after
+    part, children next to their parents, grads zero.
+
+    Raises:
+        SceneError: no splat is usable any more.
     """
     good = usable(splats, extent_m)
-    check_some_usable(splats, good)
-    keep = good & (splats.opacities >= config.prune_opacity)
+    if len(splats) and not good.any():
+        raise SceneError(
+            f"none of the {len(splats)} splats is finite and of sensible size: the fit has "
+            f"diverged; lower its learning rates, or begin again from an earlier checkpoint"
+        )
+    keep = good & (splats.opacities >= growth.prune_opacity)
     if not keep.any():
         keep = good
     kept = int(keep.sum())
     counts = keep.astype(np.int64)
     large = _is_large(splats, extent_m)
-    opacities = _child_opacities(splats, large, config.split)
-    chosen = np.zeros(0, np.int64)
-    if grow:
-        # Children fainter than prune_opacity would both be gone after the next round.
-        candidates = keep & (opacities >= config.prune_opacity)
-        budget = min(int(config.grow_fraction * kept), max(config.max_splats - kept, 0))
-        chosen = _best(splats, candidates, budget)
+    opacities = _child_opacities(splats, large)
+    # Children fainter than prune_opacity would both be gone after the next round.
+    candidates = keep & (opacities >= growth.prune_opacity)
+    chosen = _best(splats, candidates, min(int(growth.fraction * kept), max(max_splats - kept, 0)))
     counts[chosen] += 1
     first = (np.cumsum(counts) - counts)[chosen]
     grown = rebuild(splats, np.repeat(np.arange(len(splats)), counts))
@@ -237,12 +223,8 @@ def densify_absgrad(
     # A clone's original keeps its momentum and the copy starts with a whole step of Adam: two
     # equal splats at one place would otherwise stay together for long.
     rest(grown, first + 1)
-    split = large[chosen]
-    _split(grown, first[split], config.split, rng)
-    num_split = int(split.sum())
-    return grown, DensifyReport(
-        len(chosen) - num_split, num_split, len(splats) - kept, moved=0, added=len(chosen)
-    )
+    _split(grown, first[large[chosen]])
+    return grown
 
 
 def _is_large(splats: Splats, extent_m: float) -> np.ndarray:
@@ -254,15 +236,15 @@ def _is_large(splats: Splats, extent_m: float) -> np.ndarray:
     return (radius > SPLIT_RADIUS) | unseen
 
 
-def _child_opacities(splats: Splats, large: np.ndarray, split: str) -> np.ndarray:
+def _child_opacities(splats: Splats, large: np.ndarray) -> np.ndarray:
     """float32 [N]: the opacity of each of the two that a splat would become.
 
     1 - sqrt(1 - o) (Rota Bulò et al. 2024, section 4.3): two such splats at one place let through
     what the one let through, where 3DGS's two copies of o hide more of what is behind them, in
-    every round again. Splits along the longest axis hardly overlap, so they keep their parent's.
+    every round again. Large ones are split side by side, hardly overlap, and keep their parent's.
     """
     halved = 1 - np.sqrt(np.clip(1 - splats.opacities, 0, 1))
-    return np.where(large, splats.opacities, halved) if split == "long_axis" else halved
+    return np.where(large, splats.opacities, halved)
 
 
 def _best(splats: Splats, candidates: np.ndarray, budget: int) -> np.ndarray:
@@ -276,201 +258,19 @@ def _best(splats: Splats, candidates: np.ndarray, budget: int) -> np.ndarray:
     return np.sort(rows[np.argsort(-scores[rows], kind="stable")[:budget]])
 
 
-def _split(splats: Splats, first: np.ndarray, split: str, rng: np.random.Generator) -> None:
-    """Turns the equal pairs of rows (first, first + 1) into two smaller splats, in place.
-
-    sampled: both axes and place as in 3DGS, 1.6 times smaller at a random place within the parent;
-    but mirrored at its centre and drawn from a Gaussian so much narrower that the pair keeps the
-    parent's mean and covariance (two free draws spread 1.4 times as wide as the parent).
-    long_axis: side by side along the longest axis only (as Deng et al. 2024 suggest), which
-    disturbs the image least; no random numbers.
+def _split(splats: Splats, first: np.ndarray) -> None:
+    """Turns the equal pairs of rows (first, first + 1) into two smaller splats, in place: side by
+    side along the longest axis (as Deng et al. 2024 suggest), which disturbs the image least.
     """
     scales = splats.scales[first]
-    if split == "long_axis":
-        along = np.arange(3) == scales.argmax(1)[:, None]
-        local = np.where(along, np.float32(OFFSET) * scales, np.float32(0))
-        shrink = np.where(along, np.float32(SHRINK), np.float32(SIDE_SHRINK))
-    else:
-        drawn = rng.standard_normal((len(first), 3), dtype=np.float32)
-        local = np.float32(OFFSET) * scales * drawn
-        shrink = np.float32(SHRINK)
+    along = np.arange(3) == scales.argmax(1)[:, None]
+    local = np.where(along, np.float32(OFFSET) * scales, np.float32(0))
+    shrink = np.where(along, np.float32(SHRINK), np.float32(SIDE_SHRINK))
     offset = rotate(splats.quats[first], local)
     splats.means[first] += offset
     splats.means[first + 1] -= offset
     splats.scales[first] = splats.scales[first + 1] = scales / shrink
     rest(splats, first)
-
-
-# ---- Moves faint splats onto strong ones and adds more there: the image hardly changes by it -----
-# Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo": splats as samples of
-# what explains the images, so that none is cloned or removed by a rule of thumb.
-
-MAX_COPIES = 51  # of one splat after a round, as in the authors' code
-OPAQUE = 1 - 1e-6  # no root of a transmittance of 0 spreads it over several splats
-NOISE_STEEPNESS = 100.0
-NOISE_KNEE = 0.005  # the opacity at which half of the noise is left, theirs
-NOISE_REACH = 0.1  # of opacity above the knee: beyond, less than 1/20000 of the noise is left
-
-_ORDERS = np.arange(1, MAX_COPIES + 1)
-_TERMS = np.array(
-    [
-        [math.comb(n, k) * (-1) ** (k + 1) / math.sqrt(k) for k in _ORDERS.tolist()]
-        for n in range(MAX_COPIES + 1)
-    ]
-)  # [MAX_COPIES + 1, MAX_COPIES]; comb is 0 where k > n
-
-
-def relocated(opacities: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opacity and factor on all scales of each of `copies` equal splats in place of one, float64.
-
-    opacities: [T] in (0, 1]. copies: integer [T], 1 to MAX_COPIES. Equation 9: together the
-    copies hide at their centre what the one hid, 1 - (1 - o')^n = o, and hide as much along a line
-    through it. Its double sum over i <= n of binomials (i - 1 over k) is one sum of (n over k + 1).
-    """
-    opacity = np.minimum(opacities.astype(np.float64), OPAQUE)
-    share = -np.expm1(np.log1p(-opacity) / copies)
-    extent = (_TERMS[copies] * share[:, None] ** _ORDERS).sum(1)
-    return share, opacity / extent
-
-
-def densify_mcmc(
-    splats: Splats, config: DensifyConfig, *, rng: np.random.Generator, extent_m: float
-) -> tuple[Splats, DensifyReport]:
-    """One round: every splat fainter than prune_opacity becomes a copy of a living one, drawn in
-    proportion to opacity, and grow_fraction more are added so.
-
-    A copy belongs to the part of its original. Where the authors raise copies that come out below
-    prune_opacity up to it, which thickens the scene, no splat is here given more copies than it can
-    carry; dead ones that find no place stay. Unusable ones are moved first, and removed otherwise.
-    Everything dead: nothing moves.
-    """
-    good = usable(splats, extent_m)
-    check_some_usable(splats, good)
-    living = good & (splats.opacities >= config.prune_opacity)
-    dead = np.concatenate([np.flatnonzero(~good), np.flatnonzero(good & ~living)])
-    room = max(config.max_splats - len(splats), 0)
-    requested = len(dead) + min(int(config.grow_fraction * len(splats)), room)
-    copies = _draw(splats, living, requested, config.prune_opacity, rng)
-
-    placed = int(copies.sum())
-    moved = min(len(dead), placed)
-    counts = living + copies
-    waiting = dead[moved:]
-    counts[waiting[good[waiting]]] = 1
-    source = np.repeat(np.arange(len(splats)), counts)
-    grown = rebuild(splats, source)
-    touched = np.flatnonzero(copies[source])
-    origin = source[touched]
-    share, factor = relocated(splats.opacities[origin], counts[origin])
-    grown.opacities[touched] = share
-    grown.scales[touched] *= factor[:, None].astype(np.float32)
-    rest(grown, touched)
-    pruned = len(splats) - moved + placed - len(grown)
-    return grown, DensifyReport(0, 0, pruned, moved, added=placed - moved)
-
-
-def _draw(
-    splats: Splats,
-    living: np.ndarray,
-    requested: int,
-    prune_opacity: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """int64 [N]: new copies of each splat, about `requested` in all, fewer where too few can carry.
-
-    Stratified: one draw in each of `requested` equal slices of the summed weights, which keeps the
-    counts nearer to their expectation than free draws do.
-    """
-    room = np.zeros(len(splats), np.int64)
-    room[living] = _most_copies(splats.opacities[living], prune_opacity) - 1
-    weights = np.where(room > 0, splats.opacities, 0).astype(np.float64)
-    summed = np.cumsum(weights)
-    if requested == 0 or len(splats) == 0 or summed[-1] <= 0:
-        return np.zeros(len(splats), np.int64)
-    at = (np.arange(requested) + rng.random(requested)) * (summed[-1] / requested)
-    # side="right" passes over rows without weight; rounding may end on the very sum.
-    drawn = np.searchsorted(summed, np.minimum(at, np.nextafter(summed[-1], 0)), side="right")
-    return np.minimum(np.bincount(drawn, minlength=len(splats)), room)
-
-
-def _most_copies(opacities: np.ndarray, prune_opacity: float) -> np.ndarray:
-    """int64: how many equal splats one can become before they are as faint as dead ones."""
-    if prune_opacity <= 0:
-        return np.full(len(opacities), MAX_COPIES, np.int64)
-    opacity = np.minimum(opacities.astype(np.float64), OPAQUE)
-    most = np.log1p(-opacity) / math.log1p(-min(prune_opacity, OPAQUE))
-    # A hair below the whole number, so that float32 does not round a copy to the dead side.
-    return np.clip(most - 1e-4, 1, MAX_COPIES).astype(np.int64)
-
-
-def add_noise(splats: Splats, rows: np.ndarray, lr: float, rng: np.random.Generator) -> None:
-    """Adds noise to the means of faint splats within their own shape, in place (section 4.2 there).
-
-    step = lr sigmoid(-100 (opacity - NOISE_KNEE)) covariance normal(0, 1). rows: int64, without
-    repetition. lr: 1/m; the authors take 5e5 times the means' learning rate. Departure: no axis's
-    step is drawn wider than the splat itself, since a covariance in m2 would throw a distant splat
-    of some metres out of the scene.
-    """
-    opacities = splats.opacities[rows]
-    faint = np.flatnonzero(opacities < NOISE_KNEE + NOISE_REACH)
-    rows = rows[faint]
-    gate = lr / (1 + np.exp(NOISE_STEEPNESS * (opacities[faint] - NOISE_KNEE)))
-    scales = splats.scales[rows]
-    sigma = np.minimum(gate[:, None].astype(np.float32) * scales, np.float32(1)) * scales
-    # The covariance times isotropic noise, R S S R^T n, is R S S n in distribution.
-    local = sigma * rng.standard_normal((len(rows), 3), dtype=np.float32)
-    splats.means[rows] += rotate(splats.quats[rows], local)
-
-
-# ---- One round by the configured method ---------------------------------------------------------
-
-METHODS = ("absgrad", "mcmc")
-
-
-def grows(config: DensifyConfig, step: int, total_steps: int) -> bool:
-    """Whether splats may be added after this many steps: from config.start to config.stop."""
-    return config.start * total_steps <= step <= config.stop * total_steps
-
-
-def densify_due(config: DensifyConfig, step: int, total_steps: int) -> bool:
-    """Whether a round is due after this many steps: every config.every while splats are added."""
-    return step > 0 and step % config.every == 0 and grows(config, step, total_steps)
-
-
-def densify(
-    splats: Splats,
-    config: DensifyConfig,
-    *,
-    rng: np.random.Generator,
-    step: int,
-    total_steps: int,
-    extent_m: float,
-) -> tuple[Splats, DensifyReport]:
-    """One round by config.method on all parts together; `splats` itself does not change.
-
-    step, total_steps: outside of config's start and stop faint splats are removed and nothing else
-    happens, by either method. extent_m: how far the scene reaches, against which absurd sizes show.
-    The result's arrays are its own, part after part, children next to their parents, grads zero.
-
-    Raises:
-        ValueError: an argument or a setting is out of range.
-        SceneError: no splat is usable any more.
-    """
-    if config.method not in METHODS:
-        raise ValueError(f"densify method must be one of {METHODS}; got {config.method!r}")
-    if config.split not in SPLITS:
-        raise ValueError(f"densify split must be one of {SPLITS}; got {config.split!r}")
-    if not (config.grow_fraction >= 0 and 0 <= config.prune_opacity < 1):
-        raise ValueError(
-            f"grow_fraction must be >= 0 and prune_opacity in [0, 1); "
-            f"got {config.grow_fraction} and {config.prune_opacity}"
-        )
-    if not (math.isfinite(extent_m) and extent_m > 0):
-        raise ValueError(f"extent_m must be finite and > 0; got {extent_m}")
-    grow = grows(config, step, total_steps)
-    if grow and config.method == "mcmc":
-        return densify_mcmc(splats, config, rng=rng, extent_m=extent_m)
-    return densify_absgrad(splats, config, rng=rng, extent_m=extent_m, grow=grow)
 
 
 # ---- Step sizes of one update, as the kernel takes them ------------------------------------------
@@ -480,13 +280,11 @@ CORRECTIONS = kernels.bias_corrections(BETA1, BETA2)
 _MIN_M = 1e-3  # no splat gets thinner along any axis
 
 
-def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -> np.ndarray:
-    """float32 [RATES] for the update after `step` updates.
+def splat_rates(rates: LearningRates, done: float, camera: Camera, extent_m: float) -> np.ndarray:
+    """float32 [RATES] for an update. done: the part of the run that lies behind.
 
     Means decay exponentially over the run; the others fall to rates.late of their value likewise.
     """
-    rates = config.rates
-    done = min(1.0, step / max(config.steps, 1))
     late = rates.late**done
     values = np.zeros(kernels.RATES, np.float32)
     values[G_MEAN : G_MEAN + 3] = decayed(rates.means, rates.means_end, done)
@@ -496,8 +294,6 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     values[kernels.R_SH_DC] = rates.sh_dc * late
     values[kernels.R_SH_REST] = rates.sh_rest * late
     values[kernels.R_BETA1], values[kernels.R_BETA2] = BETA1, BETA2
-    values[kernels.R_OPACITY_DECAY] = config.loss.opacity_decay
-    values[kernels.R_SCALE_DECAY] = config.loss.scale_decay
     values[kernels.R_SMALLEST], values[kernels.R_LARGEST] = _MIN_M, extent_m
     side = max(camera.width, camera.height)
     values[kernels.R_ABS_UNIT], values[kernels.R_RADIUS_UNIT] = 0.5 * side, 1 / side

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.labels import EGO_VEHICLE
-from augment.reconstruct.config import FitConfig
+from augment.reconstruct.config import FitConfig, LossWeights, Tuning
 from augment.reconstruct.kernels import MOMENTS, GradientRows, sum_forces, update_splats
 from augment.reconstruct.loss import (
     IDENTITY_MAP,
@@ -37,7 +37,6 @@ from augment.reconstruct.splats import (
     ColorAdam,
     DenseAdam,
     Splats,
-    add_noise,
     decayed,
     densify,
     densify_due,
@@ -534,15 +533,24 @@ class Trainer:
     """A scene while it is fitted to its recorded views."""
 
     def __init__(
-        self, scene: Scene, source: ViewSource, config: FitConfig, *, device: str = "cpu"
+        self,
+        scene: Scene,
+        source: ViewSource,
+        config: FitConfig,
+        steps: int,
+        *,
+        tuning: Tuning = Tuning(),  # noqa: B008 - frozen, so sharing it is safe
+        device: str = "cpu",
     ) -> None:
         """scene: what is started from; it is not changed. source: at least one training view.
-        device: where views are rendered; bits are those of "cpu".
+        steps: of the whole run, one view each. device: where views are rendered; bits are those of
+        "cpu".
         """
         if not source.train:
             raise ValueError("the view source has no training views; nothing can be learnt")
-        self.config = config
         self.step = 0
+        self._config, self._steps, self._tuning = config, steps, tuning
+        self._weights = LossWeights(depth=config.depth_weight)
         parts = scene.all_gaussians
         self.splats = Splats.of(parts, config.sh_degree)
         self.sky_faces = starting_sky(scene.sky)
@@ -578,7 +586,7 @@ class Trainer:
                 view,
                 self.sky_faces,
                 self.color_maps[key.camera],
-                self.config.loss,
+                self._weights,
                 scratch=self._loss_scratch,
             )
         with _timed(stages, "backward"):
@@ -590,8 +598,6 @@ class Trainer:
             self._update(parts, tape.inputs, grads, view.camera, loss)
         self.step += 1
         with _timed(stages, "densify"):
-            if self.config.densify.method == "mcmc" and self.config.densify.noise > 0:
-                self._add_noise(tape.inputs, grads)
             self._densify()
         return StepRecord(
             step=self.step, key=key, loss=loss.total, l1=loss.l1, ssim=loss.ssim, depth=loss.depth,
@@ -617,7 +623,7 @@ class Trainer:
             actors=actors,
             frames=tuple(self._frame(frame) for frame in self._scene.frames),
             sky=CubemapSky(torch.from_numpy(self.sky_faces.copy())),
-            color_maps=maps if self.config.exposure else {},
+            color_maps=maps,
             image_color_maps={},
         )
 
@@ -654,7 +660,7 @@ class Trainer:
         epoch, place = divmod(self.step, len(train))
         if self._order[0] != epoch:
             rng = rng_for(
-                seed=self.config.seed, scene=self._scene.name, effect="fit.order", frame=epoch
+                seed=self._config.seed, scene=self._scene.name, effect="fit.order", frame=epoch
             )
             self._order = (epoch, rng.permutation(len(train)))
         return train[int(self._order[1][place])]
@@ -670,18 +676,17 @@ class Trainer:
         ]
         numbers = [part.instance_id for part in posed]
         poses = part_poses([part.world_from_part for part in posed])
-        if self.config.pose_refinement:
-            for place, number in enumerate(numbers):
-                if number > 0:
-                    poses[place] = self.actor_poses.corrected(
-                        number - 1, poses[place], camera.timestamp_ns
-                    )
+        for place, number in enumerate(numbers):
+            if number > 0:
+                poses[place] = self.actor_poses.corrected(
+                    number - 1, poses[place], camera.timestamp_ns
+                )
         return _PosedParts(numbers, poses)
 
     def _render(self, parts: _PosedParts, camera: Camera) -> Tape | GsplatTape:
         inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, SETTINGS)
         inputs.modes[M_FUNCTIONS] = self._functions
-        with_depth = self.config.loss.depth > 0
+        with_depth = self._weights.depth > 0
         return self._renderer.record(
             self.splats, inputs, parts.poses, camera, with_depth=with_depth
         )
@@ -689,12 +694,12 @@ class Trainer:
     @property
     def _done(self) -> float:
         """The part of the run that lies behind."""
-        return min(1.0, self.step / max(self.config.steps, 1))
+        return min(1.0, self.step / self._steps)
 
     @property
     def _functions(self) -> int:
         """SH functions that are learnt by now."""
-        degree = min(self.config.sh_degree, self.step // max(self.config.sh_every, 1))
+        degree = min(self._config.sh_degree, self.step // self._tuning.sh_every)
         return (degree + 1) ** 2
 
     def _update(
@@ -705,76 +710,41 @@ class Trainer:
         camera: Camera,
         loss: ViewLoss,
     ) -> None:
-        splats, rates = self.splats, self.config.rates
+        splats, rates, tuning = self.splats, self._tuning.rates, self._tuning
         done = self._done
-        forces = part_forces(inputs, grads) if self.config.pose_refinement else None
+        late = rates.late**done
+        forces = part_forces(inputs, grads)
         with kernel_threads():
             update_splats(
                 inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
                 GradientRows(grads.rows.reshape(-1), grads.ids, grads.counts), self._functions,
-                splat_rates(self.config, self.step, camera, self._extent_m),
-                CORRECTIONS.reshape(-1), splats.adam_state(),
+                splat_rates(rates, done, camera, self._extent_m), CORRECTIONS.reshape(-1),
+                splats.adam_state(),
             )  # fmt: skip
         if loss.d_sky is not None:
             rate = decayed(rates.sky, rates.sky_end, done)
             above = self._is_sky[loss.d_sky.texels]
             self._sky_adam.update(loss.d_sky.texels[above], loss.d_sky.grads[above], rate)
-        if self.config.exposure:
-            color_map = self.color_maps[camera.name]
-            pull = self.config.exposure_pull * (color_map - IDENTITY_MAP)
-            self._map_adams[camera.name].update(
-                loss.d_color_map + pull, rates.color_map * rates.late**done
-            )
-        if forces is not None:
-            late = rates.late**done
-            self.actor_poses.update(
-                parts.numbers,
-                parts.poses,
-                forces,
-                camera.timestamp_ns,
-                rate_m=rates.actors * late,
-                pull=self.config.pose_pull,
-            )
-            self.camera_poses.update(
-                camera,
-                parts.poses,
-                forces,
-                rate_px=rates.cameras * late,
-                pull=self.config.pose_pull,
-            )
-
-    def _add_noise(self, inputs: Inputs, grads: SplatGradients) -> None:
-        """Noise on the means of faint splats that the view shows."""
-        config = self.config
-        firsts = inputs.first_ids[inputs.blocks[:, 0]]
-        rows = [
-            first + grads.ids[block * BLOCK : block * BLOCK + count].astype(np.int64)
-            for block, (first, count) in enumerate(zip(firsts, grads.counts, strict=True))
-            if count > 0
-        ]
-        if not rows:
-            return
-        rng = rng_for(seed=config.seed, scene=self._scene.name, effect="fit.noise", frame=self.step)
-        rates = config.rates
-        decay = decayed(rates.means, rates.means_end, self._done) / (rates.means or 1.0)
-        noise = config.densify.noise * decay
-        add_noise(self.splats, np.concatenate(rows), noise, rng)
+        pull = tuning.exposure_pull * (self.color_maps[camera.name] - IDENTITY_MAP)
+        self._map_adams[camera.name].update(loss.d_color_map + pull, rates.color_map * late)
+        self.actor_poses.update(
+            parts.numbers,
+            parts.poses,
+            forces,
+            camera.timestamp_ns,
+            rate_m=rates.actors * late,
+            pull=tuning.pose_pull,
+        )
+        self.camera_poses.update(
+            camera, parts.poses, forces, rate_px=rates.cameras * late, pull=tuning.pose_pull
+        )
 
     def _densify(self) -> None:
-        config = self.config
-        if not densify_due(config.densify, self.step, config.steps):
-            return
-        rng = rng_for(
-            seed=config.seed, scene=self._scene.name, effect="fit.densify", frame=self.step
-        )
-        self.splats, _ = densify(
-            self.splats,
-            config.densify,
-            rng=rng,
-            step=self.step,
-            total_steps=config.steps,
-            extent_m=self._extent_m,
-        )
+        config, growth = self._config, self._tuning.growth
+        if config.densify != "none" and densify_due(growth, self.step, self._steps):
+            self.splats = densify(
+                self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 pytest.importorskip("triton")
 
 from augment.errors import BackendUnavailable, ClimateGSError
-from augment.reconstruct.config import DensifyConfig
+from augment.reconstruct.config import FitConfig, Growth, Tuning
 from augment.reconstruct.trainer import Trainer
 from augment.render.cpu import backward_kernels as columns
 from augment.render.cuda import runtime as gpu
 from augment.render.layout import BLOCK
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
-from tests.augment.test_trainer import QUICK, assert_same_state, record, run, start, truth
+from tests.augment.test_trainer import QUICK, assert_same_state, quick, record, run, start, truth
 from tools.options import FitOptions
 
 if not gpu.is_interpreted():
     pytest.skip("the stand-in computes on the CPU", allow_module_level=True)
 
-CONFIG = dataclasses.replace(
-    QUICK, steps=8, sh_every=1, densify=DensifyConfig(every=3, start=0.1, stop=0.6)
-)
+CONFIG = FitConfig(max_splats=600)
+TUNING = Tuning(sh_every=1, growth=Growth(every=3, start=0.1, stop=0.6))
+
+
+def trainer_on(device: str, source) -> Trainer:
+    """Of a run of 8 steps, in which splats are added and a band joins."""
+    return Trainer(start(), source, CONFIG, 8, tuning=TUNING, device=device)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def test_gradients_are_those_of_the_cpu_s_kernels(recorded):
     slopes = [rng.normal(size=s).astype(np.float32) for s in ((*size, 3), size, size)]
     found = []
     for device in ("cpu", "cuda"):
-        trainer = Trainer(start(), recorded, QUICK, device=device)
+        trainer = quick(start(), recorded, device=device)
         trainer.step = QUICK.sh_every  # two bands are learnt
         tape = trainer._render(trainer._posed(view.camera), view.camera)
         rows = dense_rows(trainer, tape.backward(*slopes), tape.inputs)
@@ -81,10 +83,10 @@ def test_gradients_are_those_of_the_cpu_s_kernels(recorded):
 @pytest.mark.usefixtures("gsplat")
 def test_a_fit_learns_the_same(recorded):
     """Through a round that adds splats, with poses and exposure; and goes on between devices."""
-    here, there = (Trainer(start(), recorded, CONFIG, device=d) for d in ("cpu", "cuda"))
+    here, there = (trainer_on(d, recorded) for d in ("cpu", "cuda"))
     for mine, theirs in zip(run(there, 5), run(here, 5), strict=True):
         assert mine.loss == pytest.approx(theirs.loss, rel=2e-2) and mine.key == theirs.key
-    resumed = Trainer(start(), recorded, CONFIG, device="cuda")
+    resumed = trainer_on("cuda", recorded)
     resumed.load_state(*there.state())
     run(there, 2)
     run(resumed, 2)
@@ -96,10 +98,10 @@ def test_a_fit_learns_the_same(recorded):
 @pytest.mark.usefixtures("gsplat")
 def test_all_that_gsplat_is_given_lies_on_the_gpu(recorded, monkeypatch):
     """The stand-in takes nothing else; steps are those of splats that never left the CPU."""
-    here = Trainer(start(), recorded, CONFIG, device="cuda")
+    here = trainer_on("cuda", recorded)
     expected = run(here, 2)
     with pretended_gpu(monkeypatch):
-        there = Trainer(start(), recorded, CONFIG, device="cuda")
+        there = trainer_on("cuda", recorded)
         found = run(there, 2)
         copies = there._renderer._copies
         assert all(isinstance(copy, AwayTensor) for copy in copies.values())
@@ -110,14 +112,14 @@ def test_all_that_gsplat_is_given_lies_on_the_gpu(recorded, monkeypatch):
 def test_without_gsplat_a_fit_does_not_begin(recorded, monkeypatch):
     gsplat_stand_in.install(monkeypatch, __version__="0.1")
     with pytest.raises(BackendUnavailable, match=r"gsplat 0\.1 is installed"):
-        Trainer(start(), recorded, CONFIG, device="cuda")
+        trainer_on("cuda", recorded)
     with pytest.raises(ValueError, match="device must be one of cpu, cuda; got 'tpu'"):
-        Trainer(start(), recorded, CONFIG, device="tpu")
+        trainer_on("tpu", recorded)
 
 
 def test_the_device_decides_the_result_where_it_is_not_the_cpu(tmp_path):
     own = {"scene": "procedural:street?seed=3", "out": tmp_path}
     here, there = (FitOptions(**own, device=device) for device in ("cpu", "cuda"))
-    assert there.settings() == here.settings() | {"device": "cuda"}  # and old checkpoints go on
-    with pytest.raises(ClimateGSError, match="--device is one of cpu, cuda; got 'tpu'"):
+    assert there.settings() == here.settings() | {"device": "cuda"}
+    with pytest.raises(ClimateGSError, match="--device must be 'cpu' or 'cuda'; got tpu"):
         FitOptions(**own, device="tpu")

@@ -24,7 +24,7 @@ from augment.effects.style.pairs import PairBatch, PairWeights, pair_losses, wei
 from augment.effects.style.statistics import WHOLE, ColorStatistics, closed_maps
 from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
-from augment.reconstruct.config import FitConfig, LossWeights
+from augment.reconstruct.config import LearningRates, LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, MIN_ALPHA, MIN_SKY, ViewLoss, view_loss
 from augment.reconstruct.splats import CORRECTIONS, ColorAdam, DenseAdam, Splats, splat_rates
 from augment.reconstruct.trainer import Knots, part_forces, splat_inputs
@@ -97,17 +97,6 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
     found = gradients(
         gaussians, camera, backend="reference", seed=seed, settings=settings, fog=SMOGS[smog]
     )
-    assert_finite(found)
-
-
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize("kind", ["plain", "edges", "near"])
-def test_of_a_view_of_nothing(kind, backend):
-    """Zeros, by both backends: a training step that sees no splat is no error."""
-    gaussians = hard_gaussians(kind, wide_camera(60.0), 30)
-    away = wide_camera(60.0, (16, 9), at=(1e3, 0.0, 0.0))
-    found = gradients(gaussians, away, backend=backend, seed=0)
-    assert all(not value.any() for value in found.values())
     assert_finite(found)
 
 
@@ -205,7 +194,7 @@ def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
     pose = rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     splats = Splats.of([start, start.select(torch.arange(20))], 3)
     poses = part_poses([None, pose])
-    config = FitConfig(steps=10, loss=LossWeights(opacity_decay=0.02, scale_decay=0.03))
+    rates = LearningRates()
     inputs = splat_inputs(splats, [0, 1], poses, camera, RasterSettings())
     knots = Knots([np.array([0, 10])], 6)
     rng, scratch = np.random.default_rng(seed), Scratch()
@@ -223,7 +212,7 @@ def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
             adam.update_splats(
                 inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
                 adam.GradientRows(found.rows.reshape(-1), found.ids, found.counts), 16,
-                splat_rates(config, step, camera, 50.0), CORRECTIONS.reshape(-1),
+                splat_rates(rates, step / 10, camera, 50.0), CORRECTIONS.reshape(-1),
                 splats.adam_state(),
             )  # fmt: skip
     for name, array in splats.arrays().items():

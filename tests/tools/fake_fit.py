@@ -30,8 +30,8 @@ SIZE = (6, 8)
 class FakeTrainer:
     """Moves a colour towards the views' by random amounts: state, seed and order all matter."""
 
-    def __init__(self, scene: Scene, source: FakeViews, config: FitConfig) -> None:
-        self.step, self.config = 0, config
+    def __init__(self, scene: Scene, source: FakeViews, config: FitConfig, steps: int) -> None:
+        self.step, self._steps = 0, steps
         self._scene, self._source = scene, source
         self._rng = np.random.default_rng(config.seed)
         self._colour = np.zeros(3, np.float32)
@@ -44,7 +44,7 @@ class FakeTrainer:
             self._order = self._rng.permutation(len(self._source.train)).tolist()
         key = self._source.train[self._order.pop()]
         target = self._source.load(key).rgb.mean((0, 1)) / np.float32(255)
-        rate = np.float32(self._rng.random() * (1 - self.step / self.config.steps))
+        rate = np.float32(self._rng.random() * (1 - self.step / self._steps))
         self._colour += rate * (target - self._colour).astype(np.float32)
         self.step += 1
         loss = float(np.abs(target - self._colour).mean())
@@ -147,9 +147,9 @@ class Fakes:
         return fake_scene(uri, self.numbers, self.recorded)
 
     def _trainer(
-        self, scene: Scene, source: FakeViews, config: FitConfig, device: str
+        self, scene: Scene, source: FakeViews, config: FitConfig, steps: int, device: str
     ) -> FakeTrainer:
-        trainer = FakeTrainer(scene, source, config)
+        trainer = FakeTrainer(scene, source, config, steps)
         trainer.before_step = self.before_step
         self.trainers.append(trainer)
         return trainer

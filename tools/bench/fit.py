@@ -18,7 +18,7 @@ from tqdm import tqdm
 from adapters.base import open_scene
 from adapters.training_views.views import RecordedViews
 from augment.errors import ClimateGSError
-from augment.reconstruct.config import DensifyConfig, FitConfig
+from augment.reconstruct.config import FitConfig, Tuning
 from augment.reconstruct.trainer import Trainer
 from augment.render.cpu.driver import warm_up
 from augment.scene import Scene
@@ -33,11 +33,10 @@ from tools.bench.harness import (
     status_mib,
 )
 from tools.bench.scenes import record_street
-from tools.fit import fit_scene
+from tools.fit import NOMINAL_STEPS, fit_scene
 from tools.options import FitOptions
 
 UNTIMED = 6  # first steps: compiling, and every view of a short recording decoded once
-NO_GROWTH = DensifyConfig(start=1.0, stop=0.0)  # its part of the run ends before it starts
 FIT_COLUMNS = ("fit", "steps", "PSNR dB", "SSIM", "FLIP", "depth median m", "90 % m",
                "true depth median m", "90 % m", "minutes")  # fmt: skip
 
@@ -114,7 +113,8 @@ def time_steps(uri: str, scale: float, case: FitCase) -> tuple[Table, Figures]:
         source.load(key)  # as in a long run, where images come from memory
     before, started = begin_peak(), time.perf_counter()
     warm_up()
-    trainer = Trainer(scene, source, FitConfig(sh_every=1, densify=NO_GROWTH))
+    config, tuning = FitConfig(densify="none"), Tuning(sh_every=1)
+    trainer = Trainer(scene, source, config, NOMINAL_STEPS, tuning=tuning)
     for _ in range(UNTIMED):
         trainer.run_step()
     warm_up_s, seconds = time.perf_counter() - started, defaultdict(list)
