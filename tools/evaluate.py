@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from augment.cameras import Camera
 from augment.dataset.clips_pairs import masks_of
-from augment.dataset.weather_dataset import Companions, RowReader, Rows, StoredFiles
+from augment.dataset.weather_dataset import RowReader, Rows
 from augment.errors import OutputError
 from augment.geometry import invert_rigid
 from augment.jobs.files import depth_in_metres
@@ -155,26 +155,25 @@ class Views:
         self.rows = Rows.of(table)
         self._store = store
         self._reader = RowReader(store, verify=False)
-        self._paths = Companions(StoredFiles(store), lambda path: (ActorPaths(read_boxes(path)),))
         self.view = functools.lru_cache(_KEPT)(self._read)
 
     def drives(self) -> list[Drive]:
         """In the manifest's order."""
         found: dict[tuple[str, str], Drive] = {}
         masks = masks_of(self.rows)
-        for row in range(len(self.rows)):
-            scene, variant = self.rows["scene"][row], self.rows["variant"][row]
+        names = ("scene", "variant", "recipe", "frame", "camera")
+        columns = (self.rows[name].to_pylist() for name in names)
+        for row, (scene, variant, recipe, *item) in enumerate(zip(*columns, strict=True)):
             if (scene, variant) not in found:
                 effects = " + ".join(name for name, there in masks.items() if there[row]) or "clean"
-                recipe = self.rows["recipe"][row]
                 found[scene, variant] = Drive(scene, variant, recipe, effects, {})
-            item = self.rows["frame"][row], self.rows["camera"][row]
-            found[scene, variant].rows[item] = row
+            found[scene, variant].rows[item[0], item[1]] = row
         return list(found.values())
 
     def camera(self, row: int) -> Camera:
         """The row's camera in the dataset's world, which is that of the boxes."""
-        record, _ = self._reader.camera(self.rows, row)
+        found = self.rows.row(row)
+        record, _ = self._reader.camera(found)
         try:
             return Camera(
                 record.name,
@@ -189,16 +188,17 @@ class Views:
             )
         except (RuntimeError, TypeError, ValueError) as error:
             raise OutputError(
-                f"{self._store.uri}: {self.rows['calibration_path'][row]} is damaged (frame "
-                f"{self.rows['frame'][row]}, camera {record.name!r}: {error}); delete it and run "
+                f"{self._store.uri}: {found['calibration_path']} is damaged (frame "
+                f"{found['frame']}, camera {record.name!r}: {error}); delete it and run "
                 f"the job again, which makes it anew"
             ) from error
 
     def paths(self, row: int) -> ActorPaths:
         """Where the boxes of the row's drive are; none where it has no labels."""
-        column: Any = self.rows["labels_path"]
-        parts = column.parts(row)
-        return ActorPaths({}) if parts is None else self._paths.get(*parts)[0]
+        path = self.rows.row(row)["labels_path"]
+        if path is None:
+            return ActorPaths({})
+        return self._reader.parsed("actors", path, lambda file: (ActorPaths(read_boxes(file)),))[0]
 
     def _read(self, row: int) -> View:
         """What the row's files hold.
@@ -206,24 +206,24 @@ class Views:
         Raises:
             OutputError: the row has no depth, or a file is missing or damaged.
         """
-        pixels = self._reader.pixels(self.rows, row, _BUFFERS)
-        if pixels.depth is None:
+        found = self.rows.row(row)
+        images = self._reader.images(found, _BUFFERS)
+        if "depth" not in images:
             raise OutputError(
-                f"{self._store.uri}: variant {self.rows['variant'][row]!r} of scene "
-                f"{self.rows['scene'][row]!r} has no depth images, by which views are compared; "
-                f"render it with output: {{depth: median}}"
+                f"{self._store.uri}: variant {found['variant']!r} of scene {found['scene']!r} has "
+                f"no depth images, by which views are compared; render it with output: {{depth: "
+                f"median}}"
             )
-        assert pixels.rgb is not None
-        depth_m = depth_in_metres(pixels.depth)
+        depth_m = depth_in_metres(images["depth"])
         return View(
             DepthView(
                 self.camera(row),
-                pixels.rgb.astype(np.float32) / np.float32(255),
+                images["image"].astype(np.float32) / np.float32(255),
                 depth_m,
                 (depth_m > 0).astype(np.float32),
             ),
-            pixels.masks[WATER] > 0 if WATER in pixels.masks else None,
-            None if pixels.instance is None else pixels.instance > 0,
+            images[WATER] > 0 if WATER in images else None,
+            images["instance"] > 0 if "instance" in images else None,
         )
 
 
@@ -300,7 +300,7 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
         "recipe": drive.recipe,
         "effects": drive.effects,
         "kind": pair.kind,
-        "frames": [views.rows["frame"][row] for row in (pair.a, pair.b)],
+        "frames": [views.rows.row(row)["frame"] for row in (pair.a, pair.b)],
         "cameras": [camera.name for camera in cameras],
         "seconds_apart": abs(cameras[1].timestamp_ns - cameras[0].timestamp_ns) * 1e-9,
         "meters_apart": float((cameras[1].centre - cameras[0].centre).norm()),

@@ -3,6 +3,7 @@
 Both yield the samples that `augment.dataset.samples` describes, with the same pixels.
 """
 
+from augment.dataset.boxes import Boxes2d, box_masks, boxes_2d, torchvision_sample
 from augment.dataset.clips_pairs import (
     ClipDataset,
     MixedDataset,
@@ -11,8 +12,9 @@ from augment.dataset.clips_pairs import (
     clean_frames,
     split_by_scene,
 )
-from augment.dataset.samples import Boxes2d, box_masks, boxes_2d, collate_frames, torchvision_sample
-from augment.dataset.weather_dataset import SceneDataset, WeatherDataset
+from augment.dataset.live import SceneDataset
+from augment.dataset.samples import collate_frames
+from augment.dataset.weather_dataset import WeatherDataset
 
 __all__ = [
     "Boxes2d",

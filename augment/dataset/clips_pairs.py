@@ -13,14 +13,20 @@ import torch
 from torch import distributed
 from torch.utils.data import Dataset, Sampler
 
-from augment.dataset.samples import buffer_names
-from augment.dataset.weather_dataset import Rows, WeatherDataset
+from augment.dataset.samples import (
+    Sample,
+    buffers,
+    check_choice,
+    check_index,
+    stack_alike,
+    stack_cameras,
+)
+from augment.dataset.weather_dataset import Rows, WeatherDataset, number_groups
 from augment.jobs.manifest import effect_masks
 
 # ---- Who trains on which sample: dealt to all processes, the same again after an interruption ----
 
 Uneven = Literal["exact", "pad", "drop"]
-_UNEVEN = ("exact", "pad", "drop")
 
 
 class ShardedSampler(Sampler[int]):
@@ -60,8 +66,7 @@ class ShardedSampler(Sampler[int]):
         self.shuffle, self.seed, self.uneven = shuffle, seed, uneven
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
-        if uneven not in _UNEVEN:
-            raise ValueError(f"uneven must be one of {', '.join(_UNEVEN)}; got {uneven!r}")
+        check_choice("uneven", uneven, Uneven)
         self.epoch = 0
         self._done = 0  # of all ranks' samples: where the epoch goes on
         self._given = 0
@@ -129,6 +134,7 @@ def _process_rank() -> tuple[int, int]:
 
 # ---- splits --------------------------------------------------------------------------------------
 
+_MOMENT = ("scene", "frame", "camera")
 Splittable = TypeVar("Splittable", WeatherDataset, pa.Table)
 DEFAULT_FRACTIONS: Mapping[str, float] = {"train": 0.8, "val": 0.2}
 
@@ -152,38 +158,16 @@ def split_by_scene(
     shares = list(fractions.values())
     if not shares or min(shares) < 0 or not math.isclose(sum(shares), 1, abs_tol=1e-9):
         raise ValueError(f"fractions must be >= 0 and add up to 1; got {dict(fractions)}")
-    names, codes = _scenes(whole)
-    places = np.array([_place(name, seed) for name in names])
+    of: Any = whole
+    is_dataset = isinstance(whole, WeatherDataset)
+    column = of.rows["scene"] if is_dataset else of["scene"].combine_chunks()
+    scenes = column.dictionary_encode()
+    places = np.array([_place(name, seed) for name in scenes.dictionary.to_pylist()])
     if exact:
-        order = np.argsort(np.argsort(places, kind="stable"), kind="stable")
-        places = (order + 0.5) / max(len(names), 1)
-    ends = np.cumsum(shares)[:-1]
-    part_of = np.searchsorted(ends, places, side="right")
-    rows = part_of[codes] if len(names) else np.zeros(0, np.int64)
-    parts = {}
-    for number, name in enumerate(fractions):
-        mask = rows == number
-        part = whole.select(mask) if isinstance(whole, WeatherDataset) else _filtered(whole, mask)
-        parts[name] = part
-    return parts
-
-
-def _filtered(table: Any, mask: np.ndarray) -> Any:
-    return table.filter(pa.array(mask))
-
-
-def _scenes(whole: WeatherDataset | pa.Table) -> tuple[list[str], np.ndarray]:
-    """The names of the scenes that there are, sorted, and each row's number of its scene."""
-    if isinstance(whole, WeatherDataset):
-        column = whole.rows.coded("scene")
-        present, codes = np.unique(column.codes, return_inverse=True)
-        names = [column.values[code] for code in present]
-    else:
-        found, codes = np.unique(
-            whole["scene"].to_numpy(zero_copy_only=False).astype(str), return_inverse=True
-        )
-        names = found.tolist()
-    return names, codes
+        places = (np.argsort(np.argsort(places, kind="stable")) + 0.5) / max(len(places), 1)
+    part = np.searchsorted(np.cumsum(shares)[:-1], places, side="right")[scenes.indices.to_numpy()]
+    select = of.select if is_dataset else lambda rows: of.filter(pa.array(rows))
+    return {name: select(part == number) for number, name in enumerate(fractions)}
 
 
 def _place(scene: str, seed: int) -> float:
@@ -200,18 +184,17 @@ def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> Weather
     those whose manifest says that no effect is there, and whose other numbers of weather are all
     zero or absent. Raises ValueError: there is no such variant.
     """
-    rows = dataset.rows
+    return dataset.select(clean_mask(dataset.rows, variant))
+
+
+def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
+    """bool [N]: rows without weather and style, or of one variant. Raises ValueError, as above."""
     if variant is None:
-        return dataset.select(clean_mask(rows))
-    names = rows.coded("variant")
-    if variant not in names.values:
-        raise ValueError(f"no variant {variant!r}; there are {', '.join(sorted(names.values))}")
-    return dataset.select(names.codes == names.values.index(variant))
-
-
-def clean_mask(rows: Rows) -> np.ndarray:
-    """bool [N]: rows without weather and style."""
-    return ~np.logical_or.reduce(list(masks_of(rows).values()))
+        return ~np.logical_or.reduce(list(masks_of(rows).values()))
+    codes, names = rows.codes("variant")
+    if variant not in names:
+        raise ValueError(f"no variant {variant!r}; there are {', '.join(sorted(names))}")
+    return codes == names.index(variant)
 
 
 def masks_of(rows: Rows) -> dict[str, np.ndarray]:
@@ -249,13 +232,8 @@ class PairedDataset(Dataset):
     @staticmethod
     def of(dataset: WeatherDataset, clean_variant: str | None = None) -> PairedDataset:
         """The pairs within one dataset: its clean images (`clean_frames`) and all others."""
-        clean = clean_frames(dataset, clean_variant)
-        if clean_variant is None:
-            others = ~clean_mask(dataset.rows)
-        else:
-            names = dataset.rows.coded("variant")
-            others = names.codes != names.values.index(clean_variant)
-        return PairedDataset(clean, dataset.select(others))
+        clean = clean_mask(dataset.rows, clean_variant)
+        return PairedDataset(dataset.select(clean), dataset.select(~clean))
 
     def __len__(self) -> int:
         return len(self._weathered_rows)
@@ -281,7 +259,8 @@ class MixedDataset(Dataset):
         if not 0 <= fraction <= 1:
             raise ValueError(f"fraction must be 0 to 1; got {fraction}")
         if len(clean) and len(weathered):
-            _check_alike(clean, weathered)
+            _check_alike(clean=clean, weathered=weathered)
+            _check_alike(weathered=weathered, clean=clean)
         self.clean, self.weathered, self.fraction, self.seed = clean, weathered, fraction, seed
         partner = _partners(clean.rows, weathered.rows)
         # The weathered rows of clean row i are _rows[_ends[i]:_ends[i + 1]].
@@ -299,9 +278,8 @@ class MixedDataset(Dataset):
         return len(self.clean)
 
     def __getitem__(self, index: int) -> Any:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"sample {index} of a dataset of {len(self)}")
-        row = self.weathered_row(index % len(self))
+        index = check_index(index, len(self))
+        row = self.weathered_row(index)
         return self.clean[index] if row is None else self.weathered[row]
 
     def weathered_row(self, index: int) -> int | None:
@@ -315,53 +293,31 @@ class MixedDataset(Dataset):
         return int(self._rows[rng.integers(start, end)])
 
 
-def _check_alike(clean: WeatherDataset, weathered: WeatherDataset) -> None:
-    sides = {"clean": clean, "weathered": weathered}
-    for name, other in (("clean", "weathered"), ("weathered", "clean")):
-        if lacking := sorted(sides[other].given() - sides[name].given()):
-            raise ValueError(
-                f"samples of `{name}` ({', '.join(sides[name].uris)}) have no "
-                f"{', '.join(lacking)}, those of `{other}` ({', '.join(sides[other].uris)}) have: "
-                f"batches would not stack. Open both with a `load` without it, or render it for "
-                f"`{name}` too"
-            )
+def _check_alike(**sides: WeatherDataset) -> None:
+    """Raise ValueError where the first dataset lacks what the second one's samples have."""
+    (name, poor), (other, rich) = sides.items()
+    if lacking := sorted(rich.given() - poor.given()):
+        raise ValueError(
+            f"samples of `{name}` ({', '.join(poor.uris)}) have no {', '.join(lacking)}, those of "
+            f"`{other}` ({', '.join(rich.uris)}) have: batches would not stack. Open both with a "
+            f"`load` without it, or render it for `{name}` too"
+        )
 
 
 def _partners(clean: Rows, weathered: Rows) -> np.ndarray:
     """int64: of each weathered row the clean row of its scene, frame and camera, or -1."""
-    wanted, keys = _keys(clean, weathered)
-    order = np.argsort(wanted, kind="stable")
-    ordered = wanted[order]
-    if (twice := np.flatnonzero(ordered[1:] == ordered[:-1])).size:
-        row = int(order[twice[0]])
+    both = [pa.concat_arrays([clean[name], weathered[name]]) for name in _MOMENT]
+    moments = number_groups([column.dictionary_encode().indices.to_numpy() for column in both])
+    own, numbers = moments[: len(clean)], np.arange(len(clean))
+    row_of = np.full(moments.max(initial=-1) + 1, -1)
+    row_of[own] = numbers
+    if (twice := np.flatnonzero(row_of[own] != numbers)).size:
+        row = clean.row(int(twice[0]))
         raise ValueError(
-            f"scene {clean['scene'][row]!r}, frame {clean['frame'][row]}, camera "
-            f"{clean['camera'][row]!r} has more than one clean image; choose a variant: "
-            f"clean_frames(dataset, variant)"
+            f"scene {row['scene']!r}, frame {row['frame']}, camera {row['camera']!r} has more than "
+            f"one clean image; choose a variant: clean_frames(dataset, variant)"
         )
-    if not len(ordered):
-        return np.full(len(keys), -1)
-    place = np.searchsorted(ordered, keys).clip(max=len(ordered) - 1)
-    return np.where(ordered[place] == keys, order[place], -1)
-
-
-def _keys(one: Rows, other: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """A number for each row's scene, frame and camera, the same in both."""
-    keys, sizes = np.zeros(len(one) + len(other), np.int64), []
-    for name in ("scene", "frame", "camera"):
-        columns = one.coded(name), other.coded(name)
-        values = {
-            value: n for n, value in enumerate(dict.fromkeys(columns[0].values + columns[1].values))
-        }
-        codes = [
-            np.array([values[value] for value in column.values], np.int64)[column.codes]
-            for column in columns
-            if len(column)
-        ]
-        sizes.append(len(values))
-        keys = keys * len(values) + np.concatenate([np.zeros(0, np.int64), *codes])
-    assert math.prod(sizes) < 2**63
-    return keys[: len(one)], keys[len(one) :]
+    return row_of[moments[len(clean) :]]
 
 
 # ---- clips ---------------------------------------------------------------------------------------
@@ -416,72 +372,60 @@ class ClipDataset(Dataset):
         numbers = {"length": length, "step": step, "stride": stride}
         if min(numbers.values()) < 1:
             raise ValueError(f"length, step and stride must be >= 1; got {numbers}")
-        self.frames, self.length, self.transform = frames, length, transform
+        self.frames, self.transform = frames, transform
         self._runs = list(_runs(frames.rows, cameras))
-        reach = (length - 1) * step
-        # Of each clip: its run, and the place of its first frame there.
-        self._starts = np.array(
-            [
-                (number, start)
-                for number, run in enumerate(self._runs)
-                for start in range(0, len(run) - reach, stride)
-            ],
-            np.int64,
-        ).reshape(-1, 2)
         self._steps = np.arange(length) * step
+        # Of each clip: its run, and the place of its first frame there.
+        starts = [
+            (run, start)
+            for run in range(len(self._runs))
+            for start in range(0, len(self._runs[run]) - int(self._steps[-1]), stride)
+        ]
+        self._starts = np.array(starts, np.int64).reshape(-1, 2)
 
     def __len__(self) -> int:
         return len(self._starts)
 
     def __getitem__(self, index: int) -> Any:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"clip {index} of a dataset of {len(self)}")
-        clip = join_clip(list(self._frames(index)))
+        clip = join_clip([
+            # All cameras see the same sweep.
+            [self.frames.sample(row, without=("lidar",) if c else ()) for c, row in enumerate(rows)]
+            for rows in self.row_numbers(index).tolist()
+        ])  # fmt: skip
         return clip if self.transform is None else self.transform(clip)
 
     def row_numbers(self, index: int) -> np.ndarray:
         """int64 [T, C]: the numbers of the clip's images in `frames`."""
-        run, start = self._starts[index]
+        run, start = self._starts[check_index(index, len(self), "clip")]
         return self._runs[run][start + self._steps]
 
-    def _frames(self, index: int) -> Iterator[list[dict[str, Any]]]:
-        for rows in self.row_numbers(index):
-            # All cameras see the same sweep.
-            yield [
-                self.frames.sample(int(row), without=("lidar",) if number else ())
-                for number, row in enumerate(rows)
-            ]
 
-
-def join_clip(frames: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
     """Samples [T][C] as one clip."""
-    first = frames[0][0]
-    clip = {**first}
-    for key in ("image", *buffer_names()):
+    first = [frame[0] for frame in frames]
+    clip = dict(first[0])
+    for key in ("image", *buffers()):
         clip[key] = _joined([[sample[key] for sample in frame] for frame in frames])
-    clip["boxes"] = None if first["boxes"] is None else [_boxes(frame) for frame in frames]
-    clip["lidar"] = [frame[0]["lidar"] for frame in frames]
-    if all(sweep is None for sweep in clip["lidar"]):
-        clip["lidar"] = None
+    if clip["boxes"] is not None:
+        clip["boxes"] = [_boxes([sample["boxes"] for sample in frame]) for frame in frames]
+    sweeps = [sample["lidar"] for sample in first]
+    clip["lidar"] = None if all(sweep is None for sweep in sweeps) else sweeps
     clip["camera"] = _cameras([[sample["camera"] for sample in frame] for frame in frames])
     clip["paths"] = [[sample["paths"] for sample in frame] for frame in frames]
-    clip["frame"] = torch.tensor([frame[0]["frame"] for frame in frames])
+    clip["frame"] = torch.tensor([sample["frame"] for sample in first])
     return clip
 
 
 def _joined(values: list[list[Any]]) -> Any:
     """[T][C] tensors as one; None where there are only None; else the lists."""
-    flat = [value for frame in values for value in frame]
-    if all(value is None for value in flat):
-        return None
-    if any(value is None for value in flat) or len({value.shape for value in flat}) > 1:
-        return values
-    return torch.stack(flat).unflatten(0, (len(values), -1))
+    joined = stack_alike([value for frame in values for value in frame])
+    if isinstance(joined, torch.Tensor):
+        return joined.unflatten(0, (len(values), -1))
+    return None if joined is None else values
 
 
-def _boxes(frame: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _boxes(every: list[dict[str, Any]]) -> dict[str, Any]:
     """A frame's boxes: what does not depend on the image once, the rest for every camera."""
-    every = [sample["boxes"] for sample in frame]
     once = _PER_FRAME if every[0]["frame"] == "camera" else (*_PER_FRAME, *_PLACED)
     return {
         key: value if key in once or value is None else torch.stack([b[key] for b in every])
@@ -490,42 +434,30 @@ def _boxes(frame: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _cameras(cameras: list[list[Mapping[str, Any]]]) -> dict[str, Any]:
-    first = cameras[0]
-    whole = {
-        key: torch.tensor([[camera[key] for camera in frame] for frame in cameras])
-        for key in ("width", "height", "timestamp_ns")
-    }
-    return {
-        "name": [camera["name"] for camera in first],
-        **whole,
-        "K": _joined([[camera["K"] for camera in frame] for frame in cameras]),
-        "world_from_camera": _joined([[c["world_from_camera"] for c in f] for f in cameras]),
-        "world_from_ego": torch.stack([frame[0]["world_from_ego"] for frame in cameras]),
-    }
+    joined = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
+    ego = joined["world_from_ego"][:, 0]
+    return {**joined, "name": joined["name"][0], "world_from_ego": ego}
 
 
 def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
     """Row numbers int64 [F, C] of frames that follow each other without a gap."""
-    column, frames, times = (
-        rows.coded("camera"),
-        rows.numbers("frame"),
-        rows.numbers("timestamp_ns"),
-    )
-    known = {column.values[code]: int(code) for code in np.unique(column.codes)}
+    camera, names = rows.codes("camera")
+    frames, times = rows.numbers("frame"), rows.numbers("timestamp_ns")
+    known = {names[code]: code for code in np.unique(camera)}
     if cameras is not None and (unknown := [name for name in cameras if name not in known]):
         raise ValueError(f"no camera {unknown}; there are {', '.join(known) or 'none'}")
-    asked = None if cameras is None else [known[name] for name in cameras]
+    asked = None if cameras is None else np.array([known[name] for name in cameras], camera.dtype)
     for numbers in _by_variant(rows):
-        codes = column.codes[numbers]
-        wanted = np.unique(codes) if asked is None else np.array(asked, codes.dtype)
+        codes = camera[numbers]
+        wanted = np.unique(codes) if asked is None else asked
         yield from _runs_of(numbers, frames[numbers], times[numbers], codes, wanted)
 
 
 def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
     """The numbers of the rows of each scene under each variant, in the order of the rows."""
-    keys = rows.variants()[1]
-    order = np.argsort(keys, kind="stable")
-    yield from np.split(order, np.flatnonzero(np.diff(keys[order])) + 1) if len(order) else ()
+    group = rows.groups()[1]
+    order = np.argsort(group, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else ()
 
 
 def _runs_of(

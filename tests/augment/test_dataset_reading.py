@@ -16,7 +16,6 @@ from dataset_folders import CLEAR, FLOODED, FOGGY, MemoryStore, assert_same_samp
 from torch.utils.data import DataLoader
 
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
-from augment.dataset import weather_dataset as rows
 from augment.dataset.weather_dataset import Rows
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat, transform_points
@@ -80,9 +79,10 @@ def test_remote_samples_in_workers(written: Path, remote: MemoryStore) -> None:
     ],
 )
 def test_damaged_remote_files_are_named(remote: MemoryStore, name, data, message) -> None:
-    remote.delete([f"street/clear-000/{name}"])
+    path = f"street/{name}" if "lidar" in name else f"street/clear-000/{name}"
+    remote.delete([path])
     if data is not None:
-        remote.write(f"street/clear-000/{name}", data)
+        remote.write(path, data)
     dataset = WeatherDataset(remote, variants=["clear-000"], frames=[1], load=ALL)
     with pytest.raises(OutputError, match=message):
         dataset[0]
@@ -199,35 +199,27 @@ def test_odd_paths_are_refused(remote: MemoryStore, tmp_path: Path, path: str) -
         WeatherDataset(tmp_path)[0]
 
 
-def test_packed_rows_are_the_manifests(written: Path, monkeypatch) -> None:
-    table = pq.read_table(written / MANIFEST)
-    for most in (2, 1 << 16):  # numbers packed as such, or by their distinct values
-        monkeypatch.setattr(rows, "_MAX_CODES", most)
-        packed = Rows.of(table)
-        assert same_tables(packed.to_arrow(), table) and len(packed) == 24
-        chosen = packed.take(np.array([5, 3, 3]))
-        assert same_tables(chosen.to_arrow(), table.take([5, 3, 3]))
-        assert chosen["image_path"][1] == table["image_path"][3].as_py()
-        assert chosen["timestamp_ns"][0] == table["timestamp_ns"][5].as_py()
-        assert packed.coded("frame").codes.dtype == np.uint8
-        np.testing.assert_array_equal(packed.numbers("frame"), table["frame"].to_numpy())
-    assert same_tables(Rows.of(table.slice(0, 0)).to_arrow(), table.slice(0, 0))
-    with pytest.raises(TypeError, match="'scene' holds string, not numbers"):
-        packed.numbers("scene")
-    with pytest.raises(TypeError, match="'image_path' holds Paths, not names"):
-        packed.coded("image_path")
-
-
 @pytest.mark.parametrize("checksums", [["ab" * 32, "A" * 64], ["ab" * 32, None], ["x", "ab" * 32]])
-def test_checksums_of_any_kind_are_kept(checksums) -> None:
-    nan = float("nan")
+def test_columns_are_the_manifests(written: Path, checksums) -> None:
+    """Also those with more values than codes of 16 bits, or checksums of another kind."""
+    whole = WeatherDataset(written).rows
+    table = pq.read_table(written / MANIFEST)
+    assert same_tables(whole.to_arrow(), table) and repr(whole.row(5)) == repr(table.to_pylist()[5])
+    chosen = whole.take(np.array([5, 3, -1]))
+    assert same_tables(chosen.to_arrow(), table.take([5, 3, 23]))
+    assert len(pickle.dumps(chosen)) < 2 * len(pickle.dumps(whole)) < 40_000
+
+    count = 70_000
     columns = {
-        "checksum": pa.array(checksums, pa.string()),
-        "image_path": pa.array(["a/b.png", "c\nd/e"], pa.string()),
-        "snow_depth_m": pa.array([nan, nan]),
+        "checksum": pa.array(checksums * (count // 2), pa.string()),
+        "image_path": pa.array(["a/b.png", None, "c\nd/e", "f"] * (count // 4), pa.string()),
+        "timestamp_ns": pa.array(range(count)),
+        "status": pa.array([f"{k}" for k in range(count)]),
+        "snow_depth_m": pa.array([float("nan")] * count),
     }
-    table = pa.concat_tables([pa.table(columns).slice(0, 1), pa.table(columns).slice(1)])
-    again = Rows.of(table).to_arrow()
-    for name in ("checksum", "image_path"):
-        assert again[name].to_pylist() == table[name].to_pylist()
-    assert np.isnan(again["snow_depth_m"].to_numpy()).all()
+    half = pa.table(columns).slice(0, 9)
+    table = pa.concat_tables([half, pa.table(columns).slice(9)])
+    rows = Rows.of(table)
+    assert same_tables(rows.to_arrow(), table)
+    assert repr(rows.row(2)) == repr(table.slice(2, 1).to_pylist()[0])
+    assert same_tables(Rows.of(table.slice(0, 0)).to_arrow(), table.slice(0, 0))

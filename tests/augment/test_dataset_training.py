@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections import Counter
 from pathlib import Path
@@ -25,7 +24,7 @@ from augment.dataset import (
     collate_frames,
     split_by_scene,
 )
-from augment.dataset.weather_dataset import Numbers
+from augment.dataset.weather_dataset import Rows
 
 FRAMES = 6
 
@@ -88,8 +87,8 @@ def test_splits_of_datasets(written: Path) -> None:
 
 
 def frames_of(clips: ClipDataset) -> list[list[int]]:
-    frame = clips.frames.rows["frame"]
-    return [[frame[int(row)] for row in clips.row_numbers(k)[:, 0]] for k in range(len(clips))]
+    frames = clips.frames.table["frame"].to_numpy()
+    return [frames[clips.row_numbers(k)[:, 0]].tolist() for k in range(len(clips))]
 
 
 def test_clips_are_the_samples_of_their_frames(written: Path) -> None:
@@ -155,10 +154,11 @@ def test_clips_never_span_gaps(written: Path) -> None:
 
 def test_clips_never_span_a_pause(written: Path) -> None:
     one = WeatherDataset(written, scenes=["alley"])
-    times = one.rows.numbers("timestamp_ns").copy()
-    times[one.rows.numbers("frame") >= 4] += 300_000_000
-    columns = {**one.rows.columns, "timestamp_ns": Numbers(times)}
-    one.rows = dataclasses.replace(one.rows, columns=columns)
+    table = one.table
+    late_ns = 300_000_000 * (table["frame"].to_numpy() >= 4)
+    times = pa.array(table["timestamp_ns"].to_numpy() + late_ns)
+    place = table.column_names.index("timestamp_ns")
+    one.rows = Rows.of(table.set_column(place, "timestamp_ns", times))
     assert frames_of(ClipDataset(one, 2)) == [[0, 1], [1, 2], [2, 3], [4, 5]]
 
 
@@ -223,17 +223,18 @@ def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
     mixed = MixedDataset(clean, weathered, 0.5, seed=1)
     assert len(mixed) == len(clean) == 24
     drawn: Counter[str] = Counter()
+    of_clean, of_weathered = clean.table.to_pylist(), weathered.table.to_pylist()
     for epoch in range(40):
         mixed.set_epoch(epoch)
         for index in range(24):
             row = mixed.weathered_row(index)
-            if clean.rows["scene"][index] == "street" and clean.rows["frame"][index] < 5:
-                drawn["clear-000" if row is None else weathered.rows["variant"][row]] += 1
+            if of_clean[index]["scene"] == "street" and of_clean[index]["frame"] < 5:
+                drawn["clear-000" if row is None else of_weathered[row]["variant"]] += 1
             else:
                 assert row is None
             if row is not None:
                 for name in ("scene", "frame", "camera"):
-                    assert weathered.rows[name][row] == clean.rows[name][index]
+                    assert of_weathered[row][name] == of_clean[index][name]
     # 400 draws; four standard deviations.
     assert abs(drawn["clear-000"] - 200) < 40 and abs(drawn["fog-000"] - 100) < 35
     mixed.set_epoch(3)

@@ -1,0 +1,190 @@
+"""Boxes as images show them, and samples in the shape that detectors are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from augment.boxes import PlacedBoxes, outline_boxes, shown_pixels
+from augment.cameras import Camera
+from augment.dataset.samples import buffers, check_choice, moved_points, turned_quats
+from augment.geometry import invert_rigid, rotmat_from_quat
+from augment.labels import Boxes
+from augment.semantics import class_of_label
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes2d:
+    """Boxes in the image. xyxy: float32 [B, 4], pixels, left, top, right, bottom, inside the image
+    (0 to its width and height; the first pixel's centre is at 0.5); zeros of boxes out of view.
+    in_view: bool [B], whether any of the box lies in the image, hidden by others or not.
+    """
+
+    xyxy: torch.Tensor
+    in_view: torch.Tensor
+
+
+def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
+    """A sample's boxes as the image shows them: bounds of what lies inside the image, tight. They
+    enclose the projected box cut off at the image's borders, not the projected corners, whose
+    bounds are wider for a box that a border cuts. Weather and what hides a box change nothing. A
+    box whose numbers are not finite is out of view. Raises ValueError: the sample has no boxes.
+    """
+    boxes, camera = sample["boxes"], sample["camera"]
+    if boxes is None:
+        raise ValueError(
+            f"scene {sample['scene']!r}, frame {sample['frame']}: the sample has no boxes; open "
+            f"the dataset with 'boxes' in load, of a variant whose recipe writes labels"
+        )
+    centers_m, quats = boxes_in_camera(boxes, camera)
+    rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()  # NaN of quaternions of zeros
+    size = (camera["width"], camera["height"])
+    outlines = outline_boxes(
+        centers_m, boxes["sizes_m"].numpy(), rotations, camera["K"].numpy(), size
+    )
+    return Boxes2d(
+        torch.from_numpy(outlines.xyxy.astype(np.float32)), torch.from_numpy(outlines.in_view)
+    )
+
+
+def boxes_in_camera(
+    boxes: Mapping[str, Any], camera: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """centers_m [B, 3] and quats [B, 4] of a sample's boxes in its camera's frame, float64,
+    whatever frame they are in.
+    """
+    centers_m, quats = boxes["centers_m"].numpy(), boxes["quats"].numpy()
+    if boxes["frame"] == "camera":
+        return centers_m, quats
+    frame_from_camera = camera["world_from_camera"].numpy()
+    if boxes["frame"] == "ego":
+        frame_from_camera = invert_rigid(camera["world_from_ego"]).numpy() @ frame_from_camera
+    return moved_points(centers_m, frame_from_camera), turned_quats(quats, frame_from_camera)
+
+
+# ---- Samples in the shape that torchvision's detectors and transforms (v2) take ------------------
+
+Bounds = Literal["amodal", "modal"]
+
+
+def torchvision_sample(
+    sample: Mapping[str, Any],
+    *,
+    label_ids: Mapping[str, int] | Callable[[str], int] = class_of_label,
+    masks: bool = False,
+    bounds: Bounds = "amodal",
+    min_visible_fraction: float = 0.0,
+    min_visibility: float = 0.0,
+    min_side_px: float = 1.0,
+    min_pixels: int = 1,
+) -> tuple[torch.Tensor, dict[str, Any]]:
+    """(image, target) of a sample, for `WeatherDataset(transform=torchvision_sample)`.
+
+    The image is [3, H, W] of the sample's type. The target holds, of the N boxes that are kept:
+
+        boxes             float32 [N, 4], pixels, xyxy, cut off at the image's borders: amodal, of
+                          the whole box (`boxes_2d`), or modal, of the pixels that show it
+        labels            int64 [N], by label_ids: `SemanticClass` by default (vehicles are 10);
+                          boxes of labels that a mapping lacks are left out
+        visible_fraction  float64 [N], of each what nothing before it hides (NaN: not known), if the
+                          sample has it
+        visibility        float64 [N], what the weather leaves of each
+        track_ids         list of N
+        masks             bool [N, H, W], if asked for: the pixels that show each box, by depth
+        depth, semantic, instance, water, snow   [H, W], those that the sample has
+        frame, scene, variant
+
+    Kept are boxes in view with sides of min_side_px at least, of which min_visible_fraction at
+    least is not hidden by other things and min_visibility not by weather; with modal bounds, those
+    that a pixel shows; with masks, those that min_pixels at least show. Where torchvision is
+    installed, image, boxes and masks are its `tv_tensors`, so that its transforms move them
+    together; depth too is a `Mask`, which transforms never blend. Else they are plain tensors.
+
+    Raises:
+        ValueError: the sample has no image or boxes, or lacks the depth that masks need, or what
+            modal bounds and min_visible_fraction need.
+    """
+    if sample["image"] is None:
+        raise ValueError("the sample has no image; open the dataset with 'image' in load")
+    check_choice("bounds", bounds, Bounds)
+    flat, boxes = boxes_2d(sample), sample["boxes"]
+    visible = boxes["visible_fraction"]
+    if visible is None and (bounds == "modal" or min_visible_fraction > 0):
+        raise ValueError(
+            f"modal bounds and min_visible_fraction need what labels/boxes_2d.parquet says; scene "
+            f"{sample['scene']!r}, variant {sample['variant']!r}, frame {sample['frame']} is of an "
+            f"output without it: overwrite the variant, or take amodal bounds and no threshold"
+        )
+    xyxy = boxes["modal_xyxy"] if bounds == "modal" else flat.xyxy
+    find_id = label_ids.get if isinstance(label_ids, Mapping) else label_ids
+    ids = [find_id(label) for label in boxes["labels"]]
+    kept = flat.in_view & (boxes["visibility"] >= min_visibility) & xyxy.isfinite().all(dim=1)
+    kept &= (xyxy[:, 2:] - xyxy[:, :2] >= min_side_px).all(dim=1)
+    kept &= torch.tensor([number is not None for number in ids], dtype=torch.bool)
+    if (
+        visible is not None and min_visible_fraction > 0
+    ):  # where it is not known (NaN), the box is left out
+        kept &= visible >= min_visible_fraction
+    shown = box_masks(sample) if masks else None
+    if shown is not None:
+        kept &= shown.flatten(1).sum(dim=1) >= min_pixels
+    chosen = kept.nonzero()[:, 0]
+    wrap = _wrappers(tuple(sample["image"].shape[-2:]))
+    target: dict[str, Any] = {
+        "boxes": wrap["boxes"](xyxy[chosen]),
+        "labels": torch.tensor([ids[k] for k in chosen.tolist()], dtype=torch.int64),
+        "visibility": boxes["visibility"][chosen],
+        "track_ids": [boxes["track_ids"][k] for k in chosen.tolist()],
+        **{key: sample[key] for key in ("frame", "scene", "variant")},
+    }
+    if visible is not None:
+        target["visible_fraction"] = visible[chosen]
+    if shown is not None:
+        target["masks"] = wrap["mask"](shown[chosen])
+    target |= {k: wrap["mask"](sample[k]) for k in buffers() if sample[k] is not None}
+    return wrap["image"](sample["image"]), target
+
+
+def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
+    """bool [B, H, W]: the pixels that show each of a sample's boxes. A pixel does if the surface of
+    the depth image there lies inside the box, its lowest centimetres left out and the other sides
+    10 cm wider (`augment.boxes`); so what hides a box is not in its mask. Where boxes overlap a
+    pixel is in both. Raises ValueError: the sample has no boxes or no depth.
+    """
+    boxes, depth, camera = sample["boxes"], sample["depth"], sample["camera"]
+    if boxes is None or depth is None:
+        raise ValueError(
+            f"masks need boxes and depth; the sample of scene {sample['scene']!r}, frame "
+            f"{sample['frame']} lacks {'boxes' if boxes is None else 'depth'}"
+        )
+    K = camera["K"].numpy()
+    view = Camera(
+        camera["name"], camera["width"], camera["height"], K[0, 0], K[1, 1], K[0, 2], K[1, 2],
+        torch.eye(4, dtype=torch.float64),
+    )  # fmt: skip
+    centers_m, quats = boxes_in_camera(boxes, camera)
+    names = tuple(boxes["track_ids"])
+    there = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)
+    masks = np.zeros((len(names), camera["height"], camera["width"]), bool)
+    for number, rows, columns in shown_pixels(
+        PlacedBoxes.of(there, np.zeros(3)), view, depth.numpy()
+    ):
+        masks[number, rows, columns] = True
+    return torch.from_numpy(masks)
+
+
+def _wrappers(size: tuple[int, ...]) -> dict[str, Callable[[torch.Tensor], torch.Tensor]]:
+    """What makes torchvision's kinds of tensors, or leaves them as they are. size: (H, W)."""
+    try:
+        from torchvision import tv_tensors  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return dict.fromkeys(("image", "boxes", "mask"), lambda tensor: tensor)
+    return {
+        "image": tv_tensors.Image,
+        "boxes": lambda xyxy: tv_tensors.BoundingBoxes(xyxy, format="XYXY", canvas_size=size),
+        "mask": tv_tensors.Mask,
+    }

@@ -1,0 +1,175 @@
+"""The dataset that renders a scene under one recipe when a sample is asked for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from augment.cameras import Camera, Frame
+from augment.dataset.samples import (
+    BoxFrame,
+    ImageType,
+    Labels,
+    Sample,
+    SampleOptions,
+    check_index,
+    make_sample,
+)
+from augment.effects import Sharing, share_effects
+from augment.errors import BackendUnavailable
+from augment.jobs.files import (
+    SceneIndex,
+    View,
+    camera_record,
+    check_view,
+    decode_image,
+    encode_image,
+    label_view,
+    quantise_depth,
+    select_frames,
+    uses_boxes,
+)
+from augment.jobs.layout import path_kinds, variant_name
+from augment.jobs.processes import choose_backend
+from augment.jobs.quality import resolve_quality
+from augment.jobs.worker import Renderer, default_renderer
+from augment.memo import memo_of
+from augment.render.buffers import CUDA
+from augment.scene import Scene
+from recipes.files import with_digest
+from recipes.schema import Recipe
+
+_FORKED = (
+    "backend 'cuda' cannot render in a forked process, which the GPU does not answer: give the "
+    "DataLoader num_workers=0 or multiprocessing_context='spawn', or take backend 'cpu'"
+)
+
+
+class SceneDataset(Dataset):
+    """The samples that `WeatherDataset` would read after a job, without writing anything.
+
+    The pixels are those of the files: depth is in steps of 1/256 m, and where the recipe writes
+    JPEG the image passes through JPEG in memory. `paths` holds only None.
+
+    What all images share (where snow can lie, the maps of a style) is found here, once for all
+    samples and worker processes. So are the settings of a recipe whose quality has still to choose
+    them: `recipe` has them in numbers.
+
+    scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`;
+    "auto" never takes a GPU, which processes that a DataLoader forks could not use. "cuda" is for
+    samples of this process, or of workers that are started afresh (`spawn`).
+    renderer: `augment.views.render_view` if None. load, box_frame, transform: as for
+    `WeatherDataset`; a live scene passes no sweeps on.
+
+    Raises:
+        SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow.
+        RecipeError, StyleError: a file of the recipe's style cannot be used.
+        BackendUnavailable: the backend.
+        ValueError: the backend, or an unknown option.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        *,
+        frames: Sequence[int] | None = None,
+        cameras: Sequence[str] | None = None,
+        backend: str = "auto",
+        image_type: ImageType = "float32",
+        renderer: Renderer | None = None,
+        load: Collection[str] | None = None,
+        box_frame: BoxFrame = "world",
+        transform: Callable[[Sample], Any] | None = None,
+    ) -> None:
+        self.options = SampleOptions.checked(image_type, load, box_frame)
+        if load is not None and "lidar" in load:
+            raise ValueError(
+                "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
+                "and read it with WeatherDataset"
+            )
+        self.scene, self.transform = scene, transform
+        self._backend = choose_backend(backend, scene, gpu=False) if renderer is None else backend
+        self._process = os.getpid()
+        chosen = resolve_quality(
+            with_digest(recipe), scene, backend=self._backend, renderer=renderer
+        )
+        self.recipe = chosen.recipe
+        self._renderer = renderer or default_renderer()
+        self._index = SceneIndex.of(scene)
+        selection = select_frames(self._index, frames, cameras)
+        self._items = [(frame, name) for frame, names in selection for name in names]
+        share_effects(Sharing(scene, [self.recipe], backend=self._backend))
+        self._memo = memo_of(scene).shared()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In another process the scene is another object, whose memo is empty."""
+        self.__dict__.update(state)
+        self._process = os.getpid()
+        memo_of(self.scene).update(self._memo)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __getitem__(self, index: int) -> Any:
+        sample = self._render(*self._items[check_index(index, len(self))])
+        return sample if self.transform is None else self.transform(sample)
+
+    def _render(self, frame: Frame, name: str) -> Sample:
+        recipe, origin_m = self.recipe, self._index.world_origin_m
+        if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
+            raise BackendUnavailable(_FORKED)
+        view = self._renderer(self.scene, frame.cameras[name], recipe, backend=self._backend)
+        camera = frame.cameras[name].scaled(recipe.render.scale)
+        check_view(view, camera, recipe)
+        view, labels = self._label(frame, camera, view)
+        world_from_ego = frame.world_from_ego.clone()
+        world_from_ego[:3, 3] += torch.from_numpy(origin_m)
+        return make_sample(
+            options=self.options,
+            images=self._images(view),
+            camera=camera_record(camera, origin_m),
+            world_from_ego=world_from_ego,
+            labels=labels,
+            described={
+                "weather": {n: v for n, v in recipe.columns().items() if isinstance(v, float)},
+                "paths": dict.fromkeys(path_kinds()),
+                "scene": self.scene.name,
+                "variant": variant_name(recipe),
+                "frame": frame.index,
+                "recipe_hash": recipe.hash,
+                "surface": recipe.output.surface,
+            },
+        )
+
+    def _images(self, view: View) -> dict[str, np.ndarray]:
+        """What of a view the samples hold, as files would."""
+        output = self.recipe.output
+        found = {"semantic": view.semantic, "instance": view.instance, **view.masks}
+        if "image" in self.options.load:
+            is_exact = output.image == "png"
+            found["image"] = view.rgb if is_exact else decode_image(encode_image(view.rgb, output))
+        if view.depth_m is not None:
+            found["depth"] = quantise_depth(view.depth_m)
+        return {k: v for k, v in found.items() if k in self.options.load and v is not None}
+
+    def _label(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
+        """A view with the boxes of its frame, and these as the files of a job would have them.
+        camera: as written.
+        """
+        load, recipe, index = self.options.load, self.recipe, self._index
+        requested = uses_boxes(recipe) and ("boxes" in load or "instance" in load)
+        if not requested or frame.index not in index.labelled:
+            return view, Labels()
+        boxes = self.scene.boxes(frame.index)
+        view, measured = label_view(
+            boxes, index.instances, index.world_origin_m, camera, view, recipe
+        )
+        if not (recipe.output.labels and "boxes" in load):
+            return view, Labels()
+        return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))
