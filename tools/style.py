@@ -26,19 +26,20 @@ from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussi
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.losses import FeatureExtractor, open_features
 from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
-from augment.effects.style.scores import DEFINITIONS, score_photos, score_training
 from augment.effects.style.style import SceneStyle, style_maps
 from augment.effects.style.train import (
+    DEFINITIONS,
     Content,
     Draw,
     StepRecord,
     StyleTrainer,
     TrainingPool,
-    fixed_threads,
     generator_for,
     new_network,
     read_photos,
     scene_contents,
+    score_photos,
+    score_training,
 )
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import save_scene
@@ -129,7 +130,7 @@ class _Run(NamedTuple):
 
 
 def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
-    _take_device(options.device)
+    _check_device(options.device)
     data = _open_data(options)
     for problem in data.problems:
         print_note(f"note: {problem}")
@@ -149,29 +150,23 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     return _Run(training, features, data)
 
 
-def _take_device(device: str) -> None:
-    """Make it the current one, on which the renderer's kernels run, too."""
+def _check_device(device: str) -> None:
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:  # of torch without CUDA
         reason = str(error).splitlines()[0]
         raise ClimateGSError(f"--device {device}: {reason}; train on cpu, or cuda") from error
-    place = torch.device(device)
-    if place.type == "cuda" and place.index is not None:
-        torch.cuda.set_device(place)
 
 
 def _open_data(options: StyleTrainOptions) -> _Data:
-    size = options.picture_px
+    size_px, device = options.settings()["size_px"], options.device
     views: list[Content] = []
     problems: list[str] = []
     for uri in options.scenes:
         scene = open_scene(uri)
-        views += scene_contents(
-            scene, options.views, size, with_parts=options.through == "renderer", seed=options.seed
-        )
+        views += scene_contents(scene, options.views, size_px, seed=options.seed, device=device)
         problems += scene.problems
-    photos = read_photos(options.photos, size, holdout=options.holdout)
+    photos = read_photos(options.photos, size_px, holdout=options.holdout)
     facts = {
         "views": len(views),
         "views_sha256": _digest(view.picture for view in views),
@@ -180,42 +175,41 @@ def _open_data(options: StyleTrainOptions) -> _Data:
         "held_out_photos": len(photos.held_out),
         "held_out_sha256": _digest([photos.held_out]),
     }
-    pool = TrainingPool(tuple(views), photos.train).to(options.device)  # once, for all trainers
+    pool = TrainingPool(views, photos.train.to(device))
     # Networks are scored by held-out photos where there are any, and the scenes' views.
-    held_out = photos.held_out.to(options.device)
-    scored_pool = TrainingPool(pool.views, held_out) if len(held_out) else pool
-    scored = scored_pool.draw(
-        generator_for(0, 0, "scores"),  # whatever the seed: trainings are compared by them
-        SCORED,
-        scene_share=options.scene_share,
-        perturbed=0.5,
-        colors=1,
-    )
+    held_out = photos.held_out.to(device)
+    scored_pool = TrainingPool(views, held_out) if len(held_out) else pool
+    # Whatever the seed: trainings are compared by them.
+    scored = scored_pool.draw(generator_for(0, 0, "scores"), SCORED)
     return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
 
 
 def _digest(pictures: Iterable[torch.Tensor]) -> str:
     found = hashlib.sha256()
     for picture in pictures:
-        found.update(picture.contiguous().numpy().tobytes())
+        found.update(picture.cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
 
 
 def _trainer(
     options: StyleTrainOptions, steps: int, pool: TrainingPool, features: FeatureExtractor
 ) -> StyleTrainer:
-    net = new_network(options.encoder, offset=options.matrix == "3x4", seed=options.seed)
+    net = new_network(options.encoder, seed=options.seed)
     if options.encoder_weights is not None:
         assert isinstance(net.encoder, B0Encoder)
         load_imagenet_weights(net.encoder, options.encoder_weights)
-    config = options.config(steps)
+    weights = {name: getattr(options, name) for name in ("style", "consistency", "cycle", "pairs")}
     return StyleTrainer(
         net,
         pool,
-        config,
         features,
+        steps=steps,
+        seed=options.seed,
+        learning_rate=options.settings()["learning_rate"],
+        weights={**weights, "range": options.pair_range},
+        batch=options.batch,
+        pair_batch=options.pair_batch,
         frozen_norm=options.encoder_weights is not None,
-        device=options.device,
     )
 
 
@@ -223,7 +217,8 @@ def _estimate(
     options: StyleTrainOptions, budget_s: float, pool: TrainingPool, features: FeatureExtractor
 ) -> tuple[int, float]:
     """Steps that fill the time, and seconds of one with all losses, by a trainer thrown away."""
-    trainer = _trainer(dataclasses.replace(options, warm_up=0.0), 1000, pool, features)
+    trainer = _trainer(options, 1000, pool, features)
+    trainer.step = 500  # beyond the warm-up
     seconds: list[float] = []
     for _ in range(UNTIMED + TIMED):
         begun = time.perf_counter()
@@ -252,17 +247,16 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
         sums = training.sums
         return {"loss": f"{sums['loss'] / sums['steps']:.4f}"} if sums else {}
 
-    with fixed_threads():
-        return run_training(
-            training,
-            "train",
-            add=add,
-            score=lambda: training.add_row(**_scores(run)),
-            shown=shown,
-            write=lambda complete: _write(run, complete),
-            checkpoint_s=checkpoint_s,
-            progress=progress,
-        )
+    return run_training(
+        training,
+        "train",
+        add=add,
+        score=lambda: training.add_row(**_scores(run)),
+        shown=shown,
+        write=lambda complete: _write(run, complete),
+        checkpoint_s=checkpoint_s,
+        progress=progress,
+    )
 
 
 def _scores(run: _Run) -> dict[str, Any]:
@@ -281,7 +275,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "settings": plan.settings,
         "data": plan.data,
     }
-    save_network(options.out / NETWORK_FILE, net, about, half_precision=options.half_precision)
+    save_network(options.out / NETWORK_FILE, net, about)
     report = {
         **about,
         "complete": complete,

@@ -22,79 +22,52 @@ hold differences of colours, with its linear part alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from augment.effects.style.network import IMAGENET_MEAN, IMAGENET_STD, fill_network
 from augment.errors import StyleError
 from augment.files.checkpoints import read_state_dict
 
 # ---- Features of pictures whose means and deviations say what a picture's style is ---------------
 # The paper's layers of VGG-19, trained on ImageNet (Simonyan & Zisserman 2015), where the user has
 # the weights; else a bank of fixed filters, which knows colours and contrasts at several scales.
+# Both make of pictures [B, 3, H, W], display-encoded RGB about [0, 1], layers [B, C, h, w].
 
-Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
-
-
-@runtime_checkable
-class FeatureExtractor(Protocol):
-    """Pictures [B, 3, H, W], display-encoded RGB about [0, 1], become layers of features.
-
-    name: for reports.
-    """
-
-    name: str
-
-    def __call__(self, pictures: Float[Tensor, "B 3 H W"]) -> Features: ...
-
-    def to(self, device: str) -> FeatureExtractor: ...
-
-
-def open_features(weights: Path | None) -> FeatureExtractor:
-    """VGG-19 with weights from a file, or the bank of filters where None is given.
-
-    Raises:
-        StyleError: the file cannot be used; see `load_vgg19`.
-    """
-    return FilterBank() if weights is None else load_vgg19(weights)
-
+Features = tuple[Tensor, ...]
 
 # Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus whose outputs
 # are taken, by the numbers that torchvision gives them.
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512,))
 _TAKEN = {1: "relu1_1", 6: "relu2_1", 11: "relu3_1", 20: "relu4_1"}
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, in training
 MIN_SIDE_PX = 8  # three poolings leave one pixel of it
 
 
 class Vgg19(nn.Module):
-    """VGG-19 up to relu4_1, as a feature extractor without gradients of its own.
-
-    width: of its channels, relative to VGG-19's; other than 1 is for tests.
-    """
+    """VGG-19 up to relu4_1, without gradients of its own."""
 
     name = "VGG-19 relu1_1 to relu4_1"
 
-    def __init__(self, *, width: float = 1.0) -> None:
+    def __init__(self) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         channels = 3
         for number, block in enumerate(_BLOCKS):
             if number:
                 layers.append(nn.MaxPool2d(2))
-            for full_width in block:
-                out = max(1, round(full_width * width))
+            for out in block:
                 layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
                 channels = out
         self.features = nn.Sequential(*layers)
         self.mean, self.deviation = (
             nn.Buffer(torch.tensor(values)[:, None, None], persistent=False)
-            for values in (_MEAN, _DEVIATION)
+            for values in (IMAGENET_MEAN, IMAGENET_STD)
         )
         self.requires_grad_(False)
 
@@ -113,39 +86,6 @@ class Vgg19(nn.Module):
         return tuple(taken)
 
 
-def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
-    """VGG-19 with the weights of a .safetensors or .pth file that names them as torchvision does.
-
-    Layers beyond relu4_1, which such files hold too, are left out. A .pth file is read without
-    running what it may hold.
-
-    Raises:
-        StyleError: no such file, not one of these kinds, or tensors that are missing, of another
-            shape or dtype, or not finite; says which.
-    """
-    found = read_state_dict(path, StyleError)
-    network = Vgg19(width=width)
-    own = network.state_dict()
-    lacking = [name for name in own if name not in found]
-    if lacking:
-        raise StyleError(
-            f"{path} lacks {', '.join(lacking[:4])}{' ...' if len(lacking) > 4 else ''}: expected "
-            f"torchvision's names of VGG-19 (features.0.weight ...); it holds "
-            f"{', '.join(list(found)[:4]) or 'nothing'}"
-        )
-    for name, ours in own.items():
-        theirs = found[name]
-        if theirs.shape != ours.shape or not theirs.dtype.is_floating_point:
-            raise StyleError(
-                f"{path}: {name} must be floats {list(ours.shape)} for VGG-19 (without batch "
-                f"normalisation); got {theirs.dtype} {list(theirs.shape)}"
-            )
-        if not bool(torch.isfinite(theirs).all()):
-            raise StyleError(f"{path}: {name} holds NaN or infinite values")
-    network.load_state_dict({name: found[name].float() for name in own})
-    return network
-
-
 # Directions of RGB space. Deviations along six of them in general position determine a covariance:
 # luminance, red against green and blue against yellow; then the channels and their differences.
 _OPPONENT = (
@@ -162,9 +102,12 @@ _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)  # about a Gaussian of 1 px
 _CONTRAST_GAIN = 2.0  # of edges, which vary less than colours do: about as much deviation
 
 
-class FilterBank:
-    """A feature extractor that needs no weights: the levels of a Gaussian pyramid (Burt & Adelson
-    1983) from half the picture's size on, and at each a layer of colours and a layer of edges.
+LEVELS = 3
+
+
+class FilterBank(nn.Module):
+    """Needs no weights: the levels of a Gaussian pyramid (Burt & Adelson 1983) from half the
+    picture's size on, and at each a layer of colours and a layer of edges.
 
     Colours: the picture along eight directions of RGB space, three of them opponent colours. Edges:
     first derivatives along x, y and both diagonals (of the steerable family, Freeman & Adelson
@@ -174,24 +117,19 @@ class FilterBank:
 
     name = "bank of colour and edge filters"
 
-    def __init__(self, levels: int = 3) -> None:
-        self.levels = levels
-        self._directions = torch.tensor(_DIRECTIONS)
-        self._blur = torch.tensor(_BINOMIAL)
+    def __init__(self) -> None:
+        super().__init__()
+        self.directions = nn.Buffer(torch.tensor(_DIRECTIONS), persistent=False)
+        self.blur = nn.Buffer(torch.tensor(_BINOMIAL), persistent=False)
 
-    def to(self, device: str) -> FilterBank:
-        self._directions = self._directions.to(device)
-        self._blur = self._blur.to(device)
-        return self
-
-    def __call__(self, pictures: Float[Tensor, "B 3 H W"]) -> Features:
+    def forward(self, pictures: Float[Tensor, "B 3 H W"]) -> Features:
         taken: list[Tensor] = []
         level = pictures
-        for number in range(self.levels):
+        for number in range(LEVELS):
             level = self._halved(level)
             if number and min(level.shape[2:]) < 4:
                 break
-            colors = torch.einsum("kc,bchw->bkhw", self._directions.to(level.dtype), level)
+            colors = torch.einsum("kc,bchw->bkhw", self.directions.to(level.dtype), level)
             taken.append(colors)
             if min(level.shape[2:]) >= 2:
                 taken.append(_edges(colors[:, :3]))
@@ -200,7 +138,7 @@ class FilterBank:
     def _halved(self, x: Tensor) -> Tensor:
         """Blurred, every second pixel; borders are repeated."""
         channels = x.shape[1]
-        kernel = self._blur.to(x.dtype)
+        kernel = self.blur.to(x.dtype)
         across = kernel.expand(channels, 1, 1, 5)
         x = F.conv2d(F.pad(x, (2, 2, 0, 0), "replicate"), across, stride=(1, 2), groups=channels)
         x = F.pad(x, (0, 0, 2, 2), "replicate")
@@ -217,6 +155,27 @@ def _edges(x: Tensor) -> Tensor:
     return _CONTRAST_GAIN * torch.cat([slopes.relu(), (-slopes).relu()], 1)
 
 
+FeatureExtractor = Vgg19 | FilterBank
+
+
+def open_features(weights: Path | None) -> FeatureExtractor:
+    """VGG-19 with weights from a .safetensors or .pth file that names them as torchvision does
+    (layers beyond relu4_1 are left out), or the bank of filters where None is given.
+
+    Raises:
+        StyleError: the file cannot be read, or lacks a tensor, or it is of another shape or kind,
+            or not finite; says which.
+    """
+    if weights is None:
+        return FilterBank()
+    network = Vgg19()
+    hint = "expected torchvision's VGG-19 without batch normalisation (features.0.weight ...)"
+    fill_network(network, read_state_dict(weights, StyleError), weights, hint)
+    return network
+
+
+# ---- Colours under maps, and distances -----------------------------------------------------------
+
 MIN_VARIANCE = 1e-6  # under the root: a constant feature has a deviation with a gradient
 
 
@@ -230,20 +189,15 @@ class GaussianColors:
     base: Float[Tensor, "B N 3"]
     bands: Float[Tensor, "B N L 3"]
 
+    def to(self, device: str | torch.device) -> GaussianColors:
+        """The same on the device."""
+        return GaussianColors(self.base.to(device), self.bands.to(device))
+
     def mapped(self, maps: Float[Tensor, "B 3 4"]) -> GaussianColors:
         """The colours that maps, one an item, make of these."""
         linear = maps[:, :, :3].mT  # rows of colours are mapped from the right
         bands = self.bands @ linear[:, None] if self.bands.shape[2] else self.bands
         return GaussianColors(self.base @ linear + maps[:, None, :, 3], bands)
-
-
-class Transfer(NamedTuple):
-    """The maps of one training step, [B, 3, 4] each, in the module's letters: all are of Y_o."""
-
-    content: Tensor  # Z_c
-    styled: Tensor  # Y_s
-    returned: Tensor  # Z_s
-    cycled: Tensor  # Y_c
 
 
 def color_distance(first: GaussianColors, second: GaussianColors) -> Float[Tensor, ""]:
@@ -280,13 +234,13 @@ def moments(feature: Float[Tensor, "B C H W"]) -> tuple[Tensor, Tensor]:
     return mean, (variance + MIN_VARIANCE).sqrt()
 
 
-def weighted_sum(terms: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
+def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     """Of the terms that weigh something; the others may be anything.
 
     Raises:
-        ValueError: there are none.
+        StyleError: there are none.
     """
     parts = [weights[name] * term for name, term in terms.items() if weights.get(name)]
     if not parts:
-        raise ValueError(f"none of the losses {', '.join(terms)} weighs anything: {weights}")
+        raise StyleError(f"none of the losses {', '.join(terms)} weighs anything: {weights}")
     return torch.stack(parts).sum()

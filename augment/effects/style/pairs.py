@@ -1,4 +1,5 @@
-"""Pairs of a photo and a recoloured copy, and what a style network learns from them.
+"""Pairs of a photo and a recoloured copy: what a style network learns from them, and how well it,
+or a closed form, does on them.
 
 A recolouring is a change of colours that a camera, a light or a weather makes: exposure, white
 balance, contrast, saturation, hue, tint, gamma, a curve, an arbitrary linear part; some reach grey
@@ -14,18 +15,25 @@ right goes on counting. With N and S the folded stages of GSCM, x a photo, p its
     consistency  N(x) x = N(p x) p x: the paper's L_con
     cycle        S(x) N(x) x = x: the paper's L_cyc
     range        colours of photo x in the style of photo y that are not displayable
+
+Scores are PSNR of same, half and look, and of below: the lower half in the style of the upper one,
+which seldom has the same colours.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from augment.effects.style.network import Gscm, apply_map, compose
+from augment.effects.style.network import SIZE_PX, Gscm, apply_map, compose
+from augment.effects.style.statistics import ColorStatistics, mkl_map, statistics_of
 
 GREY = (0.2126, 0.7152, 0.0722)  # luma of sRGB's primaries (ITU-R BT.709)
 
@@ -78,8 +86,7 @@ class Recoloring:
         return torch.lerp(mapped, smooth, curve[:, None, None, None])
 
 
-@dataclass(frozen=True, eq=False)
-class PairBatch:
+class PairBatch(NamedTuple):
     """B photos, B others, and both under the same recolourings; float32 [B, 3, S, S] in [0, 1]."""
 
     photos: Float[Tensor, "B 3 S S"]
@@ -131,12 +138,7 @@ def recolor(
 
 
 def sample_pairs(
-    photos: Float[Tensor, "P 3 H W"],
-    generator: torch.Generator,
-    batch: int,
-    *,
-    size_px: int = 128,
-    settings: RecolorSettings = RecolorSettings(),
+    photos: Float[Tensor, "P 3 H W"], generator: torch.Generator, batch: int, size_px: int
 ) -> PairBatch:
     """A batch from photos in [0, 1], on their device; the same for the same state of the CPU's
     generator.
@@ -153,15 +155,15 @@ def sample_pairs(
         raise ValueError(f"pairs need at least 2 photos; got {count}")
     first = torch.randint(count, (batch,), generator=generator)
     second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
-    recoloring = sample_recolorings(batch, generator, settings)
+    recoloring = sample_recolorings(batch, generator)
     first, second = first.to(photos.device), second.to(photos.device)
-    one = _varied(_cut(photos[first], generator, size_px), generator, settings)
-    two = _varied(_cut(photos[second], generator, size_px), generator, settings)
+    one = _varied(_cut(photos[first], generator, size_px), generator)
+    two = _varied(_cut(photos[second], generator, size_px), generator)
     return PairBatch(one, recoloring(one), two, recoloring(two))
 
 
 def _varied(
-    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator, settings: RecolorSettings
+    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator
 ) -> Float[Tensor, "B 3 S S"]:
     """Half of the photos take a part, on the right or below, from the one before in the batch;
     then each is recoloured a little."""
@@ -173,8 +175,9 @@ def _varied(
     foreign = torch.where(below, beyond.transpose(1, 2), beyond)
     foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
     mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
-    little = {n: 0.0 if "share" in n else VARIED * v for n, v in vars(settings).items()}
-    return sample_recolorings(count, generator, RecolorSettings(**little))(mixed)
+    usual = vars(RecolorSettings()).items()
+    little = RecolorSettings(**{n: 0.0 if "share" in n else VARIED * v for n, v in usual})
+    return sample_recolorings(count, generator, little)(mixed)
 
 
 def _about_grey(
@@ -210,23 +213,14 @@ _ERROR_FLOOR = 1e-4  # mean square: nothing is gained beyond 40 dB
 _STRIDE_PX = 2  # of the pixels whose colours are compared
 
 
-@dataclass(frozen=True)
-class PairWeights:
-    """Of the losses in their sum."""
-
-    same: float = 1.0
-    half: float = 0.5
-    look: float = 1.0
-    consistency: float = 1.0
-    cycle: float = 1.0
-    range: float = 4.0
+# In their sum; that of the range is an option of the training.
+PAIR_WEIGHTS = {"same": 1.0, "half": 0.5, "look": 1.0, "consistency": 1.0, "cycle": 1.0}
 
 
 def pair_losses(net: Gscm, batch: PairBatch) -> dict[str, Float[Tensor, ""]]:
     """Each loss, by name, unweighted."""
     count, _, _, size = batch.photos.shape
-    parts = (batch.photos, batch.recolored, batch.others, batch.others_recolored)
-    pictures = dict(zip(("x", "px", "y", "py"), parts, strict=True))
+    pictures = dict(zip(("x", "px", "y", "py"), batch, strict=True))
     # The left half's style on the right half's colours.
     halves = {
         f"{side}{name}": functional.interpolate(part, (size, size), mode="bilinear")
@@ -260,11 +254,6 @@ def pair_losses(net: Gscm, batch: PairBatch) -> dict[str, Float[Tensor, ""]]:
     }
 
 
-def weighted(losses: dict[str, Tensor], weights: PairWeights) -> Float[Tensor, ""]:
-    """Their sum."""
-    return torch.stack([getattr(weights, name) * loss for name, loss in losses.items()]).sum()
-
-
 def _colors(pictures: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B N 3"]:
     return pictures[:, :, ::_STRIDE_PX, ::_STRIDE_PX].flatten(2).transpose(1, 2)
 
@@ -273,3 +262,75 @@ def _log_error(got: Float[Tensor, "B N 3"], target: Float[Tensor, "B N 3"]) -> F
     """Mean log of the mean square, of what a display would show."""
     square = (got.clamp(0, 1) - target).square().mean((1, 2))
     return (square + _ERROR_FLOOR).log().mean()
+
+
+# ---- Scores: a map of colours from a content and a style picture, on photographs -----------------
+
+# Contents and styles [3, H, W] each, in [0, 1], to the map of the content.
+Method = Callable[[Float[Tensor, "3 H W"], Float[Tensor, "3 A B"]], Float[Tensor, "3 4"]]
+Closed = Callable[[ColorStatistics, ColorStatistics], Float[Tensor, "3 4"]]
+
+
+def score_pairs(
+    method: Method, photos: Float[Tensor, "P 3 S S"], *, repeats: int
+) -> dict[str, float]:
+    """Means of PSNR (dB) by name, of each photo under `repeats` recolourings, always the same."""
+    count, half = len(photos), photos.shape[3] // 2
+    generator = torch.Generator().manual_seed(0)
+    found: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
+    for repeat in range(repeats):
+        all_of_them = sample_recolorings(count, generator)
+        for index, photo in enumerate(photos):
+            one = slice(index, index + 1)
+            look = Recoloring(all_of_them.maps[one], all_of_them.gamma[one], all_of_them.curve[one])
+            recolored = look(photo[None])[0]
+            other = look(photos[(index + 1 + repeat % (count - 1)) % count][None])[0]
+            for name, content, style, target in (
+                ("same", photo, recolored, recolored),
+                ("half", photo[:, :, half:], recolored[:, :, :half], recolored[:, :, half:]),
+                ("below", photo[:, half:], recolored[:, :half], recolored[:, half:]),
+                ("look", photo, other, recolored),
+            ):
+                mapped = mapped_picture(method(content, style), content).clamp(0, 1)
+                found[name].append(_psnr_db(mapped, target))
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def network_method(net: Gscm) -> Method:
+    """The network as a method; halves of pictures are squeezed to squares, as all are."""
+
+    def mapped(content: Tensor, style: Tensor) -> Tensor:
+        squares = [
+            functional.interpolate(p[None], (SIZE_PX, SIZE_PX), mode="bilinear", antialias=True)
+            for p in (content, style)
+        ]
+        with torch.no_grad():
+            f_c, f_s = net.encode(torch.cat(squares))
+            return compose(net.style_map(f_s[1:]), net.content_map(f_c[:1]))[0]
+
+    return mapped
+
+
+def closed_method(closed: Closed = mkl_map, strength: float = 1.0) -> Method:
+    """A closed form with the limits that recipes have, at a strength; 0 changes nothing."""
+
+    def mapped(content: Tensor, style: Tensor) -> Tensor:
+        pixels = (picture.flatten(1).T.numpy() for picture in (content, style))
+        from_content, to_style = map(statistics_of, pixels)
+        assert from_content is not None and to_style is not None  # every pixel weighs 1
+        return torch.lerp(torch.eye(3, 4), closed(from_content, to_style).float(), strength)
+
+    return mapped
+
+
+def mapped_picture(
+    color_map: Float[Tensor, "3 4"], picture: Float[Tensor, "3 H W"]
+) -> Float[Tensor, "3 H W"]:
+    """Not clamped."""
+    mapped = torch.einsum("ij,jhw->ihw", color_map[:, :3], picture)
+    return mapped + color_map[:, 3, None, None]
+
+
+def _psnr_db(got: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]) -> float:
+    square = float((got - target).square().mean())
+    return -10 * float(np.log10(max(square, 1e-6)))  # 60 dB at most: one black pair is no mean
