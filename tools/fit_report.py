@@ -8,7 +8,6 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,6 +35,7 @@ from recipes.schema import Recipe
 from tools.drawing import (
     color_bar,
     color_mapped,
+    evenly,
     log_ticks,
     resized,
     short_number,
@@ -123,7 +123,7 @@ def write_report(
         "mean": mean_scores(scores),
         "cameras": means_by_camera(scores),
         "training_sample": sample,
-        "views": [{"frame": s.key.frame, "camera": s.key.camera, **s.numbers()} for s in scores],
+        "views": [{"frame": s.key.frame, "camera": s.key.camera, **s.numbers} for s in scores],
         "history": list(history),
         "definitions": DEFINITIONS,
     }
@@ -152,20 +152,15 @@ def _spread(keys: Sequence[ViewKey], most: int) -> tuple[ViewKey, ...]:
     """At most so many of the views, of all cameras alike, evenly spread over each one's."""
     if len(keys) <= most:
         return tuple(keys)
-    cameras = dict.fromkeys(key.camera for key in keys)
-    each = max(1, most // len(cameras))
-    chosen = {
-        key
-        for name in cameras
-        for key in _evenly_spaced([key for key in keys if key.camera == name], each)
-    }
+    cameras = {key.camera for key in keys}
+    chosen = set(_of_each_camera(keys, cameras, max(1, most // len(cameras))))
     return tuple(key for key in keys if key in chosen)
 
 
-def _evenly_spaced(values: Sequence[Any], most: int) -> list[Any]:
-    """At most so many of them, from the middles of as many equal parts."""
-    count = min(most, len(values))
-    return [values[int((i + 0.5) / count * len(values))] for i in range(count)]
+def _of_each_camera(keys: Sequence[ViewKey], cameras: Iterable[str], most: int) -> list[ViewKey]:
+    return [
+        key for name in cameras for key in evenly([key for key in keys if key.camera == name], most)
+    ]
 
 
 def _write_pictures(
@@ -239,42 +234,18 @@ class RenderedView(NamedTuple):
     has_surface: np.ndarray
 
 
-@dataclass(frozen=True)
-class ViewScore:
-    """One view's render against its recording.
+class ViewScore(NamedTuple):
+    """One view's render against its recording: figures by the names that reports use, NaN where
+    nothing is known.
 
-    psnr (dB), ssim, flip over the pixels of weight > 0, which are the part `scored` of all; NaN
-    where there are none, and flip also where it was not asked for. median, expected: errors of
-    both depths over the pixels with a depth prior and a surface (alpha >= SURFACE_ALPHA), weighted
-    as the priors. no_surface: the part of the pixels with a prior that have none; NaN without
-    priors.
+    psnr (dB), ssim, flip: over the pixels of weight > 0, which are the part `scored` of all.
+    depth_*, expected_depth_*: errors of the median depth, as in files, and of the expected one,
+    over the pixels with a depth prior and a surface, weighted as the priors. no_surface: the part
+    of the pixels with a prior that have none.
     """
 
     key: ViewKey
-    psnr: float
-    ssim: float
-    flip: float
-    scored: float
-    median: DepthErrors
-    expected: DepthErrors
-    no_surface: float
-
-    def numbers(self) -> dict[str, float]:
-        """By the names that reports use; depth_* are those of the median depth, as in files."""
-        return {
-            "psnr": self.psnr,
-            "ssim": self.ssim,
-            "flip": self.flip,
-            "scored": self.scored,
-            "depth_median_m": self.median.median_m,
-            "depth_p90_m": self.median.p90_m,
-            "depth_abs_rel": self.median.abs_rel,
-            "depth_within_5cm": self.median.within_5cm,
-            "expected_depth_median_m": self.expected.median_m,
-            "expected_depth_p90_m": self.expected.p90_m,
-            "depth_pixels": float(self.median.pixels),
-            "no_surface": self.no_surface,
-        }
+    numbers: dict[str, float]
 
 
 def evaluate_views(
@@ -295,10 +266,10 @@ def evaluate_views(
 
 
 def mean_scores(scores: Iterable[ViewScore]) -> dict[str, float]:
-    """Means over the views by the names of `ViewScore.numbers`, each over the views that have a
+    """Means over the views by the names of `ViewScore`, each over the views that have a
     number; names that no view has one for are left out, as are infinite means (equal pictures).
     """
-    rows = [score.numbers() for score in scores]
+    rows = [score.numbers for score in scores]
     means: dict[str, float] = {}
     for name in rows[0] if rows else ():
         known = [row[name] for row in rows if not math.isnan(row[name])]
@@ -351,7 +322,7 @@ def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> V
     rendered = render_recorded(scene, _found_camera(scene, key, view.camera))
     counts = view.weight > 0
     scored = float(counts.mean())
-    numbers = {"psnr": math.nan, "ssim": math.nan, "flip": math.nan}
+    numbers = {"psnr": math.nan, "ssim": math.nan, "flip": math.nan, "scored": scored}
     if scored > 0:
         metrics = {"psnr": psnr, "ssim": ssim, **({"flip": flip} if with_flip else {})}
         weight = None if scored == 1 else counts
@@ -363,14 +334,18 @@ def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> V
         true_m, weight = view.depth_m[surface], view.depth_weight[surface]
         return depth_errors(depth_m.reshape(-1)[at[surface]], true_m, weight)
 
-    return ViewScore(
-        key=key,
-        **numbers,
-        scored=scored,
-        median=errors(rendered.median_depth_m),
-        expected=errors(rendered.expected_depth_m),
-        no_surface=float(1 - surface.mean()) if len(at) else math.nan,
-    )
+    median, expected = errors(rendered.median_depth_m), errors(rendered.expected_depth_m)
+    numbers |= {
+        "depth_median_m": median.median_m,
+        "depth_p90_m": median.p90_m,
+        "depth_abs_rel": median.abs_rel,
+        "depth_within_5cm": median.within_5cm,
+        "expected_depth_median_m": expected.median_m,
+        "expected_depth_p90_m": expected.p90_m,
+        "depth_pixels": float(median.pixels),
+        "no_surface": float(1 - surface.mean()) if len(at) else math.nan,
+    }
+    return ViewScore(key, numbers)
 
 
 class _Row(NamedTuple):
@@ -390,13 +365,10 @@ def choose_views(scores: Sequence[ViewScore]) -> list[ViewScore]:
 
     Of more cameras than that, the first ones.
     """
-    cameras = list(dict.fromkeys(score.key.camera for score in scores))[:MAX_ROWS]
+    by_key = {score.key: score for score in scores}
+    cameras = list(dict.fromkeys(key.camera for key in by_key))[:MAX_ROWS]
     each = max(1, min(MAX_OF_A_CAMERA, MAX_ROWS // max(1, len(cameras))))
-    return [
-        score
-        for camera in cameras
-        for score in _evenly_spaced([s for s in scores if s.key.camera == camera], each)
-    ]
+    return [by_key[key] for key in _of_each_camera(list(by_key), cameras, each)]
 
 
 def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) -> np.ndarray:
@@ -412,7 +384,7 @@ def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) ->
     for row, height in zip(rows, heights, strict=True):
         key, seen = row.score.key, row.depth_m > 0
         write(sheet, f"{key.camera}, frame {key.frame}", _EDGE, top + 24, size=0.6, color=_INK)
-        write(sheet, _figures(row.score, unit), _column(1), top + 24, size=0.5, color=_INK)
+        write(sheet, _figures(row.score.numbers, unit), _column(1), top + 24, size=0.5, color=_INK)
         # Near is red, far is blue.
         part = np.log(np.where(seen, row.depth_m, nearest) / nearest) / np.log(farthest / nearest)
         images = (
@@ -492,9 +464,8 @@ def _column(number: int) -> int:
     return _EDGE + number * (CELL_WIDTH + _GAP)
 
 
-def _figures(score: ViewScore, unit: str) -> str:
+def _figures(numbers: Mapping[str, float], unit: str) -> str:
     """The row's figures that are known, in one line."""
-    numbers = score.numbers()
     texts = {
         "psnr": "PSNR {:.2f} dB",
         "ssim": "SSIM {:.3f}",
@@ -502,34 +473,21 @@ def _figures(score: ViewScore, unit: str) -> str:
         "depth_median_m": f"depth error {{:.3f}}{unit} (median)",
         "depth_p90_m": f"{{:.2f}}{unit} (90 %)",
     }
-    return "     ".join(
-        text.format(numbers[name]) for name, text in texts.items() if not np.isnan(numbers[name])
-    )
+    known = {name: text for name, text in texts.items() if not math.isnan(numbers[name])}
+    return "     ".join(text.format(numbers[name]) for name, text in known.items())
 
 
-@dataclass(frozen=True)
-class TruthErrors:
-    """Depth errors over all pixels of a number of views whose true depth is known.
+def true_depth_errors(
+    scene: Scene, truth: StreetTruth, cameras: Sequence[Camera]
+) -> dict[str, Any]:
+    """Compare a scene's depth with the street's, over all pixels of cameras of the scene's own
+    world; the scene may have moved the origin (`world_origin_m`), as an adapter of recordings does.
 
-    median, expected: of both depths, over the pixels that truly show a surface and are rendered
-    with one. by_class: the median depth's, by the true class's name. no_surface: the part of the
-    true surface pixels that are rendered without one. sky_covered: the part of the true sky pixels
-    that are rendered with a surface; sky_alpha: their mean opacity. NaN where no pixel is meant.
-    """
-
-    views: int
-    median: DepthErrors
-    expected: DepthErrors
-    by_class: dict[str, DepthErrors]
-    no_surface: float
-    sky_covered: float
-    sky_alpha: float
-
-
-def true_depth_errors(scene: Scene, truth: StreetTruth, cameras: Sequence[Camera]) -> TruthErrors:
-    """Compare a scene's depth with the street's, through cameras of the scene's own world.
-
-    The scene may have moved the origin (`world_origin_m`), as an adapter of recordings does.
+    Of the result, median, expected: errors of both depths (see `DepthErrors`) over the pixels that
+    truly show a surface and are rendered with one. by_class: the median depth's, by the true
+    class's name. no_surface: the part of the true surface pixels that are rendered without one.
+    sky_covered: the part of the true sky pixels that are rendered with a surface; sky_alpha: their
+    mean opacity. NaN where no pixel is meant.
     """
     origin = torch.from_numpy(np.asarray(scene.world_origin_m, np.float64))
     scene_from_dataset = rigid(torch.eye(3, dtype=torch.float64), -origin)
@@ -542,6 +500,9 @@ def true_depth_errors(scene: Scene, truth: StreetTruth, cameras: Sequence[Camera
     def joined(images: Iterable[np.ndarray]) -> np.ndarray:
         return np.concatenate([image.reshape(-1) for image in images] or [np.zeros(0)])
 
+    def errors(depth_m: np.ndarray, pixels: np.ndarray) -> dict[str, Any]:
+        return dataclasses.asdict(depth_errors(depth_m[pixels], true_m[pixels]))
+
     surface = joined(seen.has_surface for seen, _ in views).astype(bool)
     median_m = joined(seen.median_depth_m for seen, _ in views)
     expected_m = joined(seen.expected_depth_m for seen, _ in views)
@@ -550,19 +511,18 @@ def true_depth_errors(scene: Scene, truth: StreetTruth, cameras: Sequence[Camera
     semantic = joined(true.semantic for _, true in views)
     is_sky = np.isinf(true_m)
     used = surface & ~is_sky
-    return TruthErrors(
-        views=len(views),
-        median=depth_errors(median_m[used], true_m[used]),
-        expected=depth_errors(expected_m[used], true_m[used]),
-        by_class={
-            SemanticClass(int(c)).name.lower(): depth_errors(median_m[own], true_m[own])
+    return {
+        "views": len(views),
+        "median": errors(median_m, used),
+        "expected": errors(expected_m, used),
+        "by_class": {
+            SemanticClass(int(c)).name.lower(): errors(median_m, used & (semantic == c))
             for c in np.unique(semantic[~is_sky])
-            for own in [used & (semantic == c)]
         },
-        no_surface=_part(~surface[~is_sky]),
-        sky_covered=_part(surface[is_sky]),
-        sky_alpha=_part(alpha[is_sky]),
-    )
+        "no_surface": _mean(~surface[~is_sky]),
+        "sky_covered": _mean(surface[is_sky]),
+        "sky_alpha": _mean(alpha[is_sky]),
+    }
 
 
 def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
@@ -577,8 +537,8 @@ def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
     truth = open_street(uri)
     keys = source.test or source.train
     chosen = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
-    errors = true_depth_errors(scene, truth, [source.camera(key) for key in chosen])
-    return {"street": uri, **dataclasses.asdict(errors)}
+    cameras = [source.camera(key) for key in chosen]
+    return {"street": uri, **true_depth_errors(scene, truth, cameras)}
 
 
 def truth_line(truth: Mapping[str, Any]) -> str:
@@ -608,5 +568,5 @@ def open_street(uri: str) -> StreetTruth:
     return open_truth(query)
 
 
-def _part(values: np.ndarray) -> float:
+def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
