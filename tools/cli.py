@@ -412,7 +412,7 @@ class ApplyOptions(Command):
         from tools.style import apply_style
 
         asked = dict(self)
-        write_json(asked.pop("json_file"), apply_style(**asked))
+        write_json(asked.pop("json_file"), apply_style(asked.pop("scene"), **asked))
         return 0
 
 

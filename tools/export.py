@@ -37,10 +37,10 @@ from augment.jobs.manifest import OK, read_manifest, rows_of
 from augment.jobs.mirror import (
     MIRROR_FOLDER,
     Links,
+    Shown,
     SourceTree,
     Survey,
     Weathered,
-    WeatheredSweep,
     check_disjoint,
     dataset_format,
     is_weathered,
@@ -53,7 +53,6 @@ from augment.jobs.mirror import (
 )
 from augment.jobs.processes import OutputLock
 from augment.scene import Scene
-from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.output import fill, print_note
 
@@ -165,61 +164,42 @@ def _mirror_rows(
 ) -> list[str]:
     folder = mirror_folder(out, name)
     record = read_record(tree, folder)
-    quality = _jpeg_quality(out, scene.name, name)
-    images, notes = weathered_images(out, rows, scene.frames, tree, quality)
+    images, notes = weathered_images(out, rows, scene.frames, tree)
     sweeps, unplaced = weathered_sweeps(out, rows, scene.labels, tree)
-    kept = _rows_of_other_scenes(scene, out, name, record.replaced, "image")
-    kept_sweeps = _rows_of_other_scenes(scene, out, name, record.sweeps, "sweep")
-    known = {row["scene"] for row in (*kept.values(), *kept_sweeps.values()) if row}
-    qualities = {other: _jpeg_quality(out, other, name) for other in known}
-    if gone := sorted(place for place, row in kept.items() if row is None):
-        unplaced = [
-            *unplaced,
+    shown = {**record.replaced, **record.replaced_sweeps}
+    of_others = {place: each for place, each in shown.items() if each.scene != scene.name}
+    others = _of_other_scenes(out, name, of_others)
+    if gone := sorted(p for p in of_others.keys() - others.keys() if of_others[p].image):
+        unplaced.append(
             f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the "
-            f"manifest: the source's own stand there again",
-        ]
-    others = {
-        p: Weathered.of_row(out, row, qualities[row["scene"]]) for p, row in kept.items() if row
-    }
-    other_sweeps = {p: WeatheredSweep.of_row(out, row) for p, row in kept_sweeps.items() if row}
+            f"manifest: the source's own stand there again"
+        )
+    scenes = {ours.shown.scene for ours in others.values()} & record.scenes.keys()
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
-    scenes = {key: record.scenes[key] for key in sorted(known & record.scenes.keys())}
     done = mirror_dataset(
         tree,
         folder,
-        {**others, **images},
-        {**scenes, scene.name: facts},
+        {**others, **images, **sweeps},
+        {**{key: record.scenes[key] for key in sorted(scenes)}, scene.name: facts},
         extent=extent,
-        sweeps={**other_sweeps, **sweeps},
         links=links,
         progress=progress,
     )
-    num_sweeps = sum(tree.is_sweep(place) for place in done.weathered)
-    page = fill("mirror.txt", done=done, sweeps=num_sweeps, root=tree.root, links=links)
+    num_sweeps = sum(tree.is_sweep(place) for place in done.record.replaced_sweeps)
+    page = fill("mirror.txt", done=done, record=done.record, sweeps=num_sweeps, root=tree.root)
     return [*page.split("\n"), *(f"  {note}" for note in [*notes, *unplaced])]
 
 
-def _rows_of_other_scenes(
-    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, Any]], kind: str
-) -> dict[str, dict[str, Any] | None]:
-    """Of each image, or weathered sweep, that the copy has from other scenes of the dataset the
-    manifest's row, by its place; None where it is no longer there.
-    """
-    entries = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
-    if not entries:
+def _of_other_scenes(out: Path, variant: str, shown: Mapping[str, Shown]) -> dict[str, Weathered]:
+    """What of other scenes stands in the copy, as far as the manifest still has it."""
+    if not shown:
         return {}
-    pairs = {(entry["scene"], variant) for entry in entries.values()}
-    rows = [row for row in rows_of(read_manifest(out), pairs) if row["status"] == OK]
-    if kind == "image":
-        by_path = {row["image_path"]: row for row in rows}
-    else:
-        by_path = {row["lidar_path"]: row for row in rows if is_weathered(row)}
-    return {place: by_path.get(entry[kind]) for place, entry in entries.items()}
-
-
-def _jpeg_quality(out: Path, scene: str, variant: str) -> int:
-    recipe = load_recipe(out / variant_folder(scene, variant) / "recipe.yaml")
-    return recipe.resolve(0).output.jpeg_quality
+    table = rows_of(read_manifest(out), {(each.scene, variant) for each in shown.values()})
+    rows = [row for row in table if row["status"] == OK]
+    by_path = {row["lidar_path"]: Weathered.sweep(out, row) for row in rows if is_weathered(row)}
+    by_path |= {row["image_path"]: Weathered.image(out, row) for row in rows}
+    found = {place: by_path.get(each.image or each.sweep) for place, each in shown.items()}
+    return {place: ours for place, ours in found.items() if ours is not None}
 
 
 def _rows(

@@ -4,27 +4,17 @@ answers at once.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from tyro.conf import Positional, arg
 
 from augment.reconstruct.config import FitConfig
 from tools.output import JsonFile, write_json
 
 if TYPE_CHECKING:
-    from pydantic import ModelWrapValidatorHandler
     from pydantic_core import ErrorDetails
 
     from adapters.training_views.depth_priors import DepthPriors
@@ -43,16 +33,14 @@ class Command(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _name_options(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def __init__(self, **values: Any) -> None:
         """Refuses what is wrong in the words of the command line."""
         try:
-            return handler(values)
+            super().__init__(**values)
         except ValidationError as error:
             from augment.errors import ClimateGSError
 
-            raise ClimateGSError("; ".join(map(cls._refusal, error.errors()))) from None
+            raise ClimateGSError("; ".join(map(self._refusal, error.errors()))) from None
 
     @classmethod
     def _refusal(cls, error: ErrorDetails) -> str:
@@ -153,6 +141,11 @@ class FitOptions(FitConfig, Command):
             "depth": _depth_text(parse_depth(self.depth)),
             "ego_masks": None if self.ego_masks is None else str(self.ego_masks.absolute()),
         }
+
+
+def names_in(text: str) -> tuple[str, ...] | None:
+    """Of names separated by commas; None for all."""
+    return None if text == "all" else tuple(text.split(","))
 
 
 def check_range(

@@ -16,7 +16,7 @@ import re
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -46,7 +46,7 @@ from augment.jobs.layout import folder_name, reading_back, resolve_inside
 from augment.jobs.manifest import OK
 from augment.jobs.tables import read_lidar
 from augment.labels import LabelSource, StoresLidar
-from augment.scene import Scene
+from recipes.load import load_recipe
 from recipes.schema import Output
 
 # ---- The files of a dataset, as a copy of it in another place has to have them -------------------
@@ -83,7 +83,7 @@ class SourceTree:
         found = [(real_root, "")]
         for name in names:
             path = os.path.join(real_root, name)
-            if not self._has(name) or not os.path.islink(path):
+            if not self.has(name) or not os.path.islink(path):
                 continue
             real = os.path.realpath(path)
             if is_within(real, real_root):
@@ -108,7 +108,7 @@ class SourceTree:
                 inner = os.path.relpath(real, base)
                 parts = [part for part in (name, inner) if part not in ("", ".")]
                 within = "/".join(parts)
-                return within if not within or self._has(within.split("/")[0]) else None
+                return within if not within or self.has(within.split("/")[0]) else None
         return None
 
     def is_image(self, relative: str) -> bool:
@@ -119,7 +119,8 @@ class SourceTree:
         """Whether this is the path of a LiDAR sweep."""
         return re.fullmatch(self.sweeps, relative) is not None
 
-    def _has(self, name: str) -> bool:
+    def has(self, name: str) -> bool:
+        """Whether this entry of root belongs to the dataset."""
         return self.entries is None or name in self.entries
 
 
@@ -155,36 +156,18 @@ def survey(tree: SourceTree) -> Survey:
     return Survey(len(are_images), sum(are_images))
 
 
-def walk(tree: SourceTree) -> Iterator[SourceFolder]:
+def walk(tree: SourceTree, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
     """The folders of a dataset, each before those in it, in order of name."""
-    elsewhere = {name: real for real, name in tree.bases if name}
-    waiting = [("", os.path.realpath(tree.root))]
-    while waiting:
-        relative, path = waiting.pop()
-        folder = _read_folder(tree, relative, path, {} if relative else elsewhere)
-        yield folder
-        waiting += reversed(folder.folders)
-
-
-def is_within(path: str, folder: str) -> bool:
-    """Whether a real path is a folder's or of something in it."""
-    return path == folder or path.startswith(folder.rstrip("/") + "/")
-
-
-def _read_folder(
-    tree: SourceTree, relative: str, path: str, elsewhere: dict[str, str]
-) -> SourceFolder:
-    """elsewhere: the real paths of entries that are links to other places, by name."""
+    path = path or os.path.realpath(tree.root)
+    elsewhere = {} if relative else {name: real for real, name in tree.bases}
     found = SourceFolder(relative, [], [], [])
     try:
-        with os.scandir(path) as scan:
-            entries = sorted(scan, key=lambda entry: entry.name)
-        for entry in entries:
-            if not relative and tree.entries is not None and entry.name not in tree.entries:
+        for name in sorted(os.listdir(path)):
+            if not relative and not tree.has(name):
                 continue
-            within = f"{relative}/{entry.name}" if relative else entry.name
-            real = elsewhere.get(entry.name, entry.path)
-            facts = os.lstat(real) if entry.name in elsewhere else entry.stat(follow_symlinks=False)
+            within = f"{relative}/{name}".lstrip("/")
+            real = elsewhere.get(name, os.path.join(path, name))
+            facts = os.lstat(real)
             if stat.S_ISREG(facts.st_mode):
                 found.files.append(SourceFile(within, real, facts))
             elif stat.S_ISDIR(facts.st_mode):
@@ -193,12 +176,19 @@ def _read_folder(
                 found.links.append((within, _link_text(tree, within, real)))
             else:
                 raise AdapterError(
-                    f"{entry.path} is neither a file nor a folder nor a link; a dataset's copy "
-                    f"cannot have it, move it elsewhere"
+                    f"{real} is neither a file nor a folder nor a link; a dataset's copy cannot "
+                    f"have it, move it elsewhere"
                 )
     except OSError as error:
         raise AdapterError(f"{error.filename or path} cannot be read: {error.strerror}") from error
-    return found
+    yield found
+    for inner, real in found.folders:
+        yield from walk(tree, inner, real)
+
+
+def is_within(path: str, folder: str) -> bool:
+    """Whether a real path is a folder's or of something in it."""
+    return path == folder or path.startswith(folder.rstrip("/") + "/")
 
 
 def _link_text(tree: SourceTree, within: str, path: str) -> str:
@@ -284,11 +274,12 @@ def _facts(path: str) -> os.stat_result | None:
 # ---- Where the copy of a dataset lies, and the file beside it that says what stands in it --------
 
 MIRROR_FOLDER = "source"
+Links = Literal["hard", "copy"]
 
 
-class Shown(BaseModel, frozen=True):
-    """What of a scene stands in a recorded file's place: an image or a sweep, by its path relative
-    to the output folder. sha256: of the image.
+class Shown(BaseModel):
+    """What of a scene stands in a recorded file's place: an image or a weathered sweep, by its path
+    relative to the output folder. sha256: of the image.
     """
 
     scene: str
@@ -297,13 +288,16 @@ class Shown(BaseModel, frozen=True):
     sweep: str | None = None
 
 
-class MirrorRecord(BaseModel, frozen=True):
-    """folder: the dataset's. scenes: facts by name. replaced, replaced_sweeps: what is shown in the
-    place of recorded files, by their places in the dataset.
+class MirrorRecord(BaseModel):
+    """folder: the dataset's. scenes: facts by name. files, bytes: how many there are of a kind.
+    replaced, replaced_sweeps: what stands in the place of recorded files, by place in the dataset.
     """
 
     folder: str
+    links: Links = "hard"
     scenes: dict[str, dict[str, Any]] = {}
+    files: dict[str, int] = {}
+    bytes: dict[str, int] = {}
     replaced: dict[str, Shown] = {}
     replaced_sweeps: dict[str, Shown] = {}
 
@@ -343,47 +337,40 @@ FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
 
 
 class ImageForm(NamedTuple):
-    """format: png or jpg. width, height: pixels. is_grey: one channel (told of PNG only)."""
+    """format: png or jpg. size: width and height. is_grey: one channel (told of PNG only)."""
 
     format: str
-    width: int
-    height: int
+    size: tuple[int, int]
     is_grey: bool = False
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.width, self.height
 
 
 class Weathered(NamedTuple):
-    """A finished image, or a weathered sweep, for a recorded file's place. path: of our file. form:
-    the image's, None of a sweep. content: makes the bytes for the place of a recorded image of
-    another form, or for one of a sweep's files; None where only another scene's labels could.
+    """What shall stand in a recorded file's place. path: our file. form: of an image; of another
+    than the recorded one it is encoded anew. content: of a sweep, makes the bytes of the file in
+    this place; None where only its scene's labels could.
     """
 
     path: Path
     shown: Shown
-    form: ImageForm | None
-    content: Callable[[ImageForm | None], bytes] | None
+    form: ImageForm | None = None
+    content: Callable[[], bytes] | None = None
 
     @staticmethod
-    def image(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
-        """The image of a manifest's row. jpeg_quality: for writing it anew."""
+    def image(out_dir: Path, row: Mapping[str, Any]) -> Weathered:
+        """The finished image of a manifest's row."""
         name = row["image_path"]
-        form = ImageForm("jpg" if name.endswith(".jpg") else "png", row["width"], row["height"])
-        path = resolve_inside(out_dir, name)
+        form = ImageForm("jpg" if name.endswith(".jpg") else "png", (row["width"], row["height"]))
         shown = Shown(scene=row["scene"], image=name, sha256=row["checksum"])
-        return Weathered(path, shown, form, partial(_fitted, path, jpeg_quality))
+        return Weathered(resolve_inside(out_dir, name), shown, form)
 
     @staticmethod
     def sweep(
-        out_dir: Path,
-        row: Mapping[str, Any],
-        content: Callable[[ImageForm | None], bytes] | None = None,
+        out_dir: Path, row: Mapping[str, Any], content: Callable[[Path], bytes] | None = None
     ) -> Weathered:
-        """The sweep of a manifest's row."""
+        """The weathered sweep of a manifest's row. content: of the place's file, from the sweep."""
         path = resolve_inside(out_dir, row["lidar_path"])
-        return Weathered(path, Shown(scene=row["scene"], sweep=row["lidar_path"]), None, content)
+        shown = Shown(scene=row["scene"], sweep=row["lidar_path"])
+        return Weathered(path, shown, content=content and partial(content, path))
 
 
 def is_weathered(row: Mapping[str, Any]) -> bool:
@@ -391,33 +378,18 @@ def is_weathered(row: Mapping[str, Any]) -> bool:
     return row["lidar"] == "weather" and row["lidar_path"] is not None
 
 
-def weathered_files(
-    out_dir: Path,
-    rows: Sequence[Mapping[str, Any]],
-    scene: Scene,
-    tree: SourceTree,
-    jpeg_quality: int,
+def weathered_images(
+    out_dir: Path, rows: Sequence[Mapping[str, Any]], frames: Sequence[Frame], tree: SourceTree
 ) -> tuple[dict[str, Weathered], list[str]]:
-    """The finished images and weathered sweeps of a variant's rows by their place in the dataset,
-    and sentences for those that have none.
+    """The finished images of a variant's rows by their place in the dataset, and a sentence for
+    those that have none.
     """
-    rows = [row for row in rows if row["status"] == OK]
-    images, notes = _images(out_dir, rows, scene.frames, tree, jpeg_quality)
-    sweeps, further = _sweeps(out_dir, rows, scene.labels, tree)
-    return images | sweeps, notes + further
-
-
-def _images(
-    out_dir: Path,
-    rows: Sequence[Mapping[str, Any]],
-    frames: Sequence[Frame],
-    tree: SourceTree,
-    jpeg_quality: int,
-) -> tuple[dict[str, Weathered], list[str]]:
     recorded = {frame.index: frame.image_paths for frame in frames}
     found: dict[str, Weathered] = {}
-    unplaced, doubled = [], []
+    unplaced, doubled, notes = [], [], []
     for row in rows:
+        if row["status"] != OK:
+            continue
         path = recorded.get(row["frame"], {}).get(row["camera"])
         place = None if path is None else tree.relative(path)
         if place is None:
@@ -425,8 +397,7 @@ def _images(
             continue
         if place in found:
             doubled.append(place)
-        found[place] = Weathered.image(out_dir, row, jpeg_quality)
-    notes = []
+        found[place] = Weathered.image(out_dir, row)
     if unplaced:
         notes.append(
             f"{len(unplaced)} rendered images, such as {unplaced[0]}, have no recorded image in "
@@ -440,57 +411,63 @@ def _images(
     return found, notes
 
 
-def _sweeps(
+def weathered_sweeps(
     out_dir: Path, rows: Sequence[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
 ) -> tuple[dict[str, Weathered], list[str]]:
-    """Of a frame the dataset may have several files. Lost returns are left out of them."""
-    frames = {row["frame"]: row for row in rows if is_weathered(row)}
-    stored = labels if isinstance(labels, StoresLidar) else None
+    """As `weathered_images`, of the sweeps, of which a dataset may have several files each. Lost
+    returns are left out.
+    """
+    frames = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
     found: dict[str, Weathered] = {}
-    unplaced = []
+    unplaced, notes = [], []
     for frame, row in sorted(frames.items()):
-        places = {tree.relative(f): f for f in (stored.lidar_files(frame) if stored else ())}
+        stored = labels if isinstance(labels, StoresLidar) else None
+        files = [] if stored is None else stored.lidar_files(frame)
+        places = {tree.relative(file): file for file in files}
         if stored is None or not places or None in places:
             unplaced.append(frame)
             continue
-        sweep = resolve_inside(out_dir, row["lidar_path"])
         for place, file in places.items():
-            content = partial(_returns, stored, frame, file, sweep)
+            content = partial(_returns, stored, frame, file)
             found[str(place)] = Weathered.sweep(out_dir, row, content)
-    if not unplaced:
-        return found, []
-    return found, [
-        f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no file "
-        f"of their own in the dataset: its copy keeps the recorded ones, and {out_dir} has these"
-    ]
+    if unplaced:
+        notes.append(
+            f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no "
+            f"file of their own in the dataset: its copy keeps the recorded ones, and {out_dir} "
+            f"has these"
+        )
+    return found, notes
 
 
-def _returns(
-    labels: StoresLidar, frame: int, file: Path, sweep: Path, _: ImageForm | None
-) -> bytes:
+def _returns(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> bytes:
     return labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
 
 
-def _fitted(path: Path, jpeg_quality: int, recorded: ImageForm | None) -> bytes:
-    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines."""
-    assert recorded is not None
+def _fitted(image: Path, recorded: ImageForm, jpeg_quality: Callable[[Path], int]) -> bytes:
+    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines.
+    jpeg_quality: of a variant's folder.
+    """
     try:
-        rgb = decode_image(path.read_bytes())
+        rgb = decode_image(image.read_bytes())
     except OSError as error:
-        raise output_error(path, error) from error
+        raise output_error(image, error) from error
     except ValueError as error:
-        raise OutputError(f"{path} is damaged ({error}); delete it and render again") from error
-    size = recorded.size
-    if (rgb.shape[1], rgb.shape[0]) != size:
-        is_smaller = size[0] < rgb.shape[1] and size[1] < rgb.shape[0]
+        raise OutputError(f"{image} is damaged ({error}); delete it and render again") from error
+    size, (height, width) = recorded.size, rgb.shape[:2]
+    if (width, height) != size:
+        is_smaller = size[0] < width and size[1] < height
         method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=method), np.uint8)
     if recorded.is_grey:
         done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
         assert done
         return data.tobytes()
-    settings = {"image": recorded.format, "jpeg_quality": jpeg_quality}
+    settings = {"image": recorded.format, "jpeg_quality": jpeg_quality(image.parents[2])}
     return encode_image(rgb, Output.model_validate(settings))
+
+
+def _jpeg_quality(variant: Path) -> int:
+    return load_recipe(variant / "recipe.yaml").resolve(0).output.jpeg_quality
 
 
 def image_form(path: str | Path) -> ImageForm | None:
@@ -498,7 +475,7 @@ def image_form(path: str | Path) -> ImageForm | None:
     header = read_image_header(path)
     if header is None or header.format not in FORMATS:
         return None
-    return ImageForm(FORMATS[header.format], header.width, header.height, header.is_grey)
+    return ImageForm(FORMATS[header.format], (header.width, header.height), header.is_grey)
 
 
 def dataset_format(frames: Sequence[Frame]) -> str:
@@ -518,63 +495,31 @@ def dataset_format(frames: Sequence[Frame]) -> str:
 
 # ---- The copy ------------------------------------------------------------------------------------
 
-Links = Literal["hard", "copy"]
+# What a record counts.
+_FILES: tuple[str, ...] = (LINKED, COPIED, "symbolic_links", "camera_images", "replaced_images",
+                           "lidar_sweeps", "replaced_lidar_files")  # fmt: skip
+_BYTES: tuple[str, ...] = (LINKED, COPIED, "new_images")
 
 
 @dataclass
 class Mirrored:
-    """What a copy of a dataset is made of. Sizes in bytes. linked, copied: files of the source.
-    replaced: weathered images in place of recorded ones; new: those that are files of their own
-    and no links to the rendered ones. resized: rendered and recorded sizes of those that differ.
-    unusable: recorded images that are neither PNG nor JPEG, which stay. sweeps: of the source;
-    weathered: files of returns, and of their labels, in place of its own. outdated: such that
-    another scene has rendered anew, where the source's own stand. missing: recorded images that the
-    source has no longer. others: files that the source does not have. changed: files and links
-    that this call has put in place.
+    """What was made of a copy. record: what it is made of. changed: how many files and links this
+    call has put in place. new: weathered images that are files of their own and no links to the
+    rendered ones. resized: rendered and recorded sizes of those that differ. unusable: recorded
+    images that are neither PNG nor JPEG, which stay. outdated: files of sweeps that another scene
+    has rendered anew, where the source's own stand. missing: recorded images that the source has
+    no longer. others: files that the source does not have.
     """
 
     folder: Path
-    linked: int = 0
-    linked_size: int = 0
-    copied: int = 0
-    copied_size: int = 0
-    links: int = 0
-    images: int = 0
-    replaced: dict[str, Shown] = field(default_factory=dict)
+    record: MirrorRecord
+    changed: int = 0
     new: int = 0
-    new_size: int = 0
     resized: list[tuple[tuple[int, int], tuple[int, int]]] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
-    sweeps: int = 0
-    weathered: dict[str, Shown] = field(default_factory=dict)
     outdated: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
-    changed: int = 0
-
-    def record(self, tree: SourceTree, links: Links, scenes: Mapping[str, Any]) -> str:
-        """The text of the file beside a complete copy, which `read_record` reads."""
-        content = {
-            "folder": str(tree.root),
-            "links": links,
-            "scenes": scenes,
-            "files": {
-                **{"linked": self.linked, "copied": self.copied, "symbolic_links": self.links},
-                **{"camera_images": self.images, "replaced_images": len(self.replaced)},
-                **{"lidar_sweeps": self.sweeps, "replaced_lidar_files": len(self.weathered)},
-            },
-            "bytes": {
-                **{"linked": self.linked_size, "copied": self.copied_size},
-                "new_images": self.new_size,
-            },
-            "replaced": _described(self.replaced),
-            "replaced_sweeps": _described(self.weathered),
-        }
-        return json.dumps(content, indent=1) + "\n"
-
-
-def _described(shown: Mapping[str, Shown]) -> dict[str, dict[str, str]]:
-    return {place: each.model_dump(exclude_none=True) for place, each in shown.items()}
 
 
 def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
@@ -598,16 +543,20 @@ def mirror_dataset(
 ) -> Mirrored:
     """Build the copy of a dataset in a folder, or bring it up to date; needs the lock of the output
     folder. weathered: by place in the dataset, all that shall stand in the copy. scenes: facts of
-    those that they are of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or
+    those that it is of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or
     copy for a copy that shares nothing with source and images. Raises AdapterError: a file of the
     source cannot be read, or a link leads out of it. OutputError: the system refused, or a link is
     in the way; no file is left half-written.
     """
     check_disjoint(tree, folder)
-    run = _Mirroring(tree, folder, weathered, links == "hard")
+    files, sizes = dict.fromkeys(_FILES, 0), dict.fromkeys(_BYTES, 0)
+    record = MirrorRecord(
+        folder=str(tree.root), links=links, scenes=dict(scenes), files=files, bytes=sizes
+    )
+    run = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         run.go(bar)
-    run.finish(run.done.record(tree, links, scenes).encode())
+    run.finish()
     return run.done
 
 
@@ -618,19 +567,25 @@ class _Mirroring:
     tree: SourceTree
     folder: Path
     weathered: Mapping[str, Weathered]
-    may_link: bool
+    done: Mirrored
     changed_folders: set[str] = field(default_factory=set)
     encoded: list[str] = field(default_factory=list)  # images of another form than ours
-    is_begun: bool = False
 
     def __post_init__(self) -> None:
-        self.record, self.begun_record = record_names(self.tree, self.folder)
-        self.done = Mirrored(self.folder / self.tree.root.name)
+        self.files, self.bytes = self.done.record.files, self.done.record.bytes
+        self.record, self.begun = record_names(self.tree, self.folder)
         self.root = str(self.done.folder)
+        self.jpeg_quality = cache(_jpeg_quality)
 
     def go(self, bar: tqdm) -> None:
-        for folder in (self.folder.parent, self.folder, self.root):
+        """Take back that the copy is complete, and make it so."""
+        for folder in (self.folder.parent, self.folder):
             self._own(str(folder))
+        with refusals_of(self.record):
+            if self.record.exists():
+                os.replace(self.record, self.begun)
+                flush_folder(self.folder)
+        self._own(self.root)
         self.pump = WritePump()
         try:
             for folder in walk(self.tree):
@@ -638,57 +593,54 @@ class _Mirroring:
                 bar.update(len(folder.files))
         finally:
             self.pump.close()
-        done = self.done
-        done.new += len(self.encoded)
-        done.new_size += sum(os.lstat(path).st_size for path in self.encoded)
-        images = {place for place, each in self.weathered.items() if each.form is not None}
-        done.missing = sorted(images - done.replaced.keys() - set(done.unusable))
+        self.done.new += len(self.encoded)
+        self.bytes["new_images"] += sum(os.lstat(path).st_size for path in self.encoded)
 
-    def finish(self, record: bytes) -> None:
+    def finish(self) -> None:
         """Make the names durable, then say that the copy is complete."""
+        record, known = self.done.record, {*self.done.record.replaced, *self.done.unusable}
+        images = {place for place, ours in self.weathered.items() if ours.form is not None}
+        self.done.missing = sorted(images - known)
+        self.files["replaced_images"] = len(record.replaced)
+        self.files["replaced_lidar_files"] = len(record.replaced_sweeps)
+        text = (json.dumps(record.model_dump(exclude_none=True), indent=1) + "\n").encode()
         with refusals_of(self.folder):
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
-        if not (self.record.is_file() and self.record.read_bytes() == record):
-            write_atomic(self.record, record)
-        with refusals_of(self.begun_record):
-            self.begun_record.unlink(missing_ok=True)
+            if self.begun.is_file() and self.begun.read_bytes() == text:
+                os.replace(self.begun, self.record)
+        if not self.record.exists():
+            write_atomic(self.record, text)
+        with refusals_of(self.begun):
+            self.begun.unlink(missing_ok=True)
 
     def _fill(self, folder: SourceFolder) -> None:
-        path, done = self._target(folder.relative), self.done
+        path = self._target(folder.relative)
         entries = [*folder.files, *folder.folders, *folder.links]
         others = others_in(path, {os.path.basename(entry[0]) for entry in entries})
         if not folder.relative:  # other drives, which the copy has from other scenes
             others = [name for name in others if not os.path.lexists(self.tree.root / name)]
-        done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
+        self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
         for inner, _ in folder.folders:
             self._own(self._target(inner))
         for file in folder.files:
-            done.images += self.tree.is_image(file.relative)
-            done.sweeps += self.tree.is_sweep(file.relative)
+            self.files["camera_images"] += self.tree.is_image(file.relative)
+            self.files["lidar_sweeps"] += self.tree.is_sweep(file.relative)
             ours = self.weathered.get(file.relative)
             if ours is None or not self._replace(file, ours):
-                self._keep(file)
+                how = self._place(file.path, file.facts, self._target(file.relative))
+                self.files[how] += 1
+                self.bytes[how] += file.facts.st_size
         for name, text in folder.links:
-            done.links += 1
-            self._begin()
+            self.files["symbolic_links"] += 1
             if put_link(text, self._target(name)):
                 self._changed(path)
-
-    def _keep(self, file: SourceFile) -> None:
-        """Put the source's own file in place."""
-        if self._place(file.path, file.facts, file.relative) == LINKED:
-            self.done.linked += 1
-            self.done.linked_size += file.facts.st_size
-        else:
-            self.done.copied += 1
-            self.done.copied_size += file.facts.st_size
 
     def _replace(self, file: SourceFile, ours: Weathered) -> bool:
         """Put what is weathered in place; False where the recorded file has to stay: an image that
         is none that we write, or a sweep that only another scene could write.
         """
-        done, recorded = self.done, None
+        done, target, recorded = self.done, self._target(file.relative), None
         if ours.form is not None:
             try:
                 recorded = image_form(file.path)
@@ -697,66 +649,57 @@ class _Mirroring:
             if recorded is None:
                 done.unusable.append(file.relative)
                 return False
-            if ours.form.size != recorded.size:
-                done.resized.append((ours.form.size, recorded.size))
         rendered = _facts_of(ours.path)
-        if ours.form is not None and ours.form == recorded:
-            if self._place(str(ours.path), rendered, file.relative) == COPIED:
-                done.new += 1
-                done.new_size += rendered.st_size
-        elif not self._encode(ours, recorded, file.relative, rendered.st_mtime_ns):
-            done.outdated.append(file.relative)
-            return False
-        (done.weathered if ours.form is None else done.replaced)[file.relative] = ours.shown
+        if ours.form is None or recorded is None:
+            if not self._write(target, rendered.st_mtime_ns, None, ours.content):
+                done.outdated.append(file.relative)
+                return False
+            done.record.replaced_sweeps[file.relative] = ours.shown
+            return True
+        if ours.form != recorded:
+            content = partial(_fitted, ours.path, recorded, self.jpeg_quality)
+            self._write(target, rendered.st_mtime_ns, recorded, content)
+            self.encoded.append(target)
+        elif self._place(str(ours.path), rendered, target) == COPIED:
+            done.new += 1
+            self.bytes["new_images"] += rendered.st_size
+        if ours.form.size != recorded.size:
+            done.resized.append((ours.form.size, recorded.size))
+        done.record.replaced[file.relative] = ours.shown
         return True
 
-    def _encode(
-        self, ours: Weathered, recorded: ImageForm | None, relative: str, mtime_ns: int
+    def _place(self, original: str, facts: os.stat_result, target: str) -> str:
+        """Link or copy, where that has not been done; says which."""
+        may_link = self.done.record.links == "hard"
+        found = found_as(target, facts)
+        if found == COPIED or (found == LINKED and may_link):
+            return found
+        is_linked = may_link and link_file(original, target)
+        if not is_linked:
+            self.pump.submit(lambda: copy_file(original, target))
+        self._changed(os.path.dirname(target))
+        return LINKED if is_linked else COPIED
+
+    def _write(
+        self,
+        target: str,
+        mtime_ns: int,
+        form: ImageForm | None,
+        content: Callable[[], bytes] | None,
     ) -> bool:
-        """Write what is not as we have it, where the file there is not that already: its time and
-        form would be ours. False where we cannot.
+        """Write a file of that time, and that form if it is an image, where there is none yet;
+        False where that would take what we do not have.
         """
-        target, content = self._target(relative), ours.content
-        if recorded is not None:
-            self.encoded.append(target)
-        if _is_written(target, mtime_ns, recorded):
+        if _is_written(target, mtime_ns, form):
             return True
         if content is None:
             return False
-        self._put(target, lambda: write_file(content(recorded), target, mtime_ns))
-        return True
-
-    def _place(self, original: str, facts: os.stat_result, relative: str) -> str:
-        """Link or copy, where that has not been done; says which."""
-        target = self._target(relative)
-        found = found_as(target, facts)
-        if found == COPIED or (found == LINKED and self.may_link):
-            return found
-        self._begin()
-        if self.may_link and link_file(original, target):
-            self._changed(os.path.dirname(target))
-            return LINKED
-        self._put(target, lambda: copy_file(original, target))
-        return COPIED
-
-    def _put(self, target: str, write: Callable[[], None]) -> None:
-        self._begin()
-        self.pump.submit(write)
+        self.pump.submit(lambda: write_file(content(), target, mtime_ns))
         self._changed(os.path.dirname(target))
-
-    def _begin(self) -> None:
-        """Take back that the copy is complete, before its first change."""
-        if self.is_begun:
-            return
-        self.is_begun = True
-        with refusals_of(self.record):
-            if self.record.exists():
-                os.replace(self.record, self.begun_record)
-                flush_folder(self.folder)
+        return True
 
     def _own(self, folder: str) -> None:
         if own_folder(folder):
-            self._begin()
             self.changed_folders.add(os.path.dirname(folder))
 
     def _changed(self, folder: str) -> None:

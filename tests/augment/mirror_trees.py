@@ -87,7 +87,7 @@ def mirror(root: Path, out: Path, variant: str = "fog-000", **options) -> Mirror
     """Build the copy of the dataset with the images that `render` made."""
     tree = options.pop("tree", None) or tree_of(root)
     rows = [row for row in read_manifest(out).to_pylist() if row["variant"] == variant]
-    images, notes = weathered_images(out, rows, scene_of(root).frames, tree, 92)
+    images, notes = weathered_images(out, rows, scene_of(root).frames, tree)
     assert notes == []
     return mirror_dataset(
         tree,
