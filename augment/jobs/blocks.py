@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field, TypeAdapter
 
@@ -32,8 +32,6 @@ from recipes.schema import Recipe, parse_frames
 
 # ---- What a job knows of a scene without keeping it open, and the blocks of images it is cut into
 
-_FORMAT = 1
-
 
 @dataclass(frozen=True)
 class FrameRecord:
@@ -47,60 +45,41 @@ class FrameRecord:
 @dataclass(frozen=True)
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
-    has_labels, has_lidar: whether there are any. open_s: how long opening it took. gaussian_bytes:
-    of its splats.
+    has_lidar: whether there is any. open_s: how long opening it took.
     """
 
     uri: str
     name: str
     source: str
-    has_labels: bool
+    has_lidar: bool
     open_s: float
-    gaussian_bytes: int
     frames: tuple[FrameRecord, ...]
-    has_lidar: bool = True  # in records of before it was asked
 
     @staticmethod
     def of(scene: Scene, uri: str, open_s: float) -> SceneRecord:
         select_frames(SceneIndex.of(scene), None, None)  # or it holds no image at all
-        return SceneRecord(
-            uri=uri,
-            name=scene.name,
-            source=scene.source,
-            has_labels=scene.labels is not None,
-            has_lidar=has_lidar(scene, [frame.index for frame in scene.frames]),
-            open_s=open_s,
-            gaussian_bytes=scene.gaussian_bytes,
-            frames=tuple(
-                FrameRecord(
-                    frame.index,
-                    frame.timestamp_ns,
-                    {
-                        name: (camera.width, camera.height, camera.timestamp_ns)
-                        for name, camera in sorted(frame.cameras.items())
-                    },
-                )
-                for frame in sorted(scene.frames, key=lambda frame: frame.index)
-            ),
-        )
+        frames = [
+            FrameRecord(
+                frame.index,
+                frame.timestamp_ns,
+                {n: (c.width, c.height, c.timestamp_ns) for n, c in sorted(frame.cameras.items())},
+            )
+            for frame in sorted(scene.frames, key=lambda frame: frame.index)
+        ]
+        lidar = has_lidar(scene, [frame.number for frame in frames])
+        return SceneRecord(uri, scene.name, scene.source, lidar, open_s, tuple(frames))
 
     def to_json(self) -> bytes:
-        frames = [[f.number, f.timestamp_ns, f.cameras] for f in self.frames]
-        facts = {**vars(self), "format": _FORMAT, "frames": frames}
-        return json.dumps(facts, separators=(",", ":")).encode()
+        return _RECORD.dump_json(self)
 
     @staticmethod
     def from_json(data: bytes, where: str) -> SceneRecord:
         """What `to_json` made bytes of."""
         with reading_back(where, "Delete it; the scene is opened again"):
-            facts: dict[str, Any] = json.loads(data)
-            if facts.pop("format") != _FORMAT:
-                raise ValueError("it is of another version")
-            frames = tuple(
-                FrameRecord(number, time, {n: (w, h, t) for n, (w, h, t) in cameras.items()})
-                for number, time, cameras in facts.pop("frames")
-            )
-            return SceneRecord(**facts, frames=frames)
+            return _RECORD.validate_json(data, strict=True)
+
+
+_RECORD = TypeAdapter(SceneRecord)
 
 
 @dataclass(frozen=True)
@@ -317,21 +296,13 @@ class StoredPlan:
 
 
 _STORED_PLAN = TypeAdapter(StoredPlan)
-_BLOCK_FIELDS = tuple(PlannedBlock.__dataclass_fields__)
 
 
 def store_plan(store: Store, plan: Plan) -> None:
     """Write the plan's file; the same for every shard and every time."""
-    facts = {
-        "format": _FORMAT,
-        "job": plan.job,
-        "version": augment.__version__,
-        "images": plan.images,
-        "scenes": len(plan.records),
-        "unusable": dict(plan.unusable),
-        "blocks": [[b.key, b.scene, b.variant, b.recipe.name, b.images] for b in plan.blocks],
-    }
-    data = json.dumps(facts, separators=(",", ":")).encode()
+    blocks = [PlannedBlock(b.key, b.scene, b.variant, b.recipe.name, b.images) for b in plan.blocks]
+    stored = StoredPlan(plan.job, augment.__version__, tuple(blocks), dict(plan.unusable))
+    data = _STORED_PLAN.dump_json(stored)
     path = f"{JOBS}/{plan.job}.json"
     if not (store.exists(path) and store.read(path) == data):
         store.write(path, data)
@@ -355,11 +326,7 @@ def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> No
 
 def _from_json(data: bytes, where: str) -> StoredPlan:
     with reading_back(where, "Delete it and start the job again"):
-        facts = json.loads(data)
-        if facts["format"] != _FORMAT:
-            raise ValueError("it is of another version")
-        blocks = [dict(zip(_BLOCK_FIELDS, block, strict=True)) for block in facts["blocks"]]
-        return _STORED_PLAN.validate_json(json.dumps({**facts, "blocks": blocks}), strict=True)
+        return _STORED_PLAN.validate_json(data, strict=True)
 
 
 # ---- How far a job has come, read from its output alone ------------------------------------------

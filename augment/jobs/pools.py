@@ -39,6 +39,7 @@ from augment.jobs.worker import Outcome, TaskFailed
 from augment.render.buffers import CUDA
 
 OnOutcome = Callable[[Outcome], None]
+Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker is done with
 
 
 @runtime_checkable
@@ -93,7 +94,7 @@ class WorkerPool(Protocol):
     """
 
     slots: int
-    tick: Callable[[int, Outcome], None]
+    tick: Tick
 
     def give(self, slot: int, task: Any) -> None:
         """Start a task in a worker that has none."""
@@ -199,9 +200,8 @@ class SerialPool:
 
     slots = 1
 
-    tick: Callable[[int, Outcome], None] = _untold
-
     def __init__(self, setup: WorkerSetup) -> None:
+        self.tick: Tick = _untold
         self._worker = setup.worker(lambda outcome: self.tick(0, outcome))
         self._task: Any = None
 
