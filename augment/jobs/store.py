@@ -313,8 +313,8 @@ def _parse(uri: str) -> _Place:
 @dataclass(frozen=True)
 class Patience:
     """How long failures that pass (timeouts, lost connections, 500, 503) are waited out. A request
-    may stand still for timeout_s, and none begins after give_up_s. Between two is a random wait that
-    doubles each time.
+    may stand still for timeout_s, and none begins after give_up_s. Before each is a random wait,
+    every time longer.
     """
 
     retries: int = 6
@@ -529,30 +529,28 @@ def _open(obs: Any, place: _Place, patience: Patience) -> Any:
 
 _of_parents: list[Any] = []
 _loading = threading.Lock()
-_loaded: tuple[int, Any] = (0, None)  # the process, and obstore as it may use it
+_loaded_by = 0  # this process, or the one that it was forked from
+_obstore_folder = ""
 
 
 def _load_obstore() -> Any:
     """obstore, whose threads do not survive a fork (in a child its calls never return), and which
     it cannot start again: a forked process loads a copy of it under another path.
     """
-    global _loaded
+    global _loaded_by, _obstore_folder
     with _loading:
-        process, obs = _loaded
-        if process == 0:
-            obs = importlib.import_module("obstore")
-        elif process != os.getpid():
+        if _loaded_by == 0:
+            _obstore_folder = str(Path(importlib.import_module("obstore").__file__ or "").parent)
+        elif _loaded_by != os.getpid():
             with tempfile.TemporaryDirectory() as folder:
-                shutil.copytree(Path(obs.__file__).parent, Path(folder, "obstore"))
+                shutil.copytree(_obstore_folder, f"{folder}/obstore")
                 for name in [name for name in sys.modules if name.split(".")[0] == "obstore"]:
                     del sys.modules[name]
                 sys.path.insert(0, folder)
-                try:
-                    obs = importlib.import_module("obstore")
-                finally:
-                    sys.path.remove(folder)
-        _loaded = (os.getpid(), obs)
-        return obs
+                importlib.import_module("obstore")
+                sys.path.remove(folder)
+        _loaded_by = os.getpid()
+    return sys.modules["obstore"]
 
 
 def _after_fork() -> None:

@@ -9,10 +9,8 @@ import os
 import sys
 import time
 
-from augment.jobs.claims import ClaimTimes, try_claim
+from augment.jobs.claims import try_claim
 from augment.jobs.store import open_store
-
-PATIENT = ClaimTimes(renewal_s=5.0, lifetime_s=60.0, attempts=4, longest_wait_s=0.02)
 
 
 def contend(name: str, places: list[str]) -> None:
@@ -25,7 +23,7 @@ def contend(name: str, places: list[str]) -> None:
     for uri, count, log in zip(places[::3], places[1::3], places[2::3], strict=True):
         store, left = open_store(uri), int(count)
         while left:
-            claim = try_claim(store, name, PATIENT)
+            claim = try_claim(store, name)
             if claim is not None:
                 with claim:
                     os.close(os.open(log, os.O_CREAT | os.O_EXCL))
@@ -44,7 +42,7 @@ def main() -> None:
         print("contending", flush=True)
         contend(name, rest)
         return
-    claims = [try_claim(open_store(uri), name, PATIENT) for uri in rest]
+    claims = [try_claim(open_store(uri), name) for uri in rest]
     assert None not in claims
     print("holding", flush=True)
     if action == "hold":

@@ -46,7 +46,7 @@ class Fault:
     path: str
     status: int | None
     cut: Cut | None
-    truncate: bool
+    ignore: str
     delay_s: float
 
     def fits(self, method: str, target: str) -> bool:
@@ -75,7 +75,7 @@ class S3Server:
         *,
         status: int | None = None,
         cut: Cut | None = None,
-        truncate: bool = False,
+        ignore: str = "",
         delay_s: float = 0.0,
         method: str | None = None,
         path: str = "",
@@ -84,11 +84,11 @@ class S3Server:
 
         status: answer that (500, 503, 403 ...) and do nothing else. cut: "upload" reads half of
         the body and closes the connection; "answer" does what was asked for, then closes it
-        without a word. truncate: half of the body is stored, and the answer is 200. delay_s:
-        first wait that long; alone, the request then succeeds. Orders add up, the oldest first.
+        without a word. ignore: this header, as WSGI calls it. delay_s: first wait that long;
+        alone, the request then succeeds. Orders add up, the oldest first.
         """
         with self._lock:
-            self._faults.append(Fault(next, method, path, status, cut, truncate, delay_s))
+            self._faults.append(Fault(next, method, path, status, cut, ignore, delay_s))
 
     def forgive(self) -> None:
         """Forget all orders of failures."""
@@ -179,22 +179,12 @@ def _answer(
     if fault.status is not None:
         start_response(f"{fault.status} Ordered", [("Content-Length", "0")])
         return [b""]
-    if fault.truncate:
-        data = _half(data, is_framed="HTTP_X_AMZ_DECODED_CONTENT_LENGTH" in environ)
+    environ.pop(fault.ignore, None)
     environ |= {"wsgi.input": io.BytesIO(data), "CONTENT_LENGTH": str(len(data))}
     if fault.cut == "answer":
         list(application(environ, lambda *_: None))
         return _cut(environ)
     return application(environ, start_response)
-
-
-def _half(body: bytes, *, is_framed: bool) -> bytes:
-    """Half of what a request brings; framed, that is one chunk, and a checksum of all chunks."""
-    if not is_framed:
-        return body[: len(body) // 2]
-    size, _, rest = body.partition(b"\r\n")
-    half = int(size, 16) // 2
-    return b"%x\r\n%s\r\n0\r\n\r\n" % (half, rest[:half])
 
 
 def _cut(environ: dict[str, Any]) -> Iterable[bytes]:

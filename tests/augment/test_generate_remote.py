@@ -22,7 +22,7 @@ def test_a_remote_output_has_the_files_of_a_local_one(
     """Requests fail now and then; the job is stopped twice, and what was finished stays so."""
     lazy = SimpleNamespace(collect=lambda: None)
     monkeypatch.setattr("augment.jobs.block_worker.gc", lazy)
-    monkeypatch.setattr("augment.jobs.claims.CLAIM_TIMES", ClaimTimes(0.2, 2.0))
+    monkeypatch.setattr("augment.jobs.claims.CLAIM_TIMES", ClaimTimes(0.2))
     scenes, recipes = ["fake:a?frames=3"], make_recipes(["fog"], block_images=2)
     run_generate(make_job(tmp_path / "local", scenes, recipes), progress=False)
     whole = outputs(tmp_path / "local")
