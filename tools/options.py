@@ -4,7 +4,6 @@ answers at once.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
@@ -106,7 +105,8 @@ class FitOptions(FitConfig, Command):
         from adapters.training_views.views import holdout_step
         from augment.errors import ClimateGSError
 
-        check_length(self)
+        if self.minutes is not None and self.steps is not None:
+            raise ClimateGSError("give --minutes or --steps, not both")
         holdout_step(self.holdout)
         if not all(self.cameras.split(",")):
             raise ClimateGSError("--cameras is names separated by commas, or all")
@@ -129,7 +129,7 @@ class FitOptions(FitConfig, Command):
     @property
     def camera_names(self) -> tuple[str, ...] | None:
         """None for all."""
-        return None if self.cameras == "all" else tuple(self.cameras.split(","))
+        return names_in(self.cameras)
 
     def settings(self) -> dict[str, Any]:
         """All that decides the result, as JSON keeps it; not how long it is fitted."""
@@ -146,49 +146,6 @@ class FitOptions(FitConfig, Command):
 def names_in(text: str) -> tuple[str, ...] | None:
     """Of names separated by commas; None for all."""
     return None if text == "all" else tuple(text.split(","))
-
-
-def check_range(
-    options: Any, name: str, text: str, low: float, high: float = math.inf, above: bool = False
-) -> None:
-    """Refuse an option outside [low, high], or (low, high] where it is to be above; None is none.
-
-    Raises:
-        ClimateGSError: it is outside, infinite or no number; text says what it must be.
-    """
-    from augment.errors import ClimateGSError
-
-    value = getattr(options, name)
-    if value is None:
-        return
-    inside = low < value <= high if above else low <= value <= high
-    if not inside or value == math.inf:  # NaN is not inside either
-        raise ClimateGSError(f"--{name.replace('_', '-')} must be {text}; got {value}")
-
-
-def check_choice(options: Any, name: str, choices: tuple[str, ...]) -> None:
-    """Refuse an option that is none of the choices.
-
-    Raises:
-        ClimateGSError: it is none.
-    """
-    from augment.errors import ClimateGSError
-
-    if (value := getattr(options, name)) not in choices:
-        raise ClimateGSError(f"--{name} is one of {', '.join(choices)}; got {value!r}")
-
-
-def check_length(options: Any) -> None:
-    """Refuse minutes beside steps, and minutes that are no time.
-
-    Raises:
-        ClimateGSError: they are.
-    """
-    from augment.errors import ClimateGSError
-
-    if options.minutes is not None and options.steps is not None:
-        raise ClimateGSError("give --minutes or --steps, not both")
-    check_range(options, "minutes", "a number of minutes > 0", 0, above=True)
 
 
 def length_of(options: Any) -> dict[str, float]:
