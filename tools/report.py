@@ -11,8 +11,7 @@ import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from importlib import resources
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -30,6 +29,7 @@ from augment.jobs.files import box_tables
 from augment.jobs.layout import STATE_FOLDER, folder_name, path_kinds
 from augment.jobs.manifest import OK, read_finished
 from augment.jobs.store import Store, StoredFile, open_store
+from tools.drawing import cameras_on_car, evenly, first_of_each, value_codes
 from tools.report_numbers import (
     byte_size,
     chart,
@@ -37,27 +37,19 @@ from tools.report_numbers import (
     find_draws,
     percent,
     plural_of,
+    short,
     spreads,
     weather_of_recipes,
+    with_unit,
 )
-from tools.report_pictures import (
-    MAX_IMAGES,
-    Gallery,
-    ReportFiles,
-    Shares,
-    depth_gradient,
-    evenly,
-    first_of_each,
-)
+from tools.report_pictures import MAX_IMAGES, Gallery, ReportFiles, Shares, depth_gradient
 
 REPORT = "report.html"
 IMAGES = 48
 MAX_PAGE = 5_000_000  # bytes
 MAX_RECIPES = 12  # whose labels and sweeps are looked at
-MAX_ROWS = 40  # of a table
-OPEN_ROWS = 12  # tables of more are folded
-MAX_CHARTS = 24
-MAX_FAILURES = 20
+# Rows of a table, those of one that is not folded, ...
+LIMITS = {"max_rows": 40, "open_rows": 12, "max_charts": 24, "max_failures": 20}
 MAX_EXAMPLES = 3
 MAX_TEXT = 300  # characters of one name or message
 # Control characters and lone surrogates have no place in HTML; others could turn the line's
@@ -67,23 +59,14 @@ _INVISIBLE = re.compile(
 )
 _DIGITS = re.compile(r"\d+")
 # Of a million rows they take some hundred megabytes, over and over.
-_UNUSED = [
-    "timestamp_ns",
-    "instance_path",
-    "calibration_path",
-    "recipe_hash",
-    "style_method",
-    "render_scale",
-    "settings",
-]
+_UNUSED = ["timestamp_ns", "instance_path", "calibration_path", "recipe_hash", "style_method"]
+_UNUSED += ["render_scale", "settings"]
 # Of a variant's folder; what else lies there, such as its recipe, is small.
 OTHER, STATE = "other", "state of jobs"
 MAX_BOX_FILES = 40
-MAX_TABLES = 6  # of each recipe
-MAX_SWEEPS = 3  # of each recipe
+MAX_TABLES, MAX_SWEEPS = 6, 3  # of each recipe
 VISIBILITY_STEPS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95)  # lower bounds of the bins; the last is open
-_BOX = ("frame", "camera", "box")
-_BOX_TYPES = [pa.int64(), pa.string(), pa.int64()]
+_BOX = {"frame": pa.int64(), "camera": pa.string(), "box": pa.int64()}
 _CODES = {
     codes.UNCHANGED: "unchanged",
     codes.ATTENUATED: "weaker",
@@ -91,6 +74,17 @@ _CODES = {
     codes.LOST: "lost",
     codes.MOVED: "on another surface",
 }
+_FACTS = {
+    "size": "Image size", "camera": "Cameras", "trajectory": "Trajectory",
+    "surface": "Surface of labels", "seed": "Seeds", "version": "Version", "backend": "Backend",
+}  # fmt: skip
+# Of a group of images by what is counted. Frames are counted once per scene, whatever their
+# variants and cameras.
+_COUNTS = {
+    "source": ("source", "min"), "finished": ("finished", "sum"), "failed": ("failed", "sum"),
+    "scenes": ("scene", "count_distinct"), "variants": ("draw", "count_distinct"),
+    "frames": ("place", "count_distinct"), "cameras": ("camera", "count_distinct"),
+}  # fmt: skip
 
 
 class Written(NamedTuple):
@@ -124,7 +118,6 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
     if html is None:
         name = f"{folder_name(_name_of(store))}-{REPORT}"
         html = Path(name) if store.local_dir is None else store.local_dir / REPORT
-    data, problems = b"", 0
     # Captions of long names may outgrow the pictures: with fewer of both the page fits.
     for fewer in (images, images // 2, images // 4, 0):
         page, problems = make_page(store, Path(html), fewer)
@@ -137,23 +130,26 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
 
 def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     """The page's text, and how many files could not be read. html: where it will lie."""
-    table = add_variant_key(read_finished(store).drop_columns(_UNUSED))
+    table = read_finished(store)
+    cameras = cameras_on_car(store, table)
+    table = add_variant_key(table.drop_columns(_UNUSED))
     beside, own = _beside(store, html)
     listing = store.list("")
     files = ReportFiles(store, listing)
     finished = table.filter(pc.equal(table["status"], OK))
     recipes = group_by(table, "recipe")
     draws = find_draws(finished)
-    with_images = [group.name for group in recipes if group.finished]
-    gallery = Gallery(finished, draws, files, Shares.of(images), beside)
+    clear = set(draws.filter(draws["is_clear"])["draw"].to_pylist())
+    with_images = [group["name"] for group in recipes if group["finished"]]
+    gallery = Gallery(finished, clear, cameras, files, Shares.of(images), beside)
     some = evenly(with_images, MAX_RECIPES)
-    found = spreads(finished, draws)
-    shown = [group.name for group in listed(recipes)["rows"]]
-    script = _asset("report.js")
+    found = spreads(draws)
+    environment = _environment()
+    style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
     # Dictionaries keep their order: in this one files are read, and noted where they are damaged.
     facts = {
         "name": _name_of(store),
-        "whole": overall(table),
+        "whole": group_by(table)[0],
         "compare": gallery.compare(),
         "sheets": gallery.contact_sheets(with_images),
         "charts": [chart(spread) for spread in found if not spread.is_constant],
@@ -163,19 +159,19 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
         "codes": share_codes(finished, some, files),
         "buffers": gallery.buffers(with_images),
         "recipes": recipes,
-        "weather": weather_of_recipes(finished, draws, shown),
+        "weather": weather_of_recipes(draws),
         "scenes": group_by(table, "scene"),
         "kinds": files_by_kind(listing, own),
         "failures": group_failures(table),
         "problems": sorted(files.problems.items()),
         "unlisted": files.unlisted,
-        "facts": _facts(table),
+        "facts": _facts(table, cameras),
+        "style": style,
         "script": script,
         # Only this very script runs, whatever may have slipped into the text.
         "digest": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        "style": _asset("report.css"),
     }
-    text = _environment().get_template("report.html").render(facts)
+    text = environment.get_template("report.html").render(facts)
     return text, len(files.problems) + files.unlisted
 
 
@@ -200,123 +196,68 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "number": count, "plural": plural_of, "bytes": byte_size, "percent": percent,
-        "listed": listed,
+        "short": short, "with_unit": with_unit,
     }  # fmt: skip
-    environment.globals |= {
-        "depth_gradient": depth_gradient, "max_rows": MAX_ROWS, "open_rows": OPEN_ROWS,
-        "max_charts": MAX_CHARTS, "max_failures": MAX_FAILURES,
-    }  # fmt: skip
+    environment.globals |= {"depth_gradient": depth_gradient, **LIMITS}
     return environment
 
 
-def _asset(name: str) -> Markup:
-    return Markup((resources.files("tools") / "templates" / name).read_text(encoding="utf-8"))
-
-
-class Group(NamedTuple):
-    """The images of a scene, of a recipe, or of all. source: of a scene, else empty."""
-
-    name: str
-    source: str
-    finished: int
-    failed: int
-    scenes: int
-    variants: int
-    frames: int
-    cameras: int
-
-
-class Failure(NamedTuple):
-    """Failed images whose messages differ in numbers alone. message: of the first of them."""
-
-    message: str
-    images: int
-    examples: list[str]
-
-
-class Files(NamedTuple):
-    """files, bytes: of one kind."""
-
-    kind: str
-    files: int
-    bytes: int
+def _asset(environment: Environment, name: str) -> Markup:
+    return Markup(environment.loader.get_source(environment, name)[0])
 
 
 def add_variant_key(table: pa.Table) -> pa.Table:
     """With a column `draw`: one whole number for each scene and variant, in the table's order."""
-    return table.append_column("draw", _codes(table, ("scene", "variant"), ""))
+    return table.append_column("draw", pa.array(value_codes(table, "scene", "variant"), pa.int64()))
 
 
-def overall(table: pa.Table) -> Group:
-    """Of the whole output. table: as `add_variant_key` returns it."""
-    everything = table.append_column("all", pa.array([""] * table.num_rows, pa.string()))
-    groups = group_by(everything, "all")
-    return groups[0] if groups else Group("", "", 0, 0, 0, 0, 0, 0)
-
-
-def group_by(table: pa.Table, column: str) -> list[Group]:
-    """Sorted by name. Frames are counted once per scene, whatever their variants and cameras."""
-    finished = pc.equal(table["status"], OK).cast(pa.int64())
-    table = table.append_column("finished", finished)
-    table = table.append_column("place", _codes(table, ("scene", "frame"), "?"))
-    functions = [("finished", "sum"), ("finished", "count"), ("source", "min")] + [
-        (name, "count_distinct") for name in ("scene", "draw", "place", "camera")
-    ]
-    rows = table.group_by(column).aggregate(functions).to_pylist()
-    groups = [
-        Group(
-            name=row[column] or "",
-            source=row["source_min"] or "",
-            finished=row["finished_sum"] or 0,
-            failed=row["finished_count"] - (row["finished_sum"] or 0),
-            scenes=row["scene_count_distinct"],
-            variants=row["draw_count_distinct"],
-            frames=row["place_count_distinct"],
-            cameras=row["camera_count_distinct"],
-        )
-        for row in rows
-    ]
-    return sorted(groups, key=lambda group: group.name)
-
-
-def listed(groups: Sequence[Group]) -> dict[str, Any]:
-    """The groups that a table has room for, with failures first where not all fit, and how many
-    others there are with how many images.
+def group_by(table: pa.Table, *column: str) -> list[dict[str, Any]]:
+    """What there is of images that share a value of the column, by name; of all without a column.
+    table: as `add_variant_key` returns it.
     """
-    if len(groups) > MAX_ROWS:
-        groups = sorted(groups, key=lambda group: (-group.failed, group.name))
-    rest = groups[MAX_ROWS:]
-    return {
-        "rows": groups[:MAX_ROWS],
-        "others": len(rest),
-        "finished": sum(group.finished for group in rest),
-        "failed": sum(group.failed for group in rest),
-    }
+    is_ok = pc.equal(table["status"], OK)
+    for name, values in (
+        ("finished", is_ok.cast(pa.int64())),
+        ("failed", pc.invert(is_ok).cast(pa.int64())),
+        ("place", pa.array(value_codes(table, "scene", "frame"))),
+    ):
+        table = table.append_column(name, values)
+    counted = table.group_by([*column]).aggregate([*_COUNTS.values()])
+    named = counted.rename_columns([*("name" for _ in column), *_COUNTS])
+    groups = [{name: value or 0 for name, value in row.items()} for row in named.to_pylist()]
+    return sorted(groups, key=lambda group: group.get("name", ""))
 
 
-def group_failures(table: pa.Table) -> list[Failure]:
-    """Most frequent first. Numbers in messages are often frames and paths: they are looked past."""
+def group_failures(table: pa.Table) -> list[dict[str, Any]]:
+    """Failed images whose messages differ in numbers alone, which are often frames and paths: the
+    first message, how many images, and examples of them. Most frequent first.
+    """
     failed = table.filter(pc.not_equal(table["status"], OK))
     names = ("message", "scene", "variant", "frame", "camera")
-    found: dict[str, Failure] = {}
+    found: dict[str, dict[str, Any]] = {}
     for message, *place in zip(*(failed[name].to_pylist() for name in names), strict=True):
-        key = _DIGITS.sub("#", message or "")
-        known = found.setdefault(key, Failure(message or "no message", 0, []))
-        if known.images < MAX_EXAMPLES:
-            known.examples.append("{} · {} · frame {} · {}".format(*place))
-        found[key] = known._replace(images=known.images + 1)
-    return sorted(found.values(), key=lambda failure: (-failure.images, failure.message))
+        known = found.setdefault(
+            _DIGITS.sub("#", message),
+            {"message": message or "no message", "images": 0, "examples": []},
+        )
+        known["images"] += 1
+        if known["images"] <= MAX_EXAMPLES:
+            known["examples"].append("{} · {} · frame {} · {}".format(*place))
+    return sorted(found.values(), key=lambda failure: (-failure["images"], failure["message"]))
 
 
-def files_by_kind(listing: Mapping[str, StoredFile], own: Sequence[str] = ()) -> list[Files]:
+def files_by_kind(
+    listing: Mapping[str, StoredFile], own: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     """What lies in the output, the largest kind first. own: the page itself, which is left out."""
-    found: dict[str, Files] = {}
+    files, size = Counter[str](), Counter[str]()
     for path, stored in listing.items():
         if path not in own:
             kind = _kind_of(path)
-            _, files, size = found.get(kind, (kind, 0, 0))
-            found[kind] = Files(kind, files + 1, size + stored.size)
-    return sorted(found.values(), key=lambda files: (-files.bytes, files.kind))
+            files[kind] += 1
+            size[kind] += stored.size
+    kinds = sorted(files, key=lambda kind: (-size[kind], kind))
+    return [{"kind": kind, "files": files[kind], "bytes": size[kind]} for kind in kinds]
 
 
 def _kind_of(path: str) -> str:
@@ -330,181 +271,154 @@ def _kind_of(path: str) -> str:
     return folder if folder in known and len(parts) > 2 else OTHER
 
 
-def sample_text(files: int, of: int) -> str:
+def _sample_text(files: int, of: int) -> str:
     """How much of what there is was looked at."""
     return "" if files >= of else f"; from {files:,} of {count(of, 'file')}, evenly chosen"
 
 
-class Classes(NamedTuple):
-    """Boxes by class, the most frequent first: (class, boxes, tracks)."""
-
-    rows: list[tuple[str, int, int]]
-    sample: str
-
-
-class Bars(NamedTuple):
-    """Counts in categories for every recipe that has any: (recipe, [c] counts). noun: what is
-    counted. keys: (name, CSS class) of each category.
+def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
+    """Boxes by class, the most frequent first: (class, boxes, tracks). Of every scene's first
+    variant that has labels: they are the same in the others.
     """
-
-    rows: list[tuple[str, list[int]]]
-    sample: str
-    noun: str
-    keys: list[tuple[str, str]]
-
-    def parts(self, counts: Sequence[int]) -> list[tuple[str, float, str, str]]:
-        """CSS class, share, name and title of each part of a recipe's bar."""
-        total = sum(counts)
-        return [
-            (css, n / total, f"{name} {percent(n, total)}", f"{name}: {n:,} ({percent(n, total)})")
-            for n, (name, css) in zip(counts, self.keys, strict=True)
-            if n
-        ]
-
-
-def count_classes(table: pa.Table, files: ReportFiles) -> Classes | None:
-    """Of every scene's first variant that has labels: they are the same in the others."""
     labelled = table.filter(pc.is_valid(table["labels_path"]))
-    if not labelled.num_rows:
-        return None
-    first = labelled["draw"].take(pa.array(first_of_each(labelled, "scene"))).combine_chunks()
-    of_first = labelled.filter(pc.is_in(labelled["draw"], value_set=first))
-    rows = first_of_each(of_first, "labels_path")
-    chosen = evenly(rows, MAX_BOX_FILES)
-    boxes: Counter[str] = Counter()
-    tracks: set[tuple[str, str, str]] = set()
-    read = 0
-    for row in of_first.select(["scene", "labels_path"]).take(pa.array(chosen)).to_pylist():
+    first = labelled["draw"].take(first_of_each(labelled, "scene")).combine_chunks()
+    labelled = labelled.filter(pc.is_in(labelled["draw"], value_set=first))
+    rows = first_of_each(labelled, "labels_path").tolist()
+    boxes, tracks, read = Counter[str](), set[tuple[str, str, str]](), 0
+    chosen = pa.array(evenly(rows, MAX_BOX_FILES), pa.int64())
+    for row in labelled.select(["scene", "labels_path"]).take(chosen).to_pylist():
         found = files.read_columns(row["labels_path"], ("label", "track_id"))
         if found is None or found.num_columns < 2:
             continue
         read += 1
-        labels, ids = (found[name].to_pylist() for name in ("label", "track_id"))
-        boxes.update(map(str, labels))
-        tracks |= {(str(a), row["scene"], str(b)) for a, b in zip(labels, ids, strict=True)}
+        labels, ids = (map(str, found[name].to_pylist()) for name in ("label", "track_id"))
+        for label, track in zip(labels, ids, strict=True):
+            boxes[label] += 1
+            tracks.add((label, row["scene"], track))
     tracked = Counter(label for label, *_ in tracks)
     order = sorted(boxes, key=lambda label: (-boxes[label], label))
     counted = [(label, boxes[label], tracked[label]) for label in order]
-    return Classes(counted, sample_text(read, len(rows))) if counted else None
+    return {"rows": counted, "sample": _sample_text(read, len(rows))} if counted else None
 
 
-def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars | None:
+def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
     """How much the weather leaves of each box that an image shows, in VISIBILITY_STEPS.
 
     The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
     """
     says = (kind for kind, of_boxes in box_tables().items() if of_boxes.visible or of_boxes.hidden)
     columns = [f"{kind}_path" for kind in says if f"{kind}_path" in table.column_names]
-    rows, read, there = [], 0, 0
-    for recipe in recipes:
-        own = table.filter(pc.equal(table["recipe"], recipe))
-        found = own.group_by(columns, use_threads=False).aggregate([]).to_pylist()
-        sets = sorted((tuple(row[c] for c in columns) for row in found), key=str)
-        sets = [paths for paths in sets if any(paths)]
-        there += len(sets)
-        counts = np.zeros(len(VISIBILITY_STEPS), np.int64)
-        for paths in evenly(sets, MAX_TABLES):
-            visible = _visible(dict(zip(columns, paths, strict=True)), files)
-            if visible is None:
-                continue
-            read += 1
-            edges = [*VISIBILITY_STEPS, np.inf]
-            counts += np.histogram(np.clip(visible, 0, 1), edges)[0]
-        if counts.any():
-            rows.append((recipe, counts.tolist()))
+
+    def counted(paths: dict[str, str | None]) -> Counter[int] | None:
+        if (visible := _visible(paths, files)) is None:
+            return None
+        bins = np.digitize(np.clip(visible, 0, 1), VISIBILITY_STEPS) - 1
+        return Counter(bins.tolist())
+
+    found, sample = _count_by_recipe(table, recipes, columns, MAX_TABLES, counted)
     bounds = [f"{100 * step:.0f}" for step in VISIBILITY_STEPS] + ["100"]
-    keys = [(f"{a}–{b} %", f"s{i}") for i, (a, b) in enumerate(itertools.pairwise(bounds))]
-    return Bars(rows, sample_text(read, there), "box", keys) if rows else None
+    keys = {i: (f"{a}–{b} %", f"s{i}") for i, (a, b) in enumerate(itertools.pairwise(bounds))}
+    return _bars(found, sample, "box", keys)
 
 
-def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> Bars | None:
+def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
     """How many points of each recipe's sweeps have which weather code.
 
     None where no sweep has the column `weather_code`.
     """
-    counted: list[tuple[str, Counter[int]]] = []
-    read, there = 0, 0
+
+    def counted(paths: dict[str, str | None]) -> Counter[int] | None:
+        sweep = files.read_columns(str(paths["lidar_path"]), ("weather_code",))
+        if sweep is None or not sweep.num_columns:
+            return None
+        column = sweep["weather_code"].drop_null()
+        is_whole = pa.types.is_integer(column.type)
+        entries = pc.value_counts(column).to_pylist() if is_whole else ()
+        return Counter({entry["values"]: entry["counts"] for entry in entries})
+
+    found, sample = _count_by_recipe(table, recipes, ["lidar_path"], MAX_SWEEPS, counted)
+    known = sorted({code for _, counts in found for code in counts})
+    keys = {code: (_CODES.get(code, f"code {code}"), f"c{i % 8}") for i, code in enumerate(known)}
+    return _bars(found, sample, "point", keys)
+
+
+def _count_by_recipe(
+    table: pa.Table,
+    recipes: list[str],
+    columns: list[str],
+    most: int,
+    counted: Callable[[dict[str, str | None]], Counter[int] | None],
+) -> tuple[list[tuple[str, Counter[int]]], str]:
+    """The sum of what is counted in the files of each recipe that has any, of at most `most` of
+    those that its rows name together, and how much that is of all.
+    """
+    found, read, there = [], 0, 0
     for recipe in recipes:
         own = table.filter(pc.equal(table["recipe"], recipe))
-        paths = sorted(path for path in pc.unique(own["lidar_path"]).to_pylist() if path)
-        found: Counter[int] = Counter()
-        for path in evenly(paths, MAX_SWEEPS):
-            sweep = files.read_columns(path, ("weather_code",))
-            if sweep is None or not sweep.num_columns:
-                break  # a recipe's sweeps all have the column, or none has it
-            read += 1
-            column = sweep["weather_code"]
-            if pa.types.is_integer(column.type):
-                entries = pc.value_counts(column.combine_chunks()).to_pylist()
-                found.update({e["values"]: e["counts"] for e in entries if e["values"] is not None})
-        if found:
-            there += len(paths)
-            counted.append((recipe, found))
-    known = sorted({code for _, found in counted for code in found})
-    rows = [(recipe, [found[code] for code in known]) for recipe, found in counted]
-    keys = [(_CODES.get(code, f"code {code}"), f"c{i % 8}") for i, code in enumerate(known)]
-    return Bars(rows, sample_text(read, there), "point", keys) if rows else None
+        sets = own.group_by(columns, use_threads=False).aggregate([]).to_pylist()
+        sets = [paths for paths in sets if any(paths.values())]
+        sets.sort(key=lambda paths: str([*paths.values()]))
+        each = [counts for s in evenly(sets, most) if (counts := counted(s)) is not None]
+        if total := sum(each, Counter[int]()):
+            found.append((recipe, total))
+        there += len(sets) if each else 0
+        read += len(each)
+    return found, _sample_text(read, there)
 
 
-def _visible(paths: dict[str, str | None], files: ReportFiles) -> np.ndarray | None:
+def _bars(
+    found: list[tuple[str, Counter[int]]], sample: str, noun: str, keys: Mapping[int, tuple]
+) -> dict[str, Any] | None:
+    """For every recipe that has any, (CSS class, name, count) of each part of its bar. noun: what
+    is counted. keys: (name, CSS class) of each category.
+    """
+    rows = [(r, [(*keys[k][::-1], counts[k]) for k in keys if counts[k]]) for r, counts in found]
+    bars = {"rows": rows, "sample": sample, "noun": noun, "keys": [*keys.values()]}
+    return bars if rows else None
+
+
+def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray | None:
     """float64 [boxes that a pixel shows] of the images that a variant's tables hold."""
     parts = []
     for column, path in paths.items():
         if path is None:
             continue
         kind = box_tables()[column.removesuffix("_path")]
-        name, counted = kind.visible or kind.hidden, [n for n in ("pixels",) if n in kind.columns]
-        found = files.read_columns(path, (*_BOX, *counted, name))
+        says, counted = kind.visible or kind.hidden, "pixels" in kind.columns
+        types = {**_BOX, **({"pixels": pa.int64()} if counted else {}), says: pa.float64()}
+        found = files.read_columns(path, (*types,))
         if found is None:
             return None
-        if found.num_columns < len(_BOX) + len(counted) + 1:  # of an output older than `pixels`
+        if found.num_columns < len(types):  # of an output older than `pixels`
             continue
-        if found.schema.types != [*_BOX_TYPES, *(pa.int64() for _ in counted), pa.float64()]:
+        if found.schema.types != [*types.values()]:
             return files.note(path, "its columns are not of the types that a job writes")
-        value = kind.left({name: np.asarray(pc.fill_null(found[name], np.nan), np.float64)})
-        shown = pa.array(np.ones(found.num_rows, np.int8))
-        if counted:
-            shown = pc.fill_null(pc.greater(found["pixels"], 0), False).cast(pa.int8())
-        part = found.select(list(_BOX))
-        part = part.append_column("left", pa.array(np.where(np.isfinite(value), value, 1.0)))
-        parts.append(part.append_column("shown", shown))
+        left = pc.subtract(1.0, found[says]) if kind.hidden else found[says]
+        left = pc.fill_null(pc.if_else(pc.is_finite(left), left, 1.0), 1.0)
+        shown = pc.greater(found["pixels"], 0) if counted else pa.repeat(True, len(found))
+        part = found.select(list(_BOX)).append_column("left", left)
+        parts.append(part.append_column("shown", pc.fill_null(shown, False)))
     if not parts:
         return None
     together = pa.concat_tables(parts).group_by(list(_BOX), use_threads=False)
-    boxes = together.aggregate([("left", "product"), ("shown", "max")])
-    return boxes.filter(pc.equal(boxes["shown_max"], 1))["left_product"].to_numpy()
+    boxes = together.aggregate([("left", "product"), ("shown", "any")])
+    return boxes.filter(boxes["shown_any"])["left_product"].to_numpy()
 
 
-def _facts(table: pa.Table) -> list[tuple[str, list[Any]]]:
-    """What all images share, or the few values that they have, the most frequent first."""
-    titles = {
-        "size": "Image size",
-        "camera": "Cameras",
-        "trajectory": "Trajectory",
-        "surface": "Surface of labels",
-        "seed": "Seeds",
-        "version": "Version",
-        "backend": "Backend",
-    }
-    table = table.append_column("size", _joined(table, ("width", "height"), "?", "×"))
-    found = []
-    for column, title in titles.items():
-        counted = pc.value_counts(table[column].combine_chunks()).to_pylist()
-        known = [entry for entry in counted if entry["values"] is not None]
-        known.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
-        found.append((title, [entry["values"] for entry in known[:6]]))
+def _facts(table: pa.Table, cameras: list[str]) -> list[tuple[str, list[Any]]]:
+    """What all images share, or the few values that they have, the most frequent first; cameras as
+    they stand on the car.
+    """
+    sizes = pc.binary_join_element_wise(
+        *(table[name].cast(pa.string()) for name in ("width", "height")), "×"
+    )
+    table, found = table.append_column("size", sizes), []
+    for column, title in _FACTS.items():
+        counted = pc.value_counts(table[column].drop_null()).to_pylist()
+        counted.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
+        values = [entry["values"] for entry in counted[:6]]
+        found.append((title, sorted(values, key=cameras.index) if column == "camera" else values))
     return [(title, values) for title, values in found if values]
-
-
-def _codes(table: pa.Table, names: Sequence[str], null: str) -> pa.Array:
-    """int64 [rows]: one number for each combination of the columns' values."""
-    joined = _joined(table, names, null, "\0")
-    return pc.dictionary_encode(joined).combine_chunks().indices.cast(pa.int64())
-
-
-def _joined(table: pa.Table, names: Sequence[str], null: str, between: str) -> pa.ChunkedArray:
-    columns = [pc.fill_null(table[name].cast(pa.string()), null) for name in names]
-    return pc.binary_join_element_wise(*columns, between)
 
 
 def _name_of(store: Store) -> str:

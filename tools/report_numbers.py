@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from markupsafe import Markup
 
 from augment.jobs.manifest import effect_masks, weather_columns
 from recipes.effect import Column
 from recipes.schema import columns_of_effects
+from tools.drawing import linear_ticks, log_ticks
 
 MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic
 MAX_MARKS = 300
-_WIDTH, _LEFT, _RIGHT, _TOP, _FLOOR = 340, 6, 6, 14, 104  # of a histogram, in SVG units
+WIDTH, LEFT, RIGHT, TOP, FLOOR = 340, 6, 6, 14, 104  # of a histogram, in SVG units
 _MAX_NUMBER = 1e99  # greater numbers are as little a weather's as infinity is
 _BYTES = ("B", "kB", "MB", "GB", "TB", "PB")
 # By ending of a column's name, the longest first.
@@ -35,44 +35,36 @@ _UNITS = {
 
 def quantity_of(column: str) -> Column:
     """What a number of an effect in the manifest means; one not known by its name's ending."""
-    known = columns_of_effects().get(column)
-    if known is not None:
-        return known
+    if column in (known := columns_of_effects()):
+        return known[column]
     ending = next((e for e in _UNITS if column.endswith(e)), "")
     name = column.removesuffix(ending).replace("_", " ").strip()
-    title, unit = name[:1].upper() + name[1:], _UNITS.get(ending, "")
-    return Column(column, lambda section: None, title=title, unit=unit)
+    title = name[:1].upper() + name[1:]
+    return Column(column, lambda section: None, title=title, unit=_UNITS.get(ending, ""))
 
 
-def _is_there(quantity: Column, numbers: np.ndarray) -> np.ndarray:
-    """bool [n]: which of the manifest's numbers say that the effect is there, of those at which it
-    is not absent."""
+def shown_numbers(quantity: Column, numbers: np.ndarray) -> np.ndarray:
+    """float64 [n] in the unit shown; NaN where the manifest's numbers say that there is no effect,
+    or are none that an effect has.
+    """
     there = np.abs(numbers) < _MAX_NUMBER  # false for NaN
     if quantity.absent == 0:
         there &= numbers != 0
     if quantity.over is not None:  # a visibility of infinity or below 0 is none
         there &= numbers > 1 / _MAX_NUMBER
-    return there
+    return quantity.shown(np.where(there, numbers, np.nan))
 
 
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Each scene and variant once, sorted by the column `draw` [d].
-
-    first: int64 [d], the row of its first image. images: int64 [d]. clear: bool [d], without
-    weather and style.
+def find_draws(table: pa.Table) -> pa.Table:
+    """The first row of each scene and variant, with the columns `images`, how many it has, and
+    `is_clear`, without weather and style. table: of finished images, with the column `draw`.
     """
-
-    draw: np.ndarray
-    first: np.ndarray
-    images: np.ndarray
-    clear: np.ndarray
-
-
-def find_draws(table: pa.Table) -> Draws:
-    """Of a table of finished images with the column `draw`."""
-    draw, first, images = np.unique(table["draw"].to_numpy(), return_index=True, return_counts=True)
-    return Draws(draw, first, images, _is_clear(table.take(pa.array(first))))
+    _, first, images = np.unique(table["draw"].to_numpy(), return_index=True, return_counts=True)
+    rows = table.take(first)
+    numbers = {name: _as_floats(rows, name) for name in _number_columns(rows)}
+    weathered = np.logical_or.reduce([*effect_masks(numbers, rows.num_rows).values()])
+    rows = rows.append_column("images", pa.array(images))
+    return rows.append_column("is_clear", pa.array(~weathered))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,21 +81,16 @@ class Spread:
     absent_images: int
 
     @property
-    def bounds(self) -> tuple[float, float]:
-        return float(self.values.min()), float(self.values.max())
-
-    @property
     def is_constant(self) -> bool:
         """All values are one, but for rounding."""
-        low, high = self.bounds
+        low, high = self.values.min(), self.values.max()
         return not high - low > 1e-9 * max(abs(low), abs(high))
 
     @property
     def range_text(self) -> str:
-        low, high = self.bounds
-        if self.is_constant:
-            return with_unit(low, self.quantity.unit)
-        return f"{short(low)} to {with_unit(high, self.quantity.unit)}"
+        low = "" if self.is_constant else f"{short(self.values.min())} to "
+        highest = self.values.min() if self.is_constant else self.values.max()
+        return low + with_unit(highest, self.quantity.unit)
 
     @property
     def where_text(self) -> str:
@@ -111,42 +98,42 @@ class Spread:
         return f"{text}; absent in {self.absent_images:,}" if self.absent_images else text
 
 
-def spreads(table: pa.Table, draws: Draws) -> list[Spread]:
+def spreads(draws: pa.Table) -> list[Spread]:
     """Of every weather column that some image has a number in; a variant's images all have its."""
-    rows = table.take(pa.array(draws.first))
-    found = []
-    for column in _number_columns(table):
-        quantity, numbers = quantity_of(column), _as_floats(rows, column)
-        there = _is_there(quantity, numbers)
+    found, images = [], draws["images"].to_numpy()
+    for name in _number_columns(draws):
+        quantity = quantity_of(name)
+        values = shown_numbers(quantity, _as_floats(draws, name))
+        there = ~np.isnan(values)
         if there.any():
-            values, images = quantity.shown(numbers[there]), draws.images[there]
-            found.append(Spread(quantity, values, images, int(draws.images[~there].sum())))
+            absent = int(images[~there].sum())
+            found.append(Spread(quantity, values[there], images[there], absent))
     return found
 
 
-def weather_of_recipes(table: pa.Table, draws: Draws, names: Collection[str]) -> dict[str, str]:
-    """What the variants of each of these recipes drew, in words; "" without weather."""
-    rows = table.take(pa.array(draws.first))
-    recipes = np.array(rows["recipe"].to_pylist(), object)
+def weather_of_recipes(draws: pa.Table) -> dict[str, str]:
+    """What the variants of each recipe drew, in words; "" without weather."""
     words = [c for c in columns_of_effects().values() if not c.is_number and c.title]
-    named = [(column.title, rows[column.name].to_pylist()) for column in words]
-    numbers = [(quantity_of(name), _as_floats(rows, name)) for name in _number_columns(table)]
-    numbers = [(q, q.shown(np.where(_is_there(q, v), v, np.nan))) for q, v in numbers]
+    numbers = [quantity_of(name) for name in _number_columns(draws)]
+    ranges = {
+        q.name: pa.array(shown_numbers(q, _as_floats(draws, q.name)), from_pandas=True)
+        for q in numbers
+    }
+    table = draws.select(["recipe", *(c.name for c in words)])
+    for name, values in ranges.items():
+        table = table.append_column(name, values)
+    ends = [(q.name, end) for q in numbers for end in ("min", "max")]
+    groups = table.group_by("recipe").aggregate([*((c.name, "distinct") for c in words), *ends])
     found = {}
-    for recipe in names:
-        own = np.flatnonzero(recipes == recipe)
-        if not len(own):
-            continue
-        texts = []
-        for title, values in named:
-            if names := sorted({v for k in own if (v := values[k]) is not None}):
-                texts.append(f"{title}: {', '.join(names[:4])}")
-        known = [(q, there) for q, v in numbers if len(there := v[own][~np.isnan(v[own])])]
-        for quantity, there in known[:10]:
-            low, high = float(there.min()), float(there.max())
+    for row in groups.to_pylist():
+        names = {c.title: sorted(set(row[f"{c.name}_distinct"]) - {None}) for c in words}
+        texts = [f"{title}: {', '.join(each[:4])}" for title, each in names.items() if each]
+        known = [q for q in numbers if row[f"{q.name}_min"] is not None]
+        for quantity in known[:10]:
+            low, high = row[f"{quantity.name}_min"], row[f"{quantity.name}_max"]
             span = short(low) if low == high else f"{short(low)} to {short(high)}"
             texts.append(f"{quantity.title} {span} {quantity.unit}".rstrip())
-        found[recipe] = "; ".join(texts)
+        found[row["recipe"]] = "; ".join(texts)
     return found
 
 
@@ -157,10 +144,11 @@ def weather_text(row: Mapping[str, Any]) -> str:
         value = row.get(column.name)
         if not column.label or value is None:
             continue
-        if not column.is_number:
+        if column.is_number:
+            value = float(shown_numbers(column, np.array([value], float))[0])
+            value = None if math.isnan(value) else with_unit(value, column.unit)
+        if value is not None:
             texts.append(f"{column.label} {value}")
-        elif _is_there(column, np.array([value], float))[0]:
-            texts.append(f"{column.label} {with_unit(column.shown(float(value)), column.unit)}")
     return ", ".join(texts) or "no weather"
 
 
@@ -175,13 +163,7 @@ def _number_columns(table: pa.Table) -> list[str]:
 
 def _as_floats(table: pa.Table, column: str) -> np.ndarray:
     """float64 [rows]; null is NaN."""
-    return np.asarray(pc.fill_null(table[column], np.nan).to_numpy(), np.float64)
-
-
-def _is_clear(rows: pa.Table) -> np.ndarray:
-    """bool [rows]: without weather and style."""
-    numbers = {column: _as_floats(rows, column) for column in _number_columns(rows)}
-    return ~np.logical_or.reduce(list(effect_masks(numbers, rows.num_rows).values()))
+    return pc.fill_null(table[column], np.nan).to_numpy().astype(np.float64)
 
 
 def histogram(
@@ -201,71 +183,39 @@ def histogram(
     return edges, counts, log
 
 
-class Chart(NamedTuple):
-    """A histogram as the template draws it, places in SVG units.
+def chart(spread: Spread) -> dict[str, Any]:
+    """A histogram for the template, places in SVG units.
 
-    bars: (x, y, width, height, what it counts). marks: the path of a tick for each variant beneath.
-    labels: (x, anchor, number) of the axis. scale: its unit. most: the tallest bar's count.
+    bars: (x, y, width, height, from, to, images). marks: x of a tick for each variant beneath, of
+    at most MAX_MARKS, evenly chosen. labels: (x, number) of the axis. most: of the tallest bar.
     """
-
-    spread: Spread
-    bars: list[tuple[str, str, str, str, str]]
-    marks: Markup
-    labels: list[tuple[str, str, str]]
-    scale: str
-    most: str
-
-
-def chart(spread: Spread) -> Chart:
-    """Bars count images; of the ticks beneath MAX_MARKS are drawn at most, evenly chosen."""
     edges, counts, log = histogram(spread.values, spread.images, linear=spread.quantity.linear)
-    unit = spread.quantity.unit
-    places = np.log(edges) if log else edges
-    span = float(places[-1] - places[0]) or 1.0
-    right = _WIDTH - _RIGHT
+    low, high = (math.log(e) if log else float(e) for e in edges[[0, -1]])
 
     def x_of(value: float) -> float:
-        place = math.log(value) if log else value
-        return _LEFT + (right - _LEFT) * min(1.0, max(0.0, (place - places[0]) / span))
+        place = ((math.log(value) if log else value) - low) / ((high - low) or 1.0)
+        return LEFT + (WIDTH - RIGHT - LEFT) * min(1.0, max(0.0, place))
 
     tallest = max(float(counts.max()), 1.0)
     bars = []
     for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True):
         if n > 0:
-            # One of a million still shows.
-            y, x, end = min(_FLOOR - (_FLOOR - _TOP) * n / tallest, _FLOOR - 1.5), x_of(a), x_of(b)
-            box = (x + 0.5, y, max(end - x - 1, 1), _FLOOR - y)
-            title = f"{with_unit(a, unit)} to {with_unit(b, unit)}: {count(int(n), 'image')}"
-            bars.append((*(f"{number:.1f}" for number in box), title))
+            y = min(FLOOR - (FLOOR - TOP) * n / tallest, FLOOR - 1.5)  # one of a million shows
+            bars.append((x_of(a) + 0.5, y, max(x_of(b) - x_of(a) - 1, 1), FLOOR - y, a, b, int(n)))
     marks = np.sort(spread.values)
     marks = marks[np.linspace(0, len(marks) - 1, min(len(marks), MAX_MARKS)).astype(int)]
-    stems = "".join(f"M{x:.1f} {_FLOOR + 4}v8" for x in sorted({x_of(float(v)) for v in marks}))
-    labels = []
-    for value in ticks(float(edges[0]), float(edges[-1]), log):
-        x = x_of(value)
-        anchor = "start" if x < _LEFT + 16 else "end" if x > right - 16 else "middle"
-        labels.append((f"{x:.1f}", anchor, short(value)))
-    scale = f"{unit}{', log scale' if log else ''}".lstrip(", ")
-    return Chart(spread, bars, Markup(stems), labels, scale, count(int(tallest)))
-
-
-def ticks(low: float, high: float, log: bool) -> list[float]:
-    """Round numbers within [low, high]: 1, 2 or 5 times powers of ten."""
+    ticks = linear_ticks(float(edges[0]), float(edges[-1]))
     if log:
-        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        every = [m * 10.0**p for p in powers for m in (1, 2, 5)]
-        inside = [v for v in every if low <= v <= high]
-        tens = [v for v in inside if math.log10(v) % 1 < 1e-9]
-        shown = inside if len(inside) <= 5 or len(tens) < 2 else tens
-        return shown[:: -(-len(shown) // 5)]
-    rough = (high - low) / 6
-    if rough < 1e-300:
-        return [low]
-    unit = 10.0 ** math.floor(math.log10(rough))
-    step = next(m * unit for m in (1, 2, 5, 10) if m * unit >= rough * 0.999)
-    first = math.ceil(low / step - 1e-9)
-    found = [(first + k) * step for k in range(8)]
-    return [v for v in found if low - 1e-9 * step <= v <= high + 1e-9 * step]
+        ticks = log_ticks(float(edges[0]), float(edges[-1]), most=5)
+        ticks = ticks[:: -(-len(ticks) // 5)]
+    return {
+        "spread": spread,
+        "bars": bars,
+        "marks": sorted({x_of(float(value)) for value in marks}),
+        "labels": [(x_of(value), value) for value in ticks],
+        "is_log": log,
+        "most": int(tallest),
+    }
 
 
 def with_unit(number: float, unit: str) -> str:
@@ -275,10 +225,8 @@ def with_unit(number: float, unit: str) -> str:
 
 def short(number: float) -> str:
     """Three significant digits, no exponent where there need be none."""
-    if not math.isfinite(number):
-        return str(number)
-    if number == 0:
-        return "0"
+    if not math.isfinite(number) or number == 0:
+        return f"{number + 0.0:g}"  # without the sign of -0.0
     size = abs(number)
     if size >= 1e7 or size < 1e-4:
         return f"{number:.2e}".replace("-", "−")

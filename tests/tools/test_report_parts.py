@@ -13,6 +13,7 @@ from augment.jobs.manifest import rows_to_table
 from augment.jobs.store import LocalStore, StoredFile
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report, report_numbers, report_pictures
+from tools.drawing import evenly, linear_ticks, log_ticks
 from tools.report_numbers import (
     Spread,
     byte_size,
@@ -69,23 +70,19 @@ def test_a_histogram_counts_every_image_once() -> None:
 def test_any_range_can_be_drawn(values) -> None:
     spread = Spread(quantity_of("x_m"), np.array(values), np.ones(len(values), int), 0)
     drawn = chart(spread)
-    assert sum(int(title.split(": ")[1].split()[0]) for *_, title in drawn.bars) == len(values)
-    places = [*drawn.bars, *drawn.labels, drawn.marks]
+    assert sum(images for *_, images in drawn["bars"]) == len(values)
+    places = [*drawn["bars"], *drawn["labels"], drawn["marks"]]
     assert "nan" not in str(places) and "inf" not in str(places)
 
 
 def test_axes_have_a_few_round_numbers() -> None:
-    for low, high, log in (
-        (0.81, 1, False),
-        (-0.02, 0.31, False),
-        (30, 2000, True),
-        (1, 1e9, True),
-    ):
-        found = report_numbers.ticks(low, high, log)
-        assert 2 <= len(found) <= 7 and low <= min(found) and max(found) <= high
-        steps = [] if log else np.diff(found)
-        assert log or steps == pytest.approx(steps[0])
-        assert {f"{s:.3e}"[:5] for s in steps} <= {"1.000", "2.000", "5.000"}
+    for low, high in ((0.81, 1), (-0.02, 0.31), (12.3, 26.1)):
+        found = linear_ticks(low, high)
+        steps = np.diff(found)
+        assert 2 <= len(found) <= 8 and low <= min(found) and max(found) <= high
+        assert steps == pytest.approx(steps[0]) and f"{steps[0]:.0e}"[0] in "125"
+    assert log_ticks(30, 2000, most=5) == [100, 1000]
+    assert log_ticks(30, 300, most=5) == [50, 100, 200]
 
 
 def test_spreads_leave_out_what_is_absent() -> None:
@@ -93,7 +90,7 @@ def test_spreads_leave_out_what_is_absent() -> None:
     rows += [make_row(recipe="fog", frame=i, smog_extinction_per_m=0.03912) for i in range(3)]
     rows += [make_row(recipe="odd", smog_extinction_per_m=math.inf, flood_level_m=0.0)]
     table = as_table(rows)
-    found = {s.quantity.name: s for s in spreads(table, find_draws(table))}
+    found = {s.quantity.name: s for s in spreads(find_draws(table))}
     assert list(found) == ["smog_extinction_per_m", "flood_level_m"]
     smog = found["smog_extinction_per_m"]
     assert smog.values == pytest.approx([100]) and smog.images.tolist() == [3]
@@ -113,7 +110,9 @@ def test_what_counts_as_without_weather() -> None:
         ({"rain_mm_per_h": 0.0}, True),
         ({"rain_mm_per_h": 2.0}, False),
     ):
-        assert find_draws(as_table([make_row(**changes)])).clear.tolist() == [clear], changes
+        assert find_draws(as_table([make_row(**changes)]))["is_clear"].to_pylist() == [clear], (
+            changes
+        )
 
 
 def test_a_row_says_its_weather() -> None:
@@ -125,12 +124,13 @@ def test_a_row_says_its_weather() -> None:
 
 
 def test_groups_count_images_variants_frames_and_cameras() -> None:
-    rows = [*street_rows(), make_row("street-1", "fog", 5, 9, "left", status="failed")]
-    fog = next(g for g in report.group_by(as_table(rows), "recipe") if g.name == "fog")
-    assert (fog.finished, fog.failed, fog.scenes, fog.variants) == (24, 1, 2, 7)
-    assert (fog.frames, fog.cameras) == (5, 2)
-    whole = report.overall(as_table(rows))
-    assert (whole.finished + whole.failed, whole.scenes, whole.variants) == (41, 2, 11)
+    table = as_table([*street_rows(), make_row("street-1", "fog", 5, 9, "left", status="failed")])
+    fog = next(g for g in report.group_by(table, "recipe") if g["name"] == "fog")
+    counts = {"finished": 24, "failed": 1, "scenes": 2, "variants": 7, "frames": 5, "cameras": 2}
+    assert fog == {"name": "fog", "source": "procedural:street-0", **counts}
+    (whole,) = report.group_by(table)
+    assert (whole["finished"] + whole["failed"], whole["scenes"], whole["variants"]) == (41, 2, 11)
+    assert report.group_by(table.slice(0, 0))[0]["finished"] == 0
 
 
 def test_files_are_counted_by_kind() -> None:
@@ -140,7 +140,8 @@ def test_files_are_counted_by_kind() -> None:
         ".climategs/parts/a.parquet": 9, "report.html": 100, "images.txt": 4,
     }  # fmt: skip
     stored = {path: StoredFile(size, 0.0) for path, size in listing.items()}
-    found = {f.kind: (f.files, f.bytes) for f in report.files_by_kind(stored, ["report.html"])}
+    kinds = report.files_by_kind(stored, ["report.html"])
+    found = {kind["kind"]: (kind["files"], kind["bytes"]) for kind in kinds}
     assert found == {
         "images": (1, 30), "depth": (1, 20), "calibration": (2, 3), "other": (2, 7),
         "manifest": (1, 7), report.STATE: (1, 9),
@@ -184,17 +185,18 @@ def test_picked_images_differ_and_are_spread() -> None:
     assert len(keys) == 10 and str(picked) == str(report_pictures.pick_images(table, 10))
     assert len({k[0] for k in keys}) == 3 and len({k[3] for k in keys}) == 2
     assert len(report_pictures.pick_images(table, 10_000)) == table.num_rows
-    assert report_pictures.evenly(list(range(10)), 3) == [1, 5, 8]
+    assert evenly(list(range(10)), 3) == [1, 5, 8]
 
 
 def test_places_pair_clear_with_each_recipe() -> None:
     rows = street_rows(scenes=3)
     rows = [r for r in rows if (r["scene"], r["recipe"]) != ("street-1", "clear")]
     table = as_table(rows)
-    places = report_pictures.pick_places(table, find_draws(table), 4, 6)
-    assert [place.scene for place in places] == ["street-0", "street-2"]
-    assert [row["recipe"] for row in places[0].rows] == ["clear", "fog", "wet"]
-    assert places[0].clear == (True, False, False) and places[0].camera == "front"
+    clear = {row["draw"] for row in table.to_pylist() if row["recipe"] == "clear"}
+    places = report_pictures.pick_places(table, clear, 4, 6)
+    assert [rows[0]["scene"] for rows in places] == ["street-0", "street-2"]
+    assert [row["recipe"] for row in places[0]] == ["clear", "fog", "wet"]
+    assert {row["camera"] for rows in places for row in rows} == {"front"}
 
 
 def test_visibility_is_that_of_the_labels(tmp_path) -> None:
@@ -206,13 +208,14 @@ def test_visibility_is_that_of_the_labels(tmp_path) -> None:
     weather = {k: box_tables()[k].read(tmp_path / path)[0, "front"] for k, path in paths.items()}
     expected = visibility(weather, 3)[:2]  # no pixel shows the third box
     assert expected.tolist() == pytest.approx([0.9 * 0.5 * 0.5, 0.0])
-    assert shares is not None and shares.rows == [("wet", [1, 0, 1, 0, 0, 0])]
-    assert shares.sample == ""  # all of them
+    assert shares is not None
+    assert shares["rows"] == [("wet", [("s0", "0–5 %", 1), ("s2", "20–50 %", 1)])]
+    assert shares["sample"] == ""  # all of them
 
 
 def test_an_image_too_large_to_decode_is_left_alone(tmp_path) -> None:
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\2\0\0\0"
     (tmp_path / "a.png").write_bytes(header + b"\0" * 40)
     files = files_of(tmp_path)
-    assert report_pictures.read_picture(make_row(image_path="a.png"), files) is None
+    assert files.read_picture(make_row(image_path="a.png")) is None
     assert files.problems == {"a.png": "60000x60000 pixels: not looked at"}
