@@ -9,7 +9,7 @@ import pytest
 from generate_jobs import make_job, make_recipes, outputs, raising_render
 
 from augment.errors import GpuLost, OutputError
-from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
+from augment.jobs.generate import GenerateJob, Workers, plan_job, run_generate
 from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.worker import shares_of
 
@@ -22,9 +22,9 @@ def job_of(out: Path, backend: str, **options) -> GenerateJob:
 
 
 def slots_of(job: GenerateJob) -> int:
-    pool = make_pool(job, lambda slot, outcome: None)
-    pool.close()
-    return pool.slots
+    workers = Workers(job)
+    workers.close()
+    return workers.slots
 
 
 def test_one_process_where_a_gpu_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
