@@ -20,8 +20,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -31,14 +30,16 @@ TEMPORARY_SUFFIX = ".climategs-tmp"
 _MAX_SHOWN = 200  # bytes of the final name in the temporary one, which may have 255
 _MAX_WRITING_S = 86400.0  # where the file system has no locks, older files count as left behind
 
+_NOT_WRITABLE = (
+    "the folder is not writable for this user: change its permissions or choose another output "
+    "folder"
+)
 _HINTS = {
     errno.ENOSPC: "the disk is full: free some space and run the same command again",
     errno.EDQUOT: "the disk quota is used up: free some space and run the same command again",
     errno.EFBIG: "the file is larger than this system allows (see `ulimit -f`)",
-    errno.EACCES: "the folder is not writable for this user: change its permissions or choose "
-    "another output folder",
-    errno.EPERM: "the folder is not writable for this user: change its permissions or choose "
-    "another output folder",
+    errno.EACCES: _NOT_WRITABLE,
+    errno.EPERM: _NOT_WRITABLE,
     errno.EROFS: "the file system is mounted read-only: choose another output folder",
     errno.ENOTDIR: "a part of this path is a file, not a folder: choose another output folder",
     errno.EEXIST: "a file of this name is in the way: choose another output folder",
@@ -64,16 +65,20 @@ def replaced_file(
         make_folder(path.parent)
         if clear:
             remove_temporaries(path.parent, name=path.name, recursive=False)
-        temporary, file = _locked_temporary(path, ending)
-        with file:
+        is_ours = False
+        while not is_ours:
+            temporary = path.with_name(temporary_beside(path).name + ending)
+            file = temporary.open("xb")
             try:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-                os.replace(temporary, path)
-            except BaseException:
+                is_ours = _lock_new(temporary, file.fileno())
+                if is_ours:
+                    yield file
+                    file.flush()
+                    os.fsync(file.fileno())
+                    os.replace(temporary, path)
+            finally:
                 temporary.unlink(missing_ok=True)
-                raise
+                file.close()
         if flush:
             flush_folder(path.parent)
 
@@ -81,28 +86,6 @@ def replaced_file(
 def temporary_beside(path: Path) -> Path:
     """A new name in the folder of `path`."""
     return path.with_name(f".{_shown(path.name)}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
-
-
-def hold_temporary(temporary: Path, descriptor: int) -> bool:
-    """Lock a file or folder that was just made; False where it is taken for left behind already."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return is_named(temporary, descriptor)
-
-
-def is_held(descriptor: int) -> bool:
-    """Whether a living process is writing this temporary file or folder."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # a file system without locks
-        return time.time() - os.fstat(descriptor).st_mtime < _MAX_WRITING_S
-    return False
 
 
 def is_named(path: Path, descriptor: int) -> bool:
@@ -123,7 +106,7 @@ def make_folder(folder: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make the names inside the folder durable."""
+    """Make the names inside the folder durable; of a file, its bytes."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -140,9 +123,11 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
     """
     for place, _, names in os.walk(folder):  # passes over folders that vanish meanwhile
         for found in temporary_names(names, name):
-            path = Path(place) / found
+            path = Path(place, found)
             with refusals_of(path):
-                _remove_if_abandoned(path)
+                _clear_abandoned(
+                    path, os.O_NONBLOCK, lambda path=path: path.unlink(missing_ok=True)
+                )
         if not recursive:
             return
 
@@ -173,32 +158,39 @@ def _shown(name: str) -> str:
     return os.fsdecode(os.fsencode(name)[:_MAX_SHOWN])
 
 
-def _locked_temporary(path: Path, ending: str) -> tuple[Path, BinaryIO]:
-    while True:
-        temporary = temporary_beside(path)
-        temporary = temporary.with_name(temporary.name + ending)
-        file = temporary.open("xb")
-        if hold_temporary(temporary, file.fileno()):
-            return temporary, file
-        file.close()
-        temporary.unlink(missing_ok=True)
-
-
-def _remove_if_abandoned(path: Path) -> None:
+def _lock_new(temporary: Path, descriptor: int) -> bool:
+    """Lock a file or folder that was just made; False where it is taken for left behind already."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except FileNotFoundError:
-        return
-    except PermissionError:  # another user's, who may be alive
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return is_named(temporary, descriptor)
+
+
+def _clear_abandoned(path: Path, flags: int, clear: Callable[[], object]) -> None:
+    """Clear a temporary file or folder unless a living process writes it. It is locked meanwhile,
+    for a process that has just made it to notice. flags: to open it with.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | flags)
+    except (FileNotFoundError, PermissionError, NotADirectoryError):  # or of another user
         return
     except OSError as error:
         if error.errno != errno.ELOOP:  # a link, which is not written but made
             raise
-        path.unlink(missing_ok=True)
-        return
+        return path.unlink(missing_ok=True)
     try:
-        if not is_held(descriptor):
-            path.unlink(missing_ok=True)
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        is_written = False
+    except BlockingIOError:
+        is_written = True
+    except OSError:  # a file system without locks
+        is_written = time.time() - os.fstat(descriptor).st_mtime < _MAX_WRITING_S
+    try:
+        if not is_written:
+            clear()
     finally:
         os.close(descriptor)
 
@@ -211,7 +203,7 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, errno.EPERM)
 
 
-@contextmanager
+@contextlib.contextmanager
 def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
     """A new, empty folder that takes the place of `target` when the block ends without an error.
     own: names of the files and folders that make up such a folder; anything else in the old folder
@@ -224,10 +216,12 @@ def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
         try:
             yield new
             for path in [*new.rglob("*"), new]:
-                flush_folder(path)  # or a file
+                flush_folder(path)
             _put_in_place(new, target)
             flush_folder(target.parent)
-            _clear_leftovers(target, own)
+            for name in temporary_names(os.listdir(target.parent), target.name):
+                old = target.with_name(name)
+                _clear_abandoned(old, os.O_DIRECTORY, lambda old=old: _clear(old, target, own))
         finally:
             _clear(new, target, own)
             os.close(descriptor)
@@ -237,13 +231,11 @@ def _locked_folder(target: Path) -> tuple[Path, int]:
     while True:
         new = temporary_beside(target)
         new.mkdir()
-        try:
+        with contextlib.suppress(FileNotFoundError):  # taken for left behind
             descriptor = os.open(new, os.O_RDONLY)
-        except FileNotFoundError:  # taken for left behind
-            continue
-        if hold_temporary(new, descriptor):
-            return new, descriptor
-        os.close(descriptor)
+            if _lock_new(new, descriptor):
+                return new, descriptor
+            os.close(descriptor)
 
 
 def _put_in_place(new: Path, target: Path) -> None:
@@ -277,26 +269,11 @@ def _exchange(one: Path, other: Path) -> bool:
     raise OSError(number, os.strerror(number), str(other))
 
 
-def _clear_leftovers(target: Path, own: Collection[str]) -> None:
-    """Clear what killed processes left beside the folder."""
-    for name in temporary_names(os.listdir(target.parent), target.name):
-        entry = target.with_name(name)
-        try:
-            descriptor = os.open(entry, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError:  # a file, gone since, or another user's
-            continue
-        try:
-            if not is_held(descriptor):
-                _clear(entry, target, own)
-        finally:
-            os.close(descriptor)
-
-
 def _clear(old: Path, target: Path, own: Collection[str]) -> None:
     """Delete a temporary folder. Entries that are not ours move to `target`; where they cannot,
     they and the folder stay, since nobody here may decide to delete them.
     """
-    with suppress(FileNotFoundError):  # somebody else who saves there clears it too
+    with contextlib.suppress(FileNotFoundError):  # somebody else who saves there clears it too
         for entry in list(old.iterdir()):
             if entry.name in own and entry.is_dir():
                 shutil.rmtree(entry)
@@ -334,15 +311,9 @@ def link_file(original: str, target: str) -> bool:
 def copy_file(original: str, target: str) -> None:
     """Copy bytes and time of change."""
     with replaced_file(Path(target), clear=False, flush=False) as file:
-        source = os.open(original, os.O_RDONLY)
-        try:
-            at = 0
-            while sent := os.sendfile(file.fileno(), source, at, 1 << 26):
-                at += sent
-            facts = os.fstat(source)
-            os.utime(file.fileno(), ns=(facts.st_mtime_ns, facts.st_mtime_ns))
-        finally:
-            os.close(source)
+        shutil.copyfile(original, file.name)
+        facts = os.stat(original)
+        os.utime(file.fileno(), ns=(facts.st_mtime_ns, facts.st_mtime_ns))
 
 
 def move_temporary(temporary: Path, target: str) -> None:
