@@ -9,7 +9,6 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from augment.views import render_view
 from recipes.fields import replaced
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
-from tools.output import fill
+from tools.output import compiling_noted, fill
 
 FRAME = "frame"  # the whole view
 ROUNDS = 3  # of all views; the fastest of each counts
@@ -172,18 +171,15 @@ def explain_recipe(
     without, the plan is that of reference.
     """
     template = load_recipe(recipe)
-    if variant >= template.variants:
-        raise ClimateGSError(
-            f"--variant {variant}: {recipe} has {template.variants} variants, 0 to "
-            f"{template.variants - 1}"
-            if template.variants > 1
-            else f"--variant {variant}: {recipe} has one variant, 0"
-        )
+    if variant >= (count := template.variants):
+        there = f"{count} variants, 0 to {count - 1}" if count > 1 else "one variant, 0"
+        raise ClimateGSError(f"--variant {variant}: {template.name} has {there}")
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
     is_open = resolved.quality.is_open
     if is_open and times:
-        resolved = resolve_quality(resolved, scene, progress=True).recipe
+        with compiling_noted():
+            resolved = resolve_quality(resolved, scene, progress=True).recipe
     elif is_open:
         reference = {knob.path: knob.reference for knob in free_knobs(resolved)}
         resolved = resolved_recipe(resolved, reference)
@@ -205,7 +201,8 @@ def explain_recipe(
         "times": None,
     }
     if times and any(frame.cameras for frame in scene.frames):
-        facts["times"] = dataclasses.asdict(measure_passes(resolved, scene))
+        with compiling_noted():
+            facts["times"] = measure_passes(resolved, scene)
     return facts | {"views": _view_facts(plan, scene, resolved.render.scale, all_of_it=times)}
 
 
@@ -232,28 +229,16 @@ def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> d
     }
 
 
-@dataclass(frozen=True)
-class PassTimes:
-    """views: how many were rendered, ROUNDS times each after a warm-up. frame_ms: of one view.
-    share: of each pass in it, of those that were measured. folded: shares of what is computed
-    inside the rasteriser, by the difference to views without it; they are part of the shares of
-    the passes that draw. noise: how far apart these passes' times are from run to run, as a share;
-    a smaller difference says nothing. once_s: what was done once for the scene, in seconds.
+def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str, Any]:
+    """Renders a few views with a stopwatch. The recipe's scale and outputs count; files do not.
+
+    views: how many were rendered, ROUNDS times each after a warm-up. frame_ms: of one view. share:
+    of each pass in it, of those that were measured. folded: shares of what is computed inside the
+    rasteriser, by the difference to views without it; they are part of the shares of the passes
+    that draw. noise: how far apart these passes' times are from run to run, as a share; a smaller
+    difference says nothing. once_s: what was done once for the scene, in seconds.
     """
-
-    views: int
-    rounds: int
-    threads: int
-    frame_ms: float
-    share: Mapping[str, float]
-    folded: Mapping[str, float]
-    noise: float
-    once_s: Mapping[str, float]
-
-
-def measure_passes(recipe: Recipe, scene: Scene, views: int = VIEWS) -> PassTimes:
-    """Renders a few views with a stopwatch. The recipe's scale and outputs count; files do not."""
-    cameras = sample_views(scene, views)
+    cameras = sample_views(scene, count)
     once_s = {}
     plan = make_plan(recipe, scene)
     for own in plan.active(scene):
@@ -261,30 +246,30 @@ def measure_passes(recipe: Recipe, scene: Scene, views: int = VIEWS) -> PassTime
             start = time.perf_counter()
             _ = own.prepared
             once_s[plan.placed[own.effect.name].steps[0].name] = time.perf_counter() - start
+    # A recipe's runs stand side by side, since a scene keeps the snow of two recipes at most.
     variants = {"": recipe} | without_folded(recipe, scene)
-    runs = {name: _runs(scene, cameras, variant) for name, variant in variants.items()}
-    times = {name: [_fastest(view) for view in views] for name, views in runs.items()}
-    total = _sum(times[""], FRAME)
-    drawing_passes = ("rasterise", *(name for e in effects.EFFECTS for name in e.draws))
-    passes = dict.fromkeys(name for best in times[""] for name in best if name != FRAME)
-    share = {name: _sum(times[""], name) / total for name in passes}
-    share["everything else"] = max(0.0, 1 - sum(share.values()))
-    folded = {
-        name: (_sum(times[""], *drawing_passes) - _sum(times[name], *drawing_passes)) / total
-        for name in variants
-        if name
+    runs = {name: [_runs(scene, c, variant) for c in cameras] for name, variant in variants.items()}
+    # The whole of one run: passes of different runs would not add up to one frame.
+    fastest = {
+        name: [min(v, key=lambda r: r[FRAME]) for v in views] for name, views in runs.items()
     }
+    total = _sum(fastest[""], FRAME)
+    drawing_passes = ("rasterise", *(name for e in effects.EFFECTS for name in e.draws))
+    passes = dict.fromkeys(name for run in fastest[""] for name in run if name != FRAME)
+    share = {name: _sum(fastest[""], name) / total for name in passes}
+    share["everything else"] = max(0.0, 1 - sum(share.values()))
+    drawn_s = {name: _sum(views, *drawing_passes) for name, views in fastest.items()}
     drawing = [[_sum([run], *drawing_passes) for run in view] for view in runs[""]]
-    return PassTimes(
-        views=len(cameras),
-        rounds=ROUNDS,
-        threads=thread_count(),
-        frame_ms=1e3 * total / len(cameras),
-        share=share,
-        folded=folded,
-        noise=sum(max(view) - min(view) for view in drawing) / total,
-        once_s=once_s,
-    )
+    return {
+        "views": len(cameras),
+        "rounds": ROUNDS,
+        "threads": thread_count(),
+        "frame_ms": 1e3 * total / len(cameras),
+        "share": share,
+        "folded": {name: (drawn_s[""] - own) / total for name, own in drawn_s.items() if name},
+        "noise": sum(max(view) - min(view) for view in drawing) / total,
+        "once_s": once_s,
+    }
 
 
 def sample_views(scene: Scene, count: int) -> list[Camera]:
@@ -308,26 +293,15 @@ def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
     return {name: replaced(recipe, *change) for name, change in folded.items() if name in runs}
 
 
-def _runs(scene: Scene, cameras: Sequence[Camera], recipe: Recipe) -> list[list[dict[str, float]]]:
-    """The stages of every run of each view. A recipe's runs stand side by side, since a scene keeps
-    the snow of two recipes at most.
-    """
-    for camera in cameras:
-        render_view(scene, camera, recipe)
-    return [[_timed(scene, camera, recipe) for _ in range(ROUNDS)] for camera in cameras]
-
-
-def _fastest(runs: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The whole of one run: passes of different runs would not add up to one frame."""
-    return min(runs, key=lambda run: run[FRAME])
-
-
-def _timed(scene: Scene, camera: Camera, recipe: Recipe) -> dict[str, float]:
-    """Seconds of the view's passes, and of the whole as FRAME."""
-    start = time.perf_counter()
-    with stopwatch() as seconds:
-        render_view(scene, camera, recipe)
-    return seconds | {FRAME: time.perf_counter() - start}
+def _runs(scene: Scene, camera: Camera, recipe: Recipe) -> list[dict[str, float]]:
+    """Seconds of the view's passes, and of the whole as FRAME, of each run after a warm-up."""
+    runs = []
+    for _ in range(1 + ROUNDS):
+        start = time.perf_counter()
+        with stopwatch() as seconds:
+            render_view(scene, camera, recipe)
+        runs.append(seconds | {FRAME: time.perf_counter() - start})
+    return runs[1:]
 
 
 def _sum(times: Sequence[Mapping[str, float]], *names: str) -> float:

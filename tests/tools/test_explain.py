@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+import numba
 import pytest
 
+from augment.errors import ClimateGSError
 from augment.scene import Scene
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
@@ -19,6 +21,7 @@ from tools.explain import (
     sample_views,
     without_folded,
 )
+from tools.output import compiling_noted
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +40,11 @@ def explained(monkeypatch, tmp_path, scene: Scene, recipe: str, **options):
 
 def test_shares_of_a_frame_add_up(scene):
     times = measure_passes(Recipe(output=Output(depth="none", labels=False)), scene)
-    assert times.views == 2 and times.frame_ms > 0 and times.folded == {} and times.once_s == {}
-    assert sum(times.share.values()) == pytest.approx(1)
-    assert {"rasterise", "sky", "view plan", "8 bits", "everything else"} <= set(times.share)
-    assert not any(name.startswith(("flood", "snow", "style")) for name in times.share)
+    assert times["views"] == 2 and times["frame_ms"] > 0
+    assert times["folded"] == times["once_s"] == {}
+    assert sum(times["share"].values()) == pytest.approx(1)
+    assert {"rasterise", "sky", "view plan", "8 bits", "everything else"} <= set(times["share"])
+    assert not any(name.startswith(("flood", "snow", "style")) for name in times["share"])
 
 
 def test_what_runs_inside_the_rasteriser_is_measured_against_the_view_without_it(scene):
@@ -81,6 +85,29 @@ def test_without_times_no_snow_is_laid(scene, monkeypatch, tmp_path):
     monkeypatch.setattr("augment.effects.snow.effect.snow_layers_of", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["views"]["snow"] is None and "snow can be" not in page
+
+
+def test_a_variant_that_the_recipe_does_not_have_is_refused(monkeypatch, tmp_path, scene):
+    recipe = "variants: 3\n"
+    with pytest.raises(ClimateGSError, match="--variant 3: recipe has 3 variants, 0 to 2"):
+        explained(monkeypatch, tmp_path, scene, recipe, variant=3, times=False)
+    facts, _ = explained(monkeypatch, tmp_path, scene, recipe, variant=2, times=False)
+    assert facts["recipe"]["variant"] == 2
+
+
+def test_compiling_is_said_before_it_is_done(capsys):
+    @numba.njit
+    def doubled(x):
+        return 2 * x
+
+    for said in (
+        ["compiling kernels (once; kept for the next run) ...", "compiled the kernels in"],
+        [],
+    ):
+        with compiling_noted():
+            doubled(2)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == len(said) and all(map(str.startswith, lines, said))
 
 
 def test_a_scene_without_views_has_a_plan_all_the_same(scene, monkeypatch, tmp_path):
