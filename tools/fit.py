@@ -21,11 +21,10 @@ from adapters.training_views.checks import check_views, with_camera_times
 from adapters.training_views.starting_scene import starting_scene
 from adapters.training_views.views import RecordedViews, holdout_step
 from adapters.uri import format_uri
-from augment.cameras import Camera
 from augment.errors import AdapterError, ClimateGSError
 from augment.files.scene_file import is_scene_folder, save_scene
 from augment.reconstruct.trainer import StepRecord, Trainer
-from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
+from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
 from tools.fit_report import evaluate_views, mean_scores, truth_facts, truth_line, write_report
 from tools.options import FitOptions, parse_depth, resolved_uri
@@ -289,17 +288,18 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "problems": run.problems(),
         "checks": run.checks,
     }
-    source: ViewSource = run.source
-    if not complete and len(source.test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
-        source = FewerTestViews(source, sample_keys(source.test, EVALUATED_WHEN_STOPPED))
+    source, test = run.source, run.source.test
+    if not complete and len(test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
+        test = sample_keys(test, EVALUATED_WHEN_STOPPED)
         facts["problems"].append(
-            f"the run was stopped: figures are of {len(source.test)} of the "
-            f"{len(run.source.test)} held-out views"
+            f"the run was stopped: figures are of {len(test)} of the {len(source.test)} held-out "
+            f"views"
         )
     if options.truth is not None:
-        facts["truth"] = truth_facts(options.truth, scene, run.source)
+        facts["truth"] = truth_facts(options.truth, scene, source)
         print_note(truth_line(facts["truth"]))
-    report = write_report(_report_folder(training.folder), scene, source, training.rows, facts)
+    folder = _report_folder(training.folder)
+    report = write_report(folder, scene, source, training.rows, facts, test=test)
     _show_end(options.out, training.folder)
     return report
 
@@ -418,24 +418,6 @@ def _data_facts(scene: Scene, source: ViewSource) -> dict[str, Any]:
         "actors": len(scene.actors),
         "cameras' poses (SHA-256)": digest.hexdigest(),
     }
-
-
-@dataclass(frozen=True)
-class FewerTestViews:
-    """A ViewSource of which only some views are held out, to be evaluated sooner."""
-
-    source: ViewSource
-    test: tuple[ViewKey, ...]
-
-    @property
-    def train(self) -> tuple[ViewKey, ...]:
-        return self.source.train
-
-    def camera(self, key: ViewKey) -> Camera:
-        return self.source.camera(key)
-
-    def load(self, key: ViewKey) -> RecordedView:
-        return self.source.load(key)
 
 
 def _seen(holdout: str, reason: str) -> str:

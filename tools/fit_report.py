@@ -95,9 +95,10 @@ def write_report(
     history: Sequence[Mapping[str, Any]],
     facts: Mapping[str, Any] | None = None,
     *,
-    progress: bool = True,
+    test: Sequence[ViewKey] | None = None,
 ) -> dict[str, Any]:
-    """Evaluate all held-out views and write report.json, report.md, curves.png and held_out.jpg.
+    """Evaluate the held-out views, or those of them in `test`, and write report.json, report.md,
+    curves.png and held_out.jpg.
 
     Without held-out views, training views are scored, at most MAX_TRAINING_VIEWS of them, and the
     report says so; the pictures are then training_views.jpg. history: rows of averages {"step",
@@ -109,7 +110,8 @@ def write_report(
         OutputError: the folder cannot be written.
     """
     split, keys, note = _choose_split(source)
-    scores = evaluate_views(scene, source, keys, progress=progress)
+    keys = test or keys
+    scores = evaluate_views(scene, source, keys, progress=True)
     sample = None
     if split == "test":
         learnt = _spread(source.train, TRAINING_SAMPLE)

@@ -9,7 +9,6 @@ one or the one before.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import io
 import json
@@ -20,12 +19,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from tqdm import tqdm
@@ -128,13 +128,13 @@ class Training:
         """One more row of the history, at the trainer's step."""
         self.rows.append({"step": int(self.trainer.step), "seconds": self.seconds(), **values})
 
-    def save(self) -> None:
-        """A checkpoint, which does not change what is learnt."""
+    def save(self) -> Checkpoint:
+        """A checkpoint, which does not change what is learnt. Returned is what its JSON holds."""
         arrays, facts = self.trainer.state()
         step, seconds = self.trainer.step, self.seconds()
         now = {"step": step, "seconds": seconds, "history": self.rows, "sums": self.sums}
-        checkpoint = dataclasses.replace(self.plan, **now, facts=facts, arrays=arrays)
-        save_checkpoint(self.folder, checkpoint)
+        now |= {"facts": facts, "arrays": arrays}
+        return save_checkpoint(self.folder, self.plan.model_copy(update=now))
 
 
 def open_training(
@@ -166,7 +166,9 @@ def open_training(
                 f"{1e3 * step_s:.0f} ms a step at the start: {steps} steps make about {minutes:g} "
                 f"minutes. --steps {steps} gives the same {result} again"
             )
-        plan = Checkpoint(options.settings(), length_of(options), steps, data)
+        plan = Checkpoint(
+            settings=options.settings(), length=length_of(options), steps=steps, data=data
+        )
         save_checkpoint(folder, plan)  # in place of what --overwrite gives up
     else:
         plan = load_checkpoint(folder)
@@ -181,7 +183,7 @@ def open_training(
         made.load_state(plan.arrays, plan.facts)
         print_note(f"going on after step {plan.step} of {plan.steps}")
     rows, sums = list(plan.history), dict(plan.sums)
-    plan = dataclasses.replace(plan, arrays={}, facts={})  # the trainer has them: free the memory
+    plan = plan.model_copy(update={"arrays": {}, "facts": {}})  # the trainer has them
     return Training(options, folder, made, plan, rows, sums)
 
 
@@ -219,11 +221,11 @@ def run_training(
                 if time.monotonic() - saved > checkpoint_s and record.step < steps:
                     training.save()
                     saved = time.monotonic()
-        training.save()
+        last = training.save()
         complete = trainer.step >= steps
         report = write(complete)
     if complete:
-        _write_plan(training.folder, {**_read_plan(training.folder), "finished": True})
+        _write_plan(training.folder, last.model_copy(update={"finished": True}))
         return Outcome(0, report)
     overwrite = training.options.overwrite
     again = "the same command without --overwrite" if overwrite else "the same command"
@@ -269,49 +271,60 @@ class StopRequest:
         os.write(2, _STOPPING)  # print could meet a half-written line of its own
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A training after `step` of `steps` steps.
+class Checkpoint(BaseModel):
+    """A training after `step` of `steps` steps, as `fit.json` holds it but for the arrays.
 
     settings, length: what was asked for. data: what was found in the recorded data. history: rows
     so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
-    trainer's state; no arrays before the first step. finished: the result and its report stand.
+    trainer's state; no arrays before the first step. state: their file and its SHA-256. finished:
+    the result and its report stand.
     """
 
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: int = VERSION
     settings: dict[str, Any]
-    length: dict[str, float]
+    length: dict[str, Any]
     steps: int
     data: dict[str, Any]
-    step: int = 0
+    step: int = Field(default=0, ge=0)
     finished: bool = False
     seconds: float = 0.0
-    history: list[dict[str, Any]] = field(default_factory=list)
-    sums: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    history: list[dict[str, Any]] = []
+    sums: dict[str, float] = {}
+    facts: dict[str, Any] = {}
+    state: State | None = None
+    arrays: dict[str, Any] = Field(default={}, exclude=True)
 
 
-def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the folder's checkpoint.
+class State(BaseModel):
+    """Of a checkpoint's arrays. file: a name, so that nothing outside of the folder is read."""
+
+    file: str = Field(pattern=r"^[^/\\]+$")
+    sha256: str
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
+    """Replace the folder's checkpoint. Returned is what its JSON holds.
 
     Raises:
         OutputError: the system refused; the checkpoint before is then as it was.
     """
-    names = [field.name for field in fields(Checkpoint) if field.name != "arrays"]
-    plan = {**{n: getattr(checkpoint, n) for n in names}, "version": VERSION, "state": None}
-    name = None
+    state = None
     if checkpoint.arrays:
         name = f"state-{checkpoint.step:07d}.safetensors"
-        plan["state"] = {"file": name, "sha256": _write_state(folder / name, checkpoint.arrays)}
+        state = State(file=name, sha256=_write_state(folder / name, checkpoint.arrays))
+    plan = checkpoint.model_copy(update={"state": state, "arrays": {}})
     _write_plan(folder, plan)
     remove_temporaries(folder, recursive=False)
     # What killed runs left half-written, too; safetensors has temporary names of its own.
     for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
-        if path.name != name:
+        if state is None or path.name != state.file:
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
                 raise output_error(path, error) from error
+    return plan
 
 
 def _check_same(options: Any, before: Checkpoint) -> None:
@@ -343,50 +356,36 @@ def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
     Raises:
         OutputError: a file of it is missing, damaged, or of another version.
     """
-    if not (folder / PLAN_FILE).is_file():
-        return None
-    plan = _read_plan(folder)
-    state = plan.pop("state")
-    del plan["version"]
-    return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
-
-
-def _write_plan(folder: Path, plan: Mapping[str, Any]) -> None:
-    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
-
-
-def _read_plan(folder: Path) -> dict[str, Any]:
     path = folder / PLAN_FILE
+    if not path.is_file():
+        return None
     try:
         plan = json.loads(path.read_bytes())
+        version = plan.get("version") if isinstance(plan, dict) else None
+        if version != VERSION:
+            raise OutputError(
+                f"{path} is of version {version}, this program writes {VERSION}: choose another "
+                f"--out, or begin anew with --overwrite"
+            )
+        checkpoint = Checkpoint.model_validate(plan)
     except OSError as error:
         raise OutputError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except ValueError as error:  # no JSON, or other fields
         raise _damaged(path, str(error)) from error
-    version = plan.get("version") if isinstance(plan, dict) else None
-    if version != VERSION:
-        raise OutputError(
-            f"{path} is of version {version}, this program writes {VERSION}: fit to another --out, "
-            f"or begin anew with --overwrite"
-        )
-    names = {field.name for field in fields(Checkpoint)} - {"arrays"} | {"version", "state"}
-    if wrong := names ^ plan.keys():
-        raise _damaged(path, f"it lacks, or should not have, {', '.join(sorted(wrong))}")
-    step, steps = plan["step"], plan["steps"]
-    if not (isinstance(step, int) and isinstance(steps, int) and 0 <= step <= steps):
-        raise _damaged(path, f"it is at step {step!r} of {steps!r}")
-    return plan
+    if not (arrays and checkpoint.state):
+        return checkpoint
+    return checkpoint.model_copy(update={"arrays": _read_state(folder, checkpoint.state)})
 
 
-def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
-    try:
-        path = folder / Path(state["file"]).name  # a name: nothing outside the folder is read
-        checksum = state["sha256"]
-    except (KeyError, TypeError) as error:
-        raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
+def _write_plan(folder: Path, plan: Checkpoint) -> None:
+    write_atomic(folder / PLAN_FILE, (json.dumps(plan.model_dump(), indent=1) + "\n").encode())
+
+
+def _read_state(folder: Path, state: State) -> dict[str, np.ndarray]:
+    path = folder / state.file
     try:
         with path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:
+            if hashlib.file_digest(file, "sha256").hexdigest() != state.sha256:
                 raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
         return {name: np.array(array) for name, array in load_file(path).items()}  # ours to change
     except OSError as error:

@@ -435,17 +435,11 @@ class DepthSource:
         self._maps = _find_all(scene, cameras, options, self.problems)
         self._sweeps: ByteCache[PriorPixels] = ByteCache(cache_bytes // 2)
         self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes - cache_bytes // 2)
-        if not self.kinds:
+        if not (self._has_sweeps or any(self._maps.values())):
             self.problems.append(
                 "no depth priors: the scene has no LiDAR sweeps and no depth maps were found, so "
                 "distances are learnt from the images alone"
             )
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Which priors there are: lidar, sparse, metric, relative."""
-        found = tuple(kind for kind, maps in self._maps.items() if maps)
-        return ("lidar", *found) if self._has_sweeps else found
 
     def lidar(self, key: ViewKey) -> PriorPixels:
         """What the sweep of the view's frame says; it is read once for all cameras of the frame."""

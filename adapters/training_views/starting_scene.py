@@ -59,18 +59,9 @@ def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSourc
     colours. The actor's frame is the camera's own, turned to x forward, y left, z up and
     moved to the box's centre; its track are the camera's poses at its own times, so that the body
     stands still in every image. Its label is EGO_VEHICLE and its class OTHER: it has no box.
-
-    Raises:
-        ValueError: no such camera, or a mask that is not bool [H, W] with the camera's proportions.
     """
     cameras = [frame.cameras[camera_name] for frame in scene.frames if camera_name in frame.cameras]
-    if not cameras:
-        raise ValueError(
-            f"scene {scene.name!r} has no camera {camera_name!r}; it has "
-            f"{', '.join(scene.camera_names) or 'none'}"
-        )
     first = cameras[0]
-    _check_mask(mask, first)
     step = first.width / min(max(first.width / _PX_PER_SPLAT, _COLUMNS[0]), _COLUMNS[1])
     grid = first.scaled(min(1.0, 1 / step))
     size = (grid.width, grid.height)
@@ -91,19 +82,6 @@ def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSourc
         track=_track(cameras, centre),
         size_m=size_m,
     )
-
-
-def _check_mask(mask: np.ndarray, camera: Camera) -> None:
-    where = f"the mask of the recording car in camera {camera.name!r}"
-    if mask.dtype != np.bool_ or mask.ndim != 2 or mask.size == 0:
-        raise ValueError(f"{where} must be bool [H, W]; got {mask.dtype} {list(mask.shape)}")
-    height, width = mask.shape
-    expected = width * camera.height / camera.width
-    if abs(height - expected) > 1:
-        raise ValueError(
-            f"{where} must have the proportions of its images, {camera.width}x{camera.height}; "
-            f"got {width}x{height}"
-        )
 
 
 def _median_colours(

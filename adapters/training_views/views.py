@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -146,7 +144,6 @@ class RecordedViews:
         depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
         reference_depth: ReferenceDepth | None = None,
         masks_dir: Path | None = None,
-        mask_ego: bool = False,
     ) -> None:
         """scene: as initialised, before any optimisation; its Gaussians tell where sky must be.
         scale: training resolution over recorded resolution, in (0, 1]. cameras: names, all by
@@ -155,7 +152,7 @@ class RecordedViews:
         not fit is read again. reference_depth: what relative depth maps are brought to metres by
         where there is no LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the
         recording car; a camera without a file does not see it. By default such pixels are found by
-        their standing still. mask_ego: do not learn from them."""
+        their standing still."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
         names = _camera_names(scene, cameras)
@@ -173,30 +170,13 @@ class RecordedViews:
         )
         self._lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
-        self._weights: dict[str, np.ndarray] = {}
         self.ego_masks = self._find_ego(names, masks_dir)
-        self._mask_ego = mask_ego
         self._lock = threading.Lock()
 
     @property
     def problems(self) -> tuple[str, ...]:
         """What was found wrong and gone on without, one sentence each; loading may add some."""
         return (*self._problems, *self._depth.problems)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What there is, for reports: JSON-able."""
-        sizes = {k.camera: [c.width, c.height] for k, c in self._cameras.items()}
-        top = self._lidar_top_rad
-        return {
-            "images": dict(Counter(key.camera for key in self._cameras)),
-            "sizes_px": sizes,
-            "train_images": len(self.train),
-            "test_images": len(self.test),
-            "depth_priors": list(self._depth.kinds),
-            "lidar_top_deg": None if top is None else float(np.degrees(top)),
-            "ego_mask_parts": {n: float(mask.mean()) for n, mask in self.ego_masks.items()},
-        }
 
     def camera(self, key: ViewKey) -> Camera:
         try:
@@ -222,23 +202,13 @@ class RecordedViews:
             ego = self._ego(camera)
             if ego is not None:
                 prior = prior.select(~ego.reshape(-1)[prior.pixels])
-            weight, depth = self._weight(camera), (prior.pixels, prior.depth_m, prior.weight)
-            return RecordedView(camera, rgb, weight, sky, *depth)
+            weight = np.ones(sky.shape, np.float32)
+            return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
 
     def _ego(self, camera: Camera) -> np.ndarray | None:
         """Where the camera sees the recording car; None if it does not."""
         mask = self.ego_masks.get(camera.name)
         return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
-
-    def _weight(self, camera: Camera) -> np.ndarray:
-        weight = self._weights.get(camera.name)
-        if weight is None or weight.shape != (camera.height, camera.width):
-            weight = np.ones((camera.height, camera.width), np.float32)
-            ego = self._ego(camera)
-            if ego is not None and self._mask_ego:
-                weight[ego] = 0
-            self._weights[camera.name] = weight
-        return weight
 
     def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
         packed = self._skies.get(key)

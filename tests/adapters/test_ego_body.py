@@ -179,17 +179,3 @@ def test_images_of_one_time_make_one_pose(scene):
     )
     still = dataclasses.replace(scene, frames=frames)
     assert len(ego_body(still, "rear", MASK, Images(still)).track.timestamps_ns) == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "mask", "message"),
-    [
-        ("top", MASK, "has no camera 'top'; it has rear, front"),
-        ("rear", MASK.astype(np.uint8), r"must be bool \[H, W\]; got uint8 \[200, 320\]"),
-        ("rear", MASK[:100], "must have the proportions of its images, 320x200; got 320x100"),
-        ("rear", np.zeros((0, 0), np.bool_), r"must be bool \[H, W\]"),
-    ],
-)
-def test_wrong_arguments(scene, name, mask, message):
-    with pytest.raises(ValueError, match=message):
-        ego_body(scene, name, mask, Images(scene))

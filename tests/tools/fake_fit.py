@@ -125,7 +125,7 @@ class Fakes:
     before_step: Callable[[int], None] = lambda step: None
     opened: list[str] = field(default_factory=list)
     trainers: list[FakeTrainer] = field(default_factory=list)
-    reported: list[FakeViews] = field(default_factory=list)
+    reported: list[Sequence[ViewKey]] = field(default_factory=list)
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
         stand_ins = {
@@ -155,10 +155,17 @@ class Fakes:
         return trainer
 
     def _report(
-        self, folder: Path, scene: Scene, source: FakeViews, history: list, facts: dict
+        self,
+        folder: Path,
+        scene: Scene,
+        source: FakeViews,
+        history: list,
+        facts: dict,
+        *,
+        test: Any,
     ) -> dict[str, Any]:
         report = {"history": [dict(row) for row in history], **facts}
-        self.reported.append(source)
+        self.reported.append(test)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "report.json").write_text(json.dumps(report))
         (folder / "report.md").write_text("# Report\n\n| views | PSNR |\n|---|---|\n| 6 | 20.0 |\n")

@@ -191,9 +191,7 @@ def test_a_stopped_run_evaluates_some_views_only(options, monkeypatch):
     monkeypatch.setattr(fit, "EVALUATED_WHEN_STOPPED", 2)
     fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
     outcome = run(options, fakes)
-    (source,) = fakes.reported
-    assert len(source.test) == 2 and len(source.train) == 6
-    assert source.load(source.test[0]).camera.name == source.test[0].camera
+    assert [len(test) for test in fakes.reported] == [2]
     assert "figures are of 2 of the 6 held-out views" in outcome.report["problems"][-1]
 
 
@@ -530,10 +528,7 @@ def test_a_checkpoint_of_another_making_is_refused(tmp_path):
     plan = json.loads((tmp_path / "fit.json").read_text())
     for change in ({"version": 1}, {"unknown": 1}, {"state": {"file": "x"}}, {"step": "no"}):
         (tmp_path / "fit.json").write_text(json.dumps({**plan, **change}))
-        with pytest.raises(
-            OutputError,
-            match=r"fit.json is (damaged|of version 1, .*--overwrite)",
-        ):
+        with pytest.raises(OutputError, match=r"fit.json is (damaged|of version 1, .*--overwrite)"):
             load_checkpoint(tmp_path)
 
 
