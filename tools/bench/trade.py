@@ -7,35 +7,30 @@ by the reference's depth, so that the drive's motion does not count, and flicker
 square of E_t - warped E_(t+1): 0 for an error that sticks to its surface, sqrt(2) times the error's
 own RMS for one that is drawn anew.
 
-The tiers of `quality` follow by a rule from the figures of docs/trade/*.json:
-
-1. Of each knob the values that save time: those faster than every more accurate one by at least
-   MIN_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
-   reference, over all recipes and scenes in which it changes the picture.
-2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
-   of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes
-   and views (augment.jobs.quality.search).
+The tiers of `quality` follow by the rule of docs/trade.md from the figures of docs/trade/*.json. A
+value's time is the geometric mean of its ratios to the reference.
 
     python -m tools.bench.trade [TABLE.json=SCENE_URI ...]
 
-renders what step 2 asks for and the tables lack, adds it to them, then the tiers themselves, in
-place of rows of earlier ones, with TABLE_tiers.jpg beside; and makes docs/trade.md's tables anew.
+renders the settings that the rule asks for and the tables lack, adds them, then the tiers
+themselves in place of earlier ones, with TABLE_tiers.jpg beside; and makes docs/trade.md's tables
+anew.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import json
 import math
-import statistics
 import sys
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -50,14 +45,14 @@ from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
 from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, useful
+from augment.jobs.worker import default_renderer
 from augment.metrics.consistency import DepthView, warp_view
-from augment.metrics.image import CLOSE_M, flip, ssim
+from augment.metrics.image import depth_errors, flip, ssim
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
 from augment.views import render_view
-from recipes.fields import changed
 from recipes.load import load_recipe
 from recipes.schema import (
     KNOBS,
@@ -72,22 +67,8 @@ from recipes.schema import (
     knobs_of,
     with_settings,
 )
-from tools.bench.harness import (
-    Figures,
-    Table,
-    extra_mib,
-    figures,
-    gpu_facts,
-    in_turns,
-    load_average,
-    machine_facts,
-    machine_line,
-    markdown_lines,
-    peak_gpu_mib,
-    replace_marked,
-    spread_ms,
-    spread_ratio,
-)
+from tools.bench import harness
+from tools.bench.harness import Figures, Table
 from tools.bench.scenes import frame_of, front_name, recipe_of
 from tools.drawing import captioned, strip, write_rgb
 from tools.render import warm_up
@@ -107,17 +88,17 @@ ALL = {
 RECIPES = (CLEAN, *PRESETS, "all")
 AT_A_TIME = 6  # settings between two frames of the reference
 DIGITS = 4  # significant ones that figures keep
+# What is measured of a knob at a value, by its heading where people read it.
 COLUMNS = {
     "knob": "knob", "value": "value", "ms": "ms", "least": "ms_min", "p90": "ms_p90",
-    "x reference": "over_reference", "x clean": "over_clean", "FLIP": "flip", "worst": "worst_flip",
-    "PSNR": "psnr", "SSIM": "ssim", "depth off, %": "off_5cm", "abs-rel, %": "abs_rel",
-    "flicker": "flicker", "MiB": "mib",
+    "kB": "kilobytes", "x reference": "over_reference", "x clean": "over_clean", "FLIP": "flip",
+    "worst": "worst_flip", "PSNR": "psnr", "SSIM": "ssim", "depth off, %": "off_5cm",
+    "abs-rel, %": "abs_rel", "flicker": "flicker", "MiB": "mib",
 }  # fmt: skip
-FILE_COLUMNS = {
-    "quality": "value", "ms": "ms", "kB": "kilobytes", "FLIP": "flip", "worst": "worst_flip",
-    "PSNR": "psnr", "SSIM": "ssim",
-}  # fmt: skip
+# {knob, value, ms, flip, ...}: a knob's path and value, all others at reference; or WHOLE, a name
+# and, under `settings`, what is set. In tables of several scenes and recipes also these two.
 Row = dict[str, Any]
+Tables = Sequence[Mapping[str, Any]]
 Wholes = Mapping[str, Mapping[str, Value]]
 
 
@@ -127,78 +108,68 @@ Wholes = Mapping[str, Mapping[str, Value]]
 @dataclass(frozen=True)
 class TradeCase:
     """width: pixels of the pictures, at most. repeats: timed frames of each setting and view.
-    depths: the estimators that are compared. memory: whether it is measured.
+    memory: whether it is measured.
     """
 
     width: int = 640
     repeats: int = 9
-    depths: tuple[str, ...] = ("none", "expected", "median", "mode")
     memory: bool = True
 
 
 WHOLE_CASE, QUICK = TradeCase(), TradeCase(width=240, repeats=1, memory=False)
 
 
-@dataclass(frozen=True)
-class Setting:
-    """One way of rendering a recipe. knob: the path of the one that is not at reference, else
-    WHOLE, and then value is a name. given: what is set, by path, where it is WHOLE.
-    """
-
-    knob: str
-    value: Value
-    recipe: Recipe
-    given: Mapping[str, Value] = field(default_factory=dict)
-
-
 def trade_recipe(name: str) -> Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
     if name in (CLEAN, "all"):
-        recipe = recipe_of(ALL if name == "all" else {}, Output()).model_copy(update={"name": name})
+        recipe = recipe_of(ALL if name == "all" else {}, Output())
     else:
-        loaded = load_recipe(PRESETS.get(name, name)).resolve(0)
-        recipe = loaded.model_copy(update={"name": name if name in PRESETS else loaded.name})
-    return recipe.model_copy(update={"quality": Quality()})
+        recipe = load_recipe(PRESETS.get(name, name)).resolve(0)
+    called = name if name in RECIPES else recipe.name
+    return recipe.model_copy(update={"name": called, "quality": Quality()})
 
 
-def settings_of_trade(
-    recipe: Recipe, case: TradeCase, wholes: Wholes | None = None
-) -> list[Setting]:
-    """Reference first, each knob's other values alone, then the recipe with its own settings, and
-    the tiers. wholes: in place of all but the reference.
+def measured_values(knob: Knob) -> Sequence[Value]:
+    """Those that pictures are rendered with: all estimators of depth, which none is the best of."""
+    if knob.path == JPEG:  # is measured of files
+        return ()
+    return knob.values if knob.path == DEPTH else knob.values[:-1]
+
+
+def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tuple[Row, Recipe]]:
+    """What rows begin with, and the recipe in that setting: reference first, each knob's other
+    values alone, then the recipe with its own settings, and the tiers. wholes: in place of all but
+    the reference.
     """
-    best = as_reference(recipe)
-    chosen = [knob for knob in knobs_of(recipe) if knob.chosen]
-    settings = [Setting(WHOLE, REFERENCE, best, {k.path: k.reference for k in chosen})]
+    best, knobs = as_reference(recipe), knobs_of(recipe)
+    references = {knob.path: knob.reference for knob in knobs if knob.chosen}
+    single: list[tuple[Row, Recipe]] = []
     if wholes is None:
-        for knob in (k for k in knobs_of(recipe) if not k.path.startswith("output.")):
-            for value in knob.values[:-1]:
-                settings.append(Setting(knob.path, value, with_settings(best, {knob.path: value})))
-        settings += [Setting(DEPTH, name, changed(best, {DEPTH: name})) for name in case.depths]
-        settings.append(Setting(WHOLE, DEFAULTS, recipe))
-    for name, given in (TIERS if wholes is None else wholes).items():
-        own = {k.path: given.get(k.path, k.reference) for k in chosen}
-        settings.append(Setting(WHOLE, name, with_settings(best, own), own))
-    return settings
+        pairs = [(knob.path, value) for knob in knobs for value in measured_values(knob)]
+        single = [({"knob": p, "value": v}, with_settings(best, {p: v})) for p, v in pairs]
+        single.append(({"knob": WHOLE, "value": DEFAULTS}, recipe))
+    whole: list[tuple[Row, Recipe]] = []
+    for name, settings in {REFERENCE: {}, **(TIERS if wholes is None else wholes)}.items():
+        given = {path: settings.get(path, value) for path, value in references.items()}
+        row = {"knob": WHOLE, "value": name, "settings": given}
+        whole.append((row, with_settings(best, given)))
+    return [whole[0], *single, *whole[1:]]
 
 
 def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
     """Frames and cameras: the front camera in the middle of the drive, the same in the next frame,
-    and the camera that looks away from it the most.
-
-    Raises:
-        SceneError: the scene has one frame only.
+    and the camera that looks away from it the most. Raises SceneError: the scene has one frame
+    only, or two successive ones share no camera.
     """
-    at = (len(scene.frames) - 1) // 2
-    if len(scene.frames) < 2:
-        raise SceneError(
-            f"{scene.name} has {len(scene.frames)} frame: the trade needs two in a row, since "
-            f"flicker is measured between them"
-        )
-    now, after = scene.frames[at : at + 2]
-    shared = [name for name in now.cameras if name in after.cameras]
+    at = max(0, (len(scene.frames) - 1) // 2)
+    pair = scene.frames[at : at + 2]
+    shared = [n for n in pair[0].cameras if n in pair[1].cameras] if len(pair) == 2 else []
     if not shared:
-        raise SceneError(f"{scene.name}: frames {now.index} and {after.index} share no camera")
+        raise SceneError(
+            f"{scene.name} has {len(scene.frames)} frame(s): the trade needs two in a row with a "
+            "camera in common, since flicker is measured between them"
+        )
+    now, after = pair
     front = front_name(shared)
     ahead = now.cameras[front].camera_from_world[2, :3]
     away = min(now.cameras, key=lambda n: float(now.cameras[n].camera_from_world[2, :3] @ ahead))
@@ -207,45 +178,19 @@ def trade_views(scene: Scene, width: int) -> list[tuple[int, Camera]]:
     return [(frame, camera.scaled(min(1.0, width / camera.width))) for frame, camera in cameras]
 
 
-class Stage:
-    """Renders recipes on one scene. Those of other effects have a copy of their own: it remembers
-    what is found once, and none may be found anew between two timed frames.
-    """
-
-    def __init__(self, scene: Scene, backend: str) -> None:
-        self._scene, self._backend = scene, backend
-        self._scenes: dict[str, Scene] = {}
-
-    def scene_for(self, recipe: Recipe) -> Scene:
-        key = recipe.model_dump_json(exclude={"name", "render", "output", "quality"})
-        return self._scenes.setdefault(key, dataclasses.replace(self._scene))
-
-    def render(self, recipe: Recipe, camera: Camera) -> Trial:
-        return render_trial(self.scene_for(recipe), camera, recipe, self._backend)
-
-    def frame_mib(self, recipe: Recipe, camera: Camera) -> float | None:
-        """MiB of a frame above its scene, at its highest moment; on a GPU of its memory. The
-        renderer's work space is given back before, so that it counts, as in a process of its own.
-        """
-        self.scene_for(recipe)
-        if self._backend == CUDA:
-            return peak_gpu_mib(lambda: self.render(recipe, camera))[1]
-        release_scratch()
-        return extra_mib(lambda: self.render(recipe, camera))
-
-
 # ---- errors -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Standard:
-    """What a reference's view is compared by. first_m, alpha [H, W]: of what a ray meets first,
-    water too. surfaces [H, W]: where there are such. masks [H, W]: where an effect is what a pixel
-    shows, by name. true_m [H, W]: the scene's exact depth, infinite in the sky; None where it is
-    not known, or something lies on it.
+    """A view at reference. best: as other settings are rendered. first_m, alpha [H, W]: of what a
+    ray meets first, water too. surfaces [H, W]: where there are such. masks [H, W]: where an effect
+    is what a pixel shows, by name. true_m [H, W]: the scene's exact depth, infinite in the sky;
+    None where it is not known, or something lies on it.
     """
 
     camera: Camera
+    best: Trial
     first_m: np.ndarray
     alpha: np.ndarray
     surfaces: np.ndarray
@@ -262,93 +207,23 @@ class Standard:
 
 
 def standard_of(
-    scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None = None
+    scene: Scene, camera: Camera, recipe: Recipe, true_m: np.ndarray | None, backend: str
 ) -> Standard:
     """recipe: at reference. true_m: of the scene without what lies on it."""
+    best = render_trial(scene, camera, recipe, backend)
     if recipe.output.depth == "none":
-        recipe = changed(recipe, {DEPTH: "median"})
+        recipe = with_settings(recipe, {DEPTH: "median"})
     solid = frame_of(scene, camera, recipe)()
     depth, alpha = solid.depth_m, solid.raster.alpha
     surfaces = (alpha >= SURFACE_ALPHA) & (depth > 0)
     if WATER in solid.masks:
-        first = render_view(scene, camera, changed(recipe, {"output.surface": "first"})).depth_m
-        depth = torch.where(solid.masks[WATER], torch.from_numpy(first).to(depth.dtype), depth)
+        of_water = with_settings(recipe, {"output.surface": "first"})
+        first = torch.from_numpy(render_view(scene, camera, of_water).depth_m)
+        depth = torch.where(solid.masks[WATER], first.to(depth.dtype), depth)
         alpha = torch.where(solid.masks[WATER], 1.0, alpha)
     masks = {name: mask.numpy() for name, mask in solid.masks.items()}
     true_m = true_m if solid.raster.overlay is None else None
-    return Standard(camera, depth.numpy(), alpha.numpy(), surfaces.numpy(), masks, true_m)
-
-
-@dataclass(frozen=True)
-class PictureErrors:
-    """mse: mean squared error of display-encoded colours, of which PSNR is made."""
-
-    mse: float
-    ssim: float
-    flip: float
-
-    @staticmethod
-    def between(picture: np.ndarray, reference: np.ndarray) -> PictureErrors:
-        """Of uint8 pictures [H, W, 3] of one size."""
-        if np.array_equal(picture, reference):  # many settings have no effect on some scene
-            return PictureErrors(0.0, 1.0, 0.0)
-        mse = float((((picture.astype(np.float64) - reference) / 255) ** 2).mean())
-        return PictureErrors(mse, ssim(picture, reference), flip(picture, reference))
-
-
-def picture_figures(views: Sequence[PictureErrors]) -> dict[str, float | None]:
-    """psnr: dB, of the mean squared error of all views; None where there is none. flip, ssim:
-    means; worst_flip: of the worst view.
-    """
-    mse = statistics.fmean(view.mse for view in views)
-    return {
-        "psnr": None if mse == 0 else -10 * math.log10(mse),
-        "ssim": statistics.fmean(view.ssim for view in views),
-        "flip": statistics.fmean(view.flip for view in views),
-        "worst_flip": max(view.flip for view in views),
-    }
-
-
-def depth_figures(
-    depths: Sequence[np.ndarray | None], right: Sequence[np.ndarray], where: Sequence[np.ndarray]
-) -> dict[str, float | None]:
-    """abs_rel: mean of |depth - right| / right where both have a surface. off_5cm: share of the
-    region's pixels, of all views, that are off by more than CLOSE_M or have no depth. None where
-    there is no depth, or the region is empty. right, where: by view, [H, W].
-    """
-    if any(depth is None for depth in depths) or not any(region.any() for region in where):
-        return {"abs_rel": None, "off_5cm": None}
-    own, good = (
-        np.concatenate([i[r] for i, r in zip(each, where, strict=True)]).astype(np.float64)
-        for each in (depths, right)
-    )
-    error, known = np.abs(own - good), own > 0
-    shares = (error / good)[known]
-    return {
-        "abs_rel": float(shares.mean()) if shares.size else None,
-        "off_5cm": float(((error > CLOSE_M) | ~known).mean()),
-    }
-
-
-def flicker(standards: Sequence[Standard], own: Sequence[Trial], best: Sequence[Trial]) -> float:
-    """Display-encoded, 0 to 1, of two successive frames under a setting and at reference; NaN where
-    they share no surface.
-    """
-    if all(np.array_equal(t.picture, b.picture) for t, b in zip(own, best, strict=True)):
-        return 0.0
-    errors = [
-        (trial.picture.astype(np.float32) - good.picture) / np.float32(255)
-        for trial, good in zip(own, best, strict=True)
-    ]
-    first, second = (
-        DepthView(standard.camera, error, standard.first_m, standard.alpha)
-        for standard, error in zip(standards, errors, strict=True)
-    )
-    warped, counts = warp_view(first, second)
-    if not counts.any():
-        return math.nan
-    change = first.picture[counts].astype(np.float64) - warped[counts]
-    return math.sqrt(float((change**2).mean()))
+    return Standard(camera, best, depth.numpy(), alpha.numpy(), surfaces.numpy(), masks, true_m)
 
 
 def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
@@ -362,11 +237,87 @@ def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
     return [truth.render(camera).depth for camera in cameras]
 
 
+def errors_of(knob: str, trials: Sequence[Trial], standards: Sequence[Standard]) -> Row:
+    """Depth against the reference's; of estimators, where the scene's exact depth is known, against
+    that. depth_against: which of the two; None where the recipe writes none.
+    """
+    where = [standard.region(knob) for standard in standards]
+    known = [standard.best.depth for standard in standards]
+    true, against = [standard.true_m for standard in standards], None
+    if knob == DEPTH and all(depth is not None for depth in true):
+        against, known = TRUTH, true
+        where = [np.isfinite(t) & s.surfaces for t, s in zip(true, standards, strict=True)]
+    elif all(depth is not None for depth in known):
+        against = REFERENCE
+        where = [region & (depth > 0) for region, depth in zip(where, known, strict=True)]
+    depths = [trial.depth if against else None for trial in trials]
+    pictures = [trial.picture for trial in trials]
+    return {
+        **picture_figures(pictures, [standard.best.picture for standard in standards]),
+        **depth_figures(depths, known, where),
+        "depth_against": against,
+        "flicker": flicker(standards[:2], pictures[:2]),
+    }
+
+
+def picture_figures(own: Sequence[np.ndarray], best: Sequence[np.ndarray]) -> Row:
+    """Of uint8 pictures [H, W, 3] by view, display-encoded. psnr: dB, of the mean squared error of
+    all views; None where there is none. flip, ssim: means; worst_flip: of the worst view.
+    """
+    pairs = list(zip(own, best, strict=True))
+    mse = fmean(float((((a.astype(np.float64) - b) / 255) ** 2).mean()) for a, b in pairs)
+    # Many settings have no effect on some scene.
+    flips = [0.0 if np.array_equal(a, b) else flip(a, b) for a, b in pairs]
+    return {
+        "psnr": None if mse == 0 else -10 * math.log10(mse),
+        "ssim": fmean(1.0 if np.array_equal(a, b) else ssim(a, b) for a, b in pairs),
+        "flip": fmean(flips),
+        "worst_flip": max(flips),
+    }
+
+
+def depth_figures(
+    depths: Sequence[np.ndarray | None], right: Sequence[np.ndarray], where: Sequence[np.ndarray]
+) -> Row:
+    """abs_rel: mean of |depth - right| / right where both have a surface. off_5cm: share of the
+    region's pixels, of all views, that are off by more than 5 cm or have no depth. None where
+    there is no depth, or the region is empty. right, where: by view, [H, W].
+    """
+    if any(depth is None for depth in depths) or not any(region.any() for region in where):
+        return {"abs_rel": None, "off_5cm": None}
+    own, good = (
+        np.concatenate([i[r] for i, r in zip(each, where, strict=True)]).astype(np.float64)
+        for each in (depths, right)
+    )
+    found = depth_errors(own, good, own > 0)
+    close = found.within_5cm * found.pixels / own.size if found.pixels else 0.0
+    return {"abs_rel": found.abs_rel, "off_5cm": 1 - close}
+
+
+def flicker(standards: Sequence[Standard], pictures: Sequence[np.ndarray]) -> float:
+    """Display-encoded, 0 to 1, of two successive pictures; NaN where they share no surface."""
+    first, second = (
+        DepthView(
+            standard.camera,
+            (picture.astype(np.float32) - standard.best.picture) / np.float32(255),
+            standard.first_m,
+            standard.alpha,
+        )
+        for standard, picture in zip(standards, pictures, strict=True)
+    )
+    if not (first.picture.any() or second.picture.any()):
+        return 0.0
+    warped, counts = warp_view(first, second)
+    if not counts.any():
+        return math.nan
+    change = first.picture[counts].astype(np.float64) - warped[counts]
+    return math.sqrt(float((change**2).mean()))
+
+
 # ---- measuring ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Trade:
+class Trade(NamedTuple):
     """figures: for JSON. pictures: the first view's, by recipe and name of the whole."""
 
     figures: Figures
@@ -383,10 +334,8 @@ def bench_trade(
 ) -> Trade:
     """recipes: of RECIPES, presets or files. wholes: settings of many knobs that are measured
     instead of single ones, by name. backend: CPU or CUDA. Times are the host's, to 8 bits that lie
-    there; on which pixels errors count is the CPU backend's to say.
-
-    Raises:
-        SceneError, RecipeError: the scene or a recipe cannot be used.
+    there; on which pixels errors count is the CPU backend's to say. Raises SceneError, RecipeError:
+    the scene or a recipe cannot be used.
     """
     drawn = [trade_recipe(name) for name in recipes]
     scene = open_scene(scene_uri)
@@ -394,13 +343,25 @@ def bench_trade(
         scene = dataclasses.replace(scene, ground=ground_of(scene))
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
-    machine, gpu = machine_facts(), None if backend == CPU else gpu_facts()
+    machine, gpu = harness.machine_facts(), None if backend == CPU else harness.gpu_facts()
     warm_up(drawn)
-    true_m = true_depths(scene_uri, cameras)
-    entries, pictures = [], {}
+    true_m = true_depths(scene_uri, cameras) or [None] * len(cameras)
+    pictures: dict[str, dict[str, np.ndarray]] = {recipe.name: {} for recipe in drawn}
+    entries = []
     for recipe in tqdm(drawn, unit="recipe"):
-        stage = Stage(scene, backend)
-        rows, pictures[recipe.name] = measure_recipe(stage, cameras, recipe, case, wholes, true_m)
+        own = dataclasses.replace(scene)  # which forgets what it knows of other recipes
+        settings = settings_of_trade(recipe, wholes)
+        standards = [
+            standard_of(own, camera, settings[0][1], true, backend)
+            for camera, true in zip(cameras, true_m, strict=True)
+        ]
+        rows: list[Row] = []
+        for row, picture in setting_rows(own, recipe, settings, standards, case, backend):
+            rows.append(row)
+            if row["knob"] == WHOLE:
+                pictures[recipe.name][row["value"]] = picture
+        if wholes is None:
+            rows += jpeg_rows([standard.best.picture for standard in standards])
         rows = [{name: _rounded(value) for name, value in row.items()} for row in rows]
         entries.append({"recipe": recipe.name, "rows": rows})
     found = {
@@ -414,118 +375,79 @@ def bench_trade(
         "machine": machine,
         "gpu": gpu,
         "backend": backend,
-        "load_after": load_average(),
+        "load_after": harness.load_average(),
         "recipes": entries,
     }
     return Trade(found, pictures)
 
 
-def measure_recipe(
-    stage: Stage,
-    cameras: Sequence[Camera],
+def setting_rows(
+    scene: Scene,
     recipe: Recipe,
+    settings: Sequence[tuple[Row, Recipe]],
+    standards: Sequence[Standard],
     case: TradeCase,
-    wholes: Wholes | None = None,
-    true_m: Sequence[np.ndarray] | None = None,
-) -> tuple[list[Row], dict[str, np.ndarray]]:
-    """Rows, reference first, and the first view's pictures of the wholes, by name. true_m: the
-    scene's exact depth by view; not used with snow, whose surface is another.
+    backend: str,
+) -> Iterator[tuple[Row, np.ndarray]]:
+    """Rows, and pictures of the first view. settings: reference first. Timed frames take turns, on
+    one view after the other; all has been rendered, and so loaded and laid, before.
     """
-    best, *others = settings_of_trade(recipe, case, wholes)
-    plain = recipe.model_copy(update={"weather": Weather(), "style": None})
-    clean = Setting(CLEAN, CLEAN, as_reference(plain))
-    standards = [
-        standard_of(stage.scene_for(best.recipe), camera, best.recipe, true)
-        for camera, true in zip(cameras, true_m or [None] * len(cameras), strict=True)
-    ]
-    rows: list[Row] = []
-    pictures: dict[str, np.ndarray] = {}
-    for start in range(0, max(len(others), 1), AT_A_TIME):
-        group = others[start : start + AT_A_TIME]
-        timed = time_group(stage, cameras, [clean, best, *group], case.repeats)
-        (_, clean_s), (best_trials, best_s), *_ = timed
-        shown = [best, *group] if not rows else group
-        for setting, (trials, seconds) in zip(shown, timed[-len(shown) :], strict=True):
-            row: Row = {"knob": setting.knob, "value": setting.value}
-            if setting.knob == WHOLE and setting.given:
-                row["settings"] = dict(setting.given)
-            ms = spread_ms(seconds)
-            row |= {"ms": ms["median"], "ms_min": ms["min"], "ms_p90": ms["p90"]}
-            row["over_reference"] = spread_ratio(seconds, best_s)["median"]
-            row["over_clean"] = spread_ratio(seconds, clean_s)["median"]
-            row |= _errors(setting, trials, best_trials, standards)
+    clean = as_reference(recipe.model_copy(update={"weather": Weather(), "style": None}))
+    cameras = [standard.camera for standard in standards]
+
+    def frame(own: Recipe, camera: Camera) -> harness.Action:
+        """Without enlarging it, which takes no part in the time."""
+        return functools.partial(default_renderer(), scene, camera, own, backend=backend)
+
+    for start in range(1, max(len(settings), 2), AT_A_TIME):
+        group = [({}, clean), settings[0], *settings[start : start + AT_A_TIME]]
+        trials = [[render_trial(scene, c, own, backend) for c in cameras] for _, own in group]
+        seconds: list[list[float]] = [[] for _ in group]
+        for camera in cameras:
+            frames = {str(n): frame(own, camera) for n, (_, own) in enumerate(group)}
+            for name, timed in harness.rounds(frames, case.repeats).items():
+                seconds[int(name)] += timed
+        for n in range(1 if start == 1 else 2, len(group)):
+            head, own = group[n]
+            row = {**head, **_times(seconds[n])}
+            row["over_reference"] = harness.spread_ratio(seconds[n], seconds[1])["median"]
+            row["over_clean"] = harness.spread_ratio(seconds[n], seconds[0])["median"]
+            row |= errors_of(row["knob"], trials[n], standards)
             if case.memory:
-                row["mib"] = stage.frame_mib(setting.recipe, cameras[0])
-            rows.append(row)
-            if setting.knob == WHOLE:
-                pictures[str(setting.value)] = trials[0].picture
-    if wholes is None:
-        rows += jpeg_rows([trial.picture for trial in best_trials])
-    return rows, pictures
+                row["mib"] = frame_mib(frame(own, cameras[0]), backend)
+            yield row, trials[n][0].picture
 
 
-def time_group(
-    stage: Stage, cameras: Sequence[Camera], settings: Sequence[Setting], repeats: int
-) -> list[tuple[list[Trial], list[float]]]:
-    """Of each setting the pictures by view, and seconds. Frames take turns, on one view after the
-    other; the first of each, which loads and lays what it needs, gives the picture and is not
-    timed.
+def frame_mib(frame: harness.Action, backend: str) -> float | None:
+    """MiB of a frame above its scene, at its highest moment; on a GPU of its memory. The renderer's
+    work space is given back before, so that it counts, as in a process of its own.
     """
-    found: dict[int, tuple[list[Trial], list[float]]] = {n: ([], []) for n in range(len(settings))}
-    for camera in cameras:
-        for repeat in range(repeats + 1):
-            for number in in_turns(found, repeat):
-                trial = stage.render(settings[number].recipe, camera)
-                trials, seconds = found[number]
-                if repeat:
-                    seconds.append(trial.seconds)
-                else:
-                    trials.append(trial)
-    return [*found.values()]
+    if backend == CUDA:
+        return harness.peak_gpu_mib(frame)[1]
+    release_scratch()
+    return harness.extra_mib(frame)
 
 
-def _errors(
-    setting: Setting, own: Sequence[Trial], best: Sequence[Trial], standards: Sequence[Standard]
-) -> Row:
-    """Depth against the reference's; of estimators, where the scene's exact depth is known, against
-    that. depth_against: which of the two.
-    """
-    pairs = zip(own, best, strict=True)
-    row: Row = picture_figures([PictureErrors.between(a.picture, b.picture) for a, b in pairs])
-    true = [s.true_m for s in standards if s.true_m is not None]
-    right = [trial.depth for trial in best if trial.depth is not None]
-    against: str | None = REFERENCE
-    where = [s.region(setting.knob) for s in standards]
-    if setting.knob == DEPTH and len(true) == len(standards):
-        against, right = TRUTH, true
-        where = [np.isfinite(t) & s.surfaces for t, s in zip(true, standards, strict=True)]
-    elif len(right) == len(best):
-        where = [region & (depth > 0) for region, depth in zip(where, right, strict=True)]
-    else:  # the recipe writes none
-        against, right = None, [np.zeros_like(region, float) for region in where]
-    depths = [None if against is None else trial.depth for trial in own]
-    row |= {**depth_figures(depths, right, where), "depth_against": against}
-    return row | {"flicker": flicker(standards[:2], own[:2], best[:2])}
-
-
-def jpeg_rows(pictures: Sequence[np.ndarray]) -> list[Row]:
+def jpeg_rows(pictures: Sequence[np.ndarray]) -> Iterator[Row]:
     """Encoding as PNG and as JPEG of each quality: ms and kB an image, errors against PNG, which
     loses nothing.
     """
-    rows = []
     for quality in ("png", *KNOBS[JPEG].values):
         output = Output() if quality == "png" else Output(image="jpg", jpeg_quality=quality)
-        seconds, files = [], []
-        for picture in pictures:
-            started = time.perf_counter()
-            files.append(encode_image(picture, output))
-            seconds.append(time.perf_counter() - started)
-        ms, decoded = spread_ms(seconds), [decode_image(data) for data in files]
-        errors = [PictureErrors.between(*pair) for pair in zip(decoded, pictures, strict=True)]
-        row = {"knob": JPEG, "value": quality, "ms": ms["median"], "ms_min": ms["min"]}
-        kilobytes = statistics.fmean(len(data) / 1e3 for data in files)
-        rows.append(row | {"ms_p90": ms["p90"], "kilobytes": kilobytes, **picture_figures(errors)})
-    return rows
+        encode = [functools.partial(encode_image, picture, output) for picture in pictures]
+        times = harness.rounds({str(n): each for n, each in enumerate(encode)}, 1).values()
+        files = [each() for each in encode]
+        yield {
+            "knob": JPEG,
+            "value": quality,
+            **_times([s for each in times for s in each]),
+            "kilobytes": fmean(len(data) / 1e3 for data in files),
+            **picture_figures([decode_image(data) for data in files], pictures),
+        }
+
+
+def _times(seconds: Sequence[float]) -> Row:
+    return dict(zip(("ms", "ms_min", "ms_p90"), harness.spread_ms(seconds).values(), strict=True))
 
 
 def _rounded(value: Any) -> Any:
@@ -535,38 +457,35 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
-def table_of(trade: Mapping[str, Any]) -> list[Row]:
-    """One row for every recipe, knob and value: {scene, recipe, knob, value, ms, flip, ...}."""
+def rows_of(tables: Tables) -> list[Row]:
+    """All rows, each with its scene and recipe."""
     return [
-        {"scene": trade["scene"], "recipe": entry["recipe"], **row}
-        for entry in trade["recipes"]
+        {"scene": table["scene"], "recipe": entry["recipe"], **row}
+        for table in tables
+        for entry in table["recipes"]
         for row in entry["rows"]
     ]
 
 
 def printable(trade: Mapping[str, Any]) -> Figures:
     """Tables in the form that all subjects are printed in: of every recipe the settings, wholes
-    first, and the files.
+    first, and the files; columns of which something is known.
     """
-    order = {path: number for number, path in enumerate([WHOLE, *KNOBS])}
-    tables = []
+    order, tables = [WHOLE, *KNOBS], []
     for entry in trade["recipes"]:
-        rows = sorted(entry["rows"], key=lambda row: order[row["knob"]])
-        for title, columns, shown in (
-            (entry["recipe"], COLUMNS, [row for row in rows if row["knob"] != JPEG]),
-            (f"{entry['recipe']}, files", FILE_COLUMNS, [r for r in rows if r["knob"] == JPEG]),
-        ):
+        rows = sorted(entry["rows"], key=lambda row: order.index(row["knob"]))
+        for title, of_files in ((entry["recipe"], False), (f"{entry['recipe']}, files", True)):
+            shown = [row for row in rows if (row["knob"] == JPEG) == of_files]
+            columns = {n: k for n, k in COLUMNS.items() if any(r.get(k) is not None for r in shown)}
             cells = [[_cell(key, row.get(key)) for key in columns.values()] for row in shown]
             tables += [Table(title, tuple(columns), cells)] if cells else []
-    shown = figures("trade", tables, machine=trade["machine"], gpu=trade["gpu"])
+    shown = harness.figures("trade", tables, machine=trade["machine"], gpu=trade["gpu"])
     return {**shown, "load_after": trade["load_after"]}
 
 
 def _cell(key: str, value: Any) -> Any:
-    if key == "knob":
-        return value.removeprefix("weather.")
-    if key == "value":
-        return _text(value)
+    if key in ("knob", "value"):
+        return _text(value).removeprefix("weather.")
     return 100 * value if key in ("off_5cm", "abs_rel") and value is not None else value
 
 
@@ -576,116 +495,82 @@ def _text(value: Value) -> str:
 
 # ---- the rule of the tiers ----------------------------------------------------------------------
 
-# What a viewer takes for the same picture: on every published scene under every recipe it is below
-# the FLIP of a JPEG at quality 92, which is what people who look at pictures take for lossless.
-INVISIBLE_FLIP, INVISIBLE_QUALITY = 0.02, 92
-# What differs plainly and shows the same: reconstructions differ as much from the recordings that
-# they are made of (docs/reconstruction.md: 0.05 to 0.11 on held-out views).
-DRAFT_FLIP = 0.10
-BOUNDS = {"draft": DRAFT_FLIP, "balanced": INVISIBLE_FLIP}
-Tables = Sequence[Mapping[str, Any]]
+# balanced: what a viewer takes for the same picture: on every published scene under every recipe
+# it is below the FLIP of a JPEG at quality 92, which is what people who look at pictures take for
+# lossless. draft: what differs plainly and shows the same: reconstructions differ as much from the
+# recordings that they are made of (docs/reconstruction.md: 0.05 to 0.11 on held-out views).
+BOUNDS = {"draft": 0.10, "balanced": 0.02}
 
 
 class Unmeasured(Exception):
-    """Settings that the rule has to know the error of, and no row has."""
-
-    def __init__(self, settings: Settings) -> None:
-        super().__init__(f"not measured together: {settings}")
-        self.settings = settings
+    """Its argument: settings that the rule has to know the error of, and no row has."""
 
 
 def tiers_from(tables: Tables) -> dict[str, dict[str, Value]]:
-    """What each tier sets, by the knobs' paths; knobs at reference are left out.
-
-    Raises:
-        Unmeasured: the tables lack settings that have to be rendered together.
+    """What each tier sets, by the knobs' paths; knobs at reference are left out. Raises Unmeasured:
+    the tables lack settings that have to be rendered together.
     """
     return {name: tier_from(tables, bound) for name, bound in BOUNDS.items()}
 
 
 def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
-    """The rule for one bound.
+    """The rule for one bound."""
+    rows, ladders = rows_of(tables), {}
+    for path, knob in KNOBS.items():
+        if knob.chosen:
+            costs = [value_cost(rows, path, value) for value in knob.values[:-1]]
+            known = [cost for cost in costs if cost is not None]
+            fast_first = useful([*known, Cost(knob.reference, 100.0, 0.0)])[::-1]
+            # What is beyond the bound alone need not be rendered with others.
+            ladders[path] = [cost for cost in fast_first if cost.flip <= bound]
+    by_time = sorted(ladders, key=lambda path: min(cost.ms for cost in ladders[path]))
+    chosen = search(
+        {path: [cost.value for cost in ladders[path]] for path in by_time},
+        lambda settings: whole_flip(rows, settings) <= bound,
+    )
+    return _moved(chosen, KNOBS)
 
-    Raises:
-        Unmeasured: see tiers_from.
+
+def value_cost(rows: Sequence[Row], path: str, value: Value) -> Cost | None:
+    """ms: here per cent of the reference's time. flip: the worst. None of a value that no table has
+    or that changes no picture: a time would be noise.
     """
-    rows = _all_rows(tables)
-    costs = {knob.path: knob_costs(rows, knob) for knob in KNOBS.values() if knob.chosen}
-    # From the fastest to reference, as within_flip takes them.
-    ladders = {path: useful(each)[::-1] for path, each in costs.items()}
-    flips = {path: {cost.value: cost.flip for cost in each} for path, each in costs.items()}
-
-    def min_ms(path: str) -> float:
-        """Of the values that are within the bound alone."""
-        return min(cost.ms for cost in ladders[path] if cost.flip <= bound)
-
-    def keeps(settings: Settings) -> bool:
-        alone = (flips[path][value] for path, value in settings.items())
-        return all(flip <= bound for flip in alone) and whole_flip(rows, settings) <= bound
-
-    values = {path: [cost.value for cost in ladders[path]] for path in sorted(ladders, key=min_ms)}
-    chosen = search(values, keeps)
-    return {path: value for path, value in chosen.items() if value != KNOBS[path].reference}
-
-
-def knob_costs(rows: Sequence[Row], knob: Knob) -> list[Cost]:
-    """Of its values, fast to accurate. ms: here per cent of the reference's time. flip: the worst.
-
-    Values that no table has, and those that change no picture, are left out: of the latter a time
-    would be noise.
-    """
-    costs = []
-    for value in knob.values[:-1]:
-        own = [row for row in _of_value(rows, knob, value) if row["worst_flip"] > 0]
-        if own:
-            worst = max(row["worst_flip"] for row in own)
-            costs.append(Cost(value, 100 * _mean_ratio(own), worst))
-    return [*costs, Cost(knob.reference, 100.0, 0.0)]
+    own = [row for row in _of_value(rows, path, value) if row["worst_flip"] > 0]
+    if not own:
+        return None
+    return Cost(value, 100 * _mean_ratio(own), max(row["worst_flip"] for row in own))
 
 
 def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
-    """The worst of the rows of these settings together.
-
-    Raises:
-        Unmeasured: a recipe has none.
+    """The worst of the rows of these settings together, of a single knob's where no other of the
+    recipe's is moved. Raises Unmeasured: a recipe has none.
     """
-    worst = 0.0
-    for recipe in sorted({(row["scene"], row["recipe"]) for row in rows}):
-        own = [row for row in rows if (row["scene"], row["recipe"]) == recipe]
-        found = [row["worst_flip"] for row in own if _is_of(row, settings)]
-        found += _alone(own, settings)
-        if not found:
-            raise Unmeasured(settings)
-        worst = max(worst, *found)
-    return worst
+    by_recipe: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        by_recipe.setdefault((row["scene"], row["recipe"]), []).append(row)
+    worst = [0.0]
+    for own in by_recipe.values():
+        knobs = {row["knob"] for row in own}
+        if moved := _moved(settings, knobs):
+            found = [row["worst_flip"] for row in own if _moved(_settings(row), knobs) == moved]
+            if not found:
+                raise Unmeasured(settings)
+            worst += found
+    return max(worst)
 
 
-def _alone(rows: Sequence[Row], settings: Settings) -> list[float]:
-    """The error of settings of which one, or none, differs from reference for a recipe."""
-    knobs = {row["knob"] for row in rows}
-    moved = {p: v for p, v in settings.items() if p in knobs and v != KNOBS[p].reference}
-    if not moved:
-        return [0.0]
-    if len(moved) > 1:
-        return []
-    return [row["worst_flip"] for row in rows if (row["knob"], row["value"]) in moved.items()]
+def _settings(row: Row) -> Mapping[str, Value]:
+    single = {} if row["knob"] == WHOLE else {row["knob"]: row["value"]}
+    return row.get("settings", single)
 
 
-def _is_of(row: Row, settings: Settings) -> bool:
-    given = row.get("settings")
-    return (
-        row["knob"] == WHOLE
-        and given is not None
-        and all(settings.get(path, value) == value for path, value in given.items())
-    )
+def _moved(settings: Mapping[str, Value], knobs: Container[str]) -> dict[str, Value]:
+    """Those of these knobs that are not at reference."""
+    return {p: v for p, v in settings.items() if p in knobs and v != KNOBS[p].reference}
 
 
-def _all_rows(tables: Tables) -> list[Row]:
-    return [row for table in tables for row in table_of(table)]
-
-
-def _of_value(rows: Sequence[Row], knob: Knob, value: Value) -> list[Row]:
-    return [row for row in rows if (row["knob"], row["value"]) == (knob.path, value)]
+def _of_value(rows: Sequence[Row], path: str, value: Value) -> list[Row]:
+    return [row for row in rows if (row["knob"], row["value"]) == (path, value)]
 
 
 def _mean_ratio(rows: Sequence[Row]) -> float:
@@ -701,9 +586,9 @@ def settle(
             return tiers_from(tables)
         except Unmeasured as missing:
             for table, uri in zip(tables, uris, strict=True):
-                rows = table_of(table)
-                tried = {r["value"] for r in rows if str(r["value"]).startswith("candidate")}
-                measure_wholes(table, uri, {f"candidate {len(tried) + 1}": missing.settings}, case)
+                values = {str(row["value"]) for row in rows_of([table])}
+                tried = sum(value.startswith("candidate") for value in values)
+                measure_wholes(table, uri, {f"candidate {tried + 1}": missing.args[0]}, case)
 
 
 def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeCase) -> Trade:
@@ -714,12 +599,6 @@ def measure_wholes(table: dict[str, Any], uri: str, wholes: Wholes, case: TradeC
         kept = [row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in wholes]
         entry["rows"] = kept + [row for row in new["rows"] if row["value"] in wholes]
     return trade
-
-
-def invisible_evidence(tables: Tables) -> list[float]:
-    """Mean FLIP of JPEGs of INVISIBLE_QUALITY against PNG, by scene and recipe."""
-    rows = _of_value(_all_rows(tables), KNOBS[JPEG], INVISIBLE_QUALITY)
-    return [row["flip"] for row in rows]
 
 
 # ---- docs/trade.md ------------------------------------------------------------------------------
@@ -738,69 +617,62 @@ def read_tables() -> list[dict[str, Any]]:
 
 
 def document(text: str, tables: Tables) -> str:
-    """The document with its tables made anew.
-
-    Raises:
-        ValueError: it lacks a marker.
-    """
+    """The document with its tables made anew. Raises ValueError: it lacks a marker."""
     sections = {
-        "machine": [f"- {machine_line(t)}; {_views_line(t)}." for t in tables],
+        "machine": [_machine_line(table) for table in tables],
         "tiers": _tier_lines(),
         "wholes": _whole_lines(tables),
         "knobs": _knob_lines(tables),
     }
     for name, lines in sections.items():
         start, end = START.format(name=name), END.format(name=name)
-        text = replace_marked(text, start, end, "\n".join(lines))
+        text = harness.replace_marked(text, start, end, "\n".join(lines))
     return text
 
 
-def _views_line(trade: Mapping[str, Any]) -> str:
-    views = [
-        f"{v['camera']} of frame {v['frame']} ({v['width']}x{v['height']})" for v in trade["views"]
-    ]
+def _machine_line(trade: Mapping[str, Any]) -> str:
+    view = "{camera} of frame {frame} ({width}x{height})"
     return (
-        f"{trade['scene']}, {trade['gaussians']:,} Gaussians; {', '.join(views)}; "
-        f"{trade['repeats']} timed frames of each view and setting"
+        f"- {harness.machine_line(trade)}; {trade['scene']}, {trade['gaussians']:,} Gaussians; "
+        f"{', '.join(view.format(**each) for each in trade['views'])}; "
+        f"{trade['repeats']} timed frames of each view and setting."
     )
 
 
 def _tier_lines() -> list[str]:
     rows = []
-    for knob in (knob for knob in KNOBS.values() if knob.chosen):
-        values = [TIERS[name].get(knob.path, knob.reference) for name in BOUNDS]
-        rows.append([f"`{knob.path}`", knob.what, *map(_text, [*values, knob.reference])])
+    for path, knob in KNOBS.items():
+        values = [TIERS[name].get(path, knob.reference) for name in BOUNDS]
+        rows += [[f"`{path}`", knob.what, *map(_text, [*values, knob.reference])]] * knob.chosen
     return _lines(["knob", "what it is", *BOUNDS, REFERENCE], rows)
 
 
 def _whole_lines(tables: Tables) -> list[str]:
     """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
-    settings, rows = (DEFAULTS, *BOUNDS), []
-    for table in tables:
-        found = {(r["recipe"], r["value"]): r for r in table_of(table) if r["knob"] == WHOLE}
-        for recipe in dict.fromkeys(recipe for recipe, _ in found):
-            of = [found[recipe, name] for name in settings]
-            cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in of]
-            ms = f"{found[recipe, REFERENCE]['ms']:.0f}"
-            rows.append([table["scene"], recipe, ms, *cells])
-    header = ["scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in settings)]
-    return _lines(header, rows)
+    names, lines = (DEFAULTS, *BOUNDS), []
+    whole = [row for row in rows_of(tables) if row["knob"] == WHOLE]
+    found = {(row["scene"], row["recipe"], row["value"]): row for row in whole}
+    for scene, recipe in dict.fromkeys(key[:2] for key in found):
+        of = [found[scene, recipe, name] for name in names]
+        cells = [f"{row['over_reference']:.2f}, {row['worst_flip']:.3f}" for row in of]
+        lines.append([scene, recipe, f"{found[scene, recipe, REFERENCE]['ms']:.0f}", *cells])
+    header = ["scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in names)]
+    return _lines(header, lines)
 
 
 def _knob_lines(tables: Tables) -> list[str]:
     """Over all recipes that a knob has an effect on: mean ratio of times and the worst errors."""
-    each, rows = ("x reference", "worst FLIP", "depth off"), []
-    for knob in (knob for knob in KNOBS.values() if knob.path != JPEG):
-        for value in knob.values if knob.path == DEPTH else knob.values[:-1]:
-            of = [_of_value(table_of(table), knob, value) for table in tables]
-            cells = [cell for own in of for cell in _knob_cells(own)]
-            rows.append([f"`{knob.path}`", _text(value), *cells])
-    return _lines(
-        ["knob", "value", *(f"{t['scene']}: {name}" for t in tables for name in each)], rows
-    )
+    rows = [
+        [f"`{path}`", _text(value), *(c for t in tables for c in _knob_cells(t, path, value))]
+        for path, knob in KNOBS.items()
+        for value in measured_values(knob)
+    ]
+    each = ("x reference", "worst FLIP", "depth off")
+    return _lines(["knob", "value", *(f"{t['scene']}: {n}" for t in tables for n in each)], rows)
 
 
-def _knob_cells(rows: Sequence[Row]) -> list[str]:
+def _knob_cells(table: Mapping[str, Any], path: str, value: Value) -> list[str]:
+    rows = _of_value(rows_of([table]), path, value)
     if not rows:
         return ["-", "-", "-"]
     ratios = [row["over_reference"] for row in rows]
@@ -814,7 +686,7 @@ def _knob_cells(rows: Sequence[Row]) -> list[str]:
 
 def _lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Of a Markdown table; all columns but the first two to the right."""
-    return markdown_lines(header, ["---", "---", *["---:"] * (len(header) - 2)], rows)
+    return harness.markdown_lines(header, ["---", "---", *["---:"] * (len(header) - 2)], rows)
 
 
 # ---- pictures -----------------------------------------------------------------------------------
@@ -876,7 +748,7 @@ def draw_tiers(path: Path, trade: Trade) -> None:
         whole = {row["value"]: row for row in entry["rows"] if row["knob"] == WHOLE}
         panels = []
         for name in (REFERENCE, *list(BOUNDS)[::-1]):
-            picture = trade.pictures[entry["recipe"]][name]
+            picture, row = trade.pictures[entry["recipe"]][name], whole[name]
             height, width = picture.shape[:2]
             tall, wide = height // 2, min(width, height * 2 // 3)
             top = min(max(0, round(CROP_AT[1] * height - tall / 2)), height - tall)
@@ -884,9 +756,10 @@ def draw_tiers(path: Path, trade: Trade) -> None:
             part = picture[top : top + tall, left : left + wide]
             size = (round(CROP_PX * wide / tall), CROP_PX)
             shown = cv2.resize(part, size, interpolation=cv2.INTER_NEAREST)
-            error = "" if name == REFERENCE else f", FLIP {whole[name]['flip']:.4f}"
-            text = f"{whole[name]['ms']:.0f} ms{error}"
-            panels.append(captioned(shown, f"{entry['recipe']}, {name}", text))
+            error = "" if name == REFERENCE else f", FLIP {row['flip']:.4f}"
+            panels.append(
+                captioned(shown, f"{entry['recipe']}, {name}", f"{row['ms']:.0f} ms{error}")
+            )
         lines.append(strip(panels))
     write_rgb(path, np.concatenate(lines))
 
