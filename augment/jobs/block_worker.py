@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from augment import effects
 from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
-from augment.jobs.atomic import remove_temporaries
+from augment.jobs.atomic import link_file, make_folder, refusals_of, remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
 from augment.jobs.files import box_tables
@@ -105,7 +105,24 @@ class Publisher:
         return publish_part(self._store, self._block.key, new)
 
     def _send(self, source: str, target: str) -> None:
-        self._sent[target] = self._pool.submit(self._store.put_file, target, self._folder / source)
+        self._sent[target] = self._pool.submit(self._put, self._folder / source, target)
+
+    def _put(self, source: Path, target: str) -> None:
+        is_shared = target.startswith(f"{folder_name(self._block.scene)}/{SWEEPS}/")
+        if not (is_shared and self._store.exists(target)):
+            self._store.put_file(target, source)
+
+
+def take_sweeps(store: Store, folder: Path, block: Block) -> None:
+    """Give the folder, by links, the sweeps that the scene's other variants have published."""
+    if store.local_dir is None or block.recipe.lidar != "clean":
+        return
+    for frame in block.frames:
+        path = item_paths(block.scene, block.recipe, "", frame)["lidar"] or ""
+        if (store.local_dir / path).is_file():
+            with refusals_of(folder / path):
+                make_folder((folder / path).parent)
+                link_file(str(store.local_dir / path), str(folder / path))
 
 
 def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
@@ -382,6 +399,7 @@ class BlockWorker:
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
             clear_files_of(self._store, block)
+        take_sweeps(self._store, folder, block)
         job = RenderJob(
             scene_uri=block.uri,
             recipes=[block.recipe],
