@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,21 +45,18 @@ def compiling_noted(*, on_gpu: bool = False) -> Iterator[None]:
     What lies in numba's cache is loaded in silence. Triton does not tell beforehand: on a GPU what
     takes longer than SILENT_S is taken to compile.
     """
-    from numba.core.event import Event, Listener, install_listener
+    from numba.core.event import Event, TimingListener, install_listener
 
-    class Announcer(Listener):
-        has_spoken = False
+    note = "compiling kernels (once; kept for the next run) ..."
+    say_once = cache(partial(print_note, note))
 
-        def on_start(self, event: Event | None = None) -> None:
-            if not self.has_spoken:
-                self.has_spoken = True
-                print_note("compiling kernels (once; kept for the next run) ...")
-
-        def on_end(self, event: Event) -> None:
-            pass
+    class Announcer(TimingListener):
+        def on_start(self, event: Event) -> None:
+            say_once()
+            super().on_start(event)
 
     announcer, started = Announcer(), time.perf_counter()
-    timer = threading.Timer(SILENT_S, announcer.on_start)
+    timer = threading.Timer(SILENT_S, say_once)
     timer.daemon = True
     if on_gpu:
         timer.start()
@@ -67,8 +65,9 @@ def compiling_noted(*, on_gpu: bool = False) -> Iterator[None]:
             yield
     finally:
         timer.cancel()
-    if announcer.has_spoken:
-        print_note(f"compiled the kernels in {time.perf_counter() - started:.1f} s")
+    if say_once.cache_info().misses:
+        seconds = time.perf_counter() - started if on_gpu else announcer.duration
+        print_note(f"compiled the kernels in {seconds:.1f} s")
 
 
 def fill(template: str, **facts: Any) -> str:
