@@ -20,7 +20,7 @@ from augment.effects.style.losses import (
     weighted_sum,
 )
 from augment.effects.style.network import Gscm
-from augment.effects.style.pairs import PairBatch, PairWeights, pair_losses, weighted
+from augment.effects.style.pairs import PAIR_WEIGHTS, PairBatch, pair_losses
 from augment.effects.style.statistics import WHOLE, ColorStatistics, closed_maps
 from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
@@ -268,7 +268,7 @@ def test_of_the_style_network_of_plain_pictures(network, first, second):
     network.zero_grad()
     losses = pair_losses(network, batch)
     assert_finite(losses)
-    weighted(losses, PairWeights()).backward()
+    weighted_sum(losses, PAIR_WEIGHTS | {"range": 4.0}).backward()
     assert_finite({n: p.grad for n, p in network.named_parameters() if p.grad is not None})
 
 
