@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
@@ -293,6 +293,7 @@ class StoredPlan:
     version: str
     blocks: tuple[PlannedBlock, ...]
     unusable: dict[str, str]
+    format: Literal[2] = 2
 
 
 _STORED_PLAN = TypeAdapter(StoredPlan)

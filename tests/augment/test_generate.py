@@ -240,12 +240,13 @@ def test_status_in_every_state(tmp_path: Path) -> None:
     assert status.by_scene["a"].planned == 16 and status.by_recipe["wet"].published == 14
 
 
-DAMAGES = [b"", b"{", b"[]", b"null", b'{"format":1}', b"\xff", b"[" * 100_000,
-           b'{"format":1,"job":"j","version":"1","blocks":[["k","s","v","r","9"]],"unusable":{}}',
-           b'{"format":1,"job":"j","version":"1","blocks":[["k"]],"unusable":{}}',
-           b'{"format":1,"job":"j","version":"1","blocks":[],"unusable":[]}',
-           b'{"format":1,"job":["j"],"version":"1","blocks":[],"unusable":{}}',
-           b'{"format":2,"job":"j","version":"1","blocks":[],"unusable":{}}']  # fmt: skip
+BLOCK = b'{"key":"k","scene":"s","variant":"v","recipe":"r","images":"9"}'
+DAMAGES = [b"", b"{", b"[]", b"null", b'{"format":2}', b"\xff", b"[" * 100_000,
+           b'{"format":2,"job":"j","version":"1","blocks":[' + BLOCK + b'],"unusable":{}}',
+           b'{"format":2,"job":"j","version":"1","blocks":[["k"]],"unusable":{}}',
+           b'{"format":2,"job":"j","version":"1","blocks":[],"unusable":[]}',
+           b'{"format":2,"job":["j"],"version":"1","blocks":[],"unusable":{}}',
+           b'{"format":1,"job":"j","version":"1","blocks":[],"unusable":{}}']  # fmt: skip
 
 
 @pytest.mark.parametrize("data", DAMAGES, ids=lambda data: data[:12].decode("latin1"))
