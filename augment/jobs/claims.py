@@ -205,11 +205,12 @@ class _ObjectClaim(Claim):
         self._stop.set()
         self._thread.join()
         try:
-            # A request to delete may hit whatever is there: it must end while this claim is fresh.
+            # A request to delete hits whatever is there. A late one must find this claim, which
+            # nobody takes over before its lifetime has passed.
             self._renew()
             left_s = self._renewed_s + self._times.lifetime_s - _clock_s()
-            if not self._lost and left_s > self._store.patience.longest_s:
-                self._store.delete([self._path])
+            if not self._lost and left_s > self._store.patience.timeout_s:
+                self._store.delete_once(self._path)
         except OutputError as error:
             _log.warning("a claim ends only in %.0f s: %s", self._times.lifetime_s, error)
         self._lost = self._lost or "it was released"

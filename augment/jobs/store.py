@@ -16,7 +16,7 @@ import tempfile
 import threading
 import urllib.parse
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -253,7 +253,6 @@ _KINDS = ("s3", *_GOOGLE, *_AZURE)
 _S3_OPTIONS = ("endpoint_override", "scheme", "region",
                "force_virtual_addressing", "tls_ca_file_path")  # fmt: skip
 _ANONYMOUS = "anonymous"  # as the user: requests are not signed
-_PARTS_AT_ONCE = 4  # of a large upload
 _T = TypeVar("_T")
 
 
@@ -286,25 +285,29 @@ def _parse(uri: str) -> _Place:
     folder = urllib.parse.unquote(path).removeprefix("/")
     known = _S3_OPTIONS if scheme == "s3" else ()
     unknown = [name for name in options if name not in known]
+    unknown += ["user@"] if user and not at and scheme != "s3" else []
+    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _UNSAFE.search(folder)
+    problem = ""
     if scheme not in _KINDS:
-        raise OutputError(
-            f"{public}: there are no stores of the kind {scheme!r}; use a path of this machine, "
-            f"or one of {', '.join(_KINDS)}"
+        problem = (
+            f"there are no stores of the kind {scheme!r}; use a path of this machine, or one of "
+            f"{', '.join(_KINDS)}"
         )
-    if not host:
-        raise OutputError(f"{public} names no bucket; expected {scheme}://bucket/folder")
-    if unknown or (user and not at and scheme != "s3"):
-        raise OutputError(
-            f"{public}: there is no option {unknown[0] if unknown else 'user@'!r} here; the "
-            f"options are {', '.join(known) or 'none'}. Credentials come from the environment "
+    elif not host:
+        problem = f"the URI names no bucket; expected {scheme}://bucket/folder"
+    elif unknown:
+        problem = (
+            f"there is no option {unknown[0]!r} here; the options are "
+            f"{', '.join(known) or 'none'}. Credentials come from the environment "
             f"({_CREDENTIALS[scheme]})"
         )
-    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _UNSAFE.search(folder)
-    if parsed.fragment or not is_clean:
-        raise OutputError(
-            f"{public}: the folder must be named without '.', '..', '#', backslashes and double "
-            f"slashes; write a sign that has a meaning in URIs as %23 and so on"
+    elif parsed.fragment or not is_clean:
+        problem = (
+            "the folder must be named without '.', '..', '#', backslashes and double slashes; "
+            "write a sign that has a meaning in URIs as %23 and so on"
         )
+    if problem:
+        raise OutputError(f"{public}: {problem}")
     query = urllib.parse.urlencode(options)
     return _Place(f"{public}?{query}" if query else public, scheme, host, folder, options,
                   user, password)  # fmt: skip
@@ -321,12 +324,7 @@ class Patience:
     first_wait_s: float = 0.5
     longest_wait_s: float = 10.0
     timeout_s: float = 30.0
-    give_up_s: float = 40.0
-
-    @property
-    def longest_s(self) -> float:
-        """No small request is under way for longer."""
-        return self.give_up_s + self.timeout_s
+    give_up_s: float = 120.0
 
 
 PATIENCE = Patience()
@@ -355,7 +353,8 @@ class RemoteStore:
         self.uri = self._place.public
         self.patience = patience
         self._uri = uri
-        self._opened: tuple[int, Any] = (0, None)
+        # By process: what a parent opened is kept, since closing it in a child is not safe.
+        self._opened: dict[tuple[int, Patience], Any] = {}
 
     def __repr__(self) -> str:
         return f"RemoteStore({self.uri!r})"
@@ -369,9 +368,7 @@ class RemoteStore:
 
     def write(self, path: str, data: bytes) -> None:
         path = stored_path(path, self.uri)
-        self._call(
-            "write", path, lambda obs, at: obs.put(at, path, data, max_concurrency=_PARTS_AT_ONCE)
-        )
+        self._call("write", path, lambda obs, at: obs.put(at, path, data, max_concurrency=4))
 
     def put_file(self, path: str, source: Path) -> None:
         """The file is read into memory first: one that fails to be read must not be uploaded."""
@@ -412,6 +409,12 @@ class RemoteStore:
                 with contextlib.suppress(StoredFileMissing):
                     self._call("delete", name, lambda obs, at, name=name: obs.delete(at, name))
 
+    def delete_once(self, path: str) -> None:
+        """Delete without trying again: of two requests, the second might hit a later object."""
+        with contextlib.suppress(StoredFileMissing):
+            once = replace(self.patience, retries=0)
+            self._call("delete", path, lambda obs, at: obs.delete(at, path), once)
+
     def read_version(self, path: str) -> StoredVersion | None:
         """What the object holds now; None where there is none."""
 
@@ -446,22 +449,25 @@ class RemoteStore:
                 return found
         raise AssertionError
 
-    def _call(self, operation: str, path: str, call: Callable[[Any, Any], _T]) -> _T:
+    def _call(
+        self,
+        operation: str,
+        path: str,
+        call: Callable[[Any, Any], _T],
+        patience: Patience | None = None,
+    ) -> _T:
         """What the call of obstore returns, at this process's connections."""
-        obs = _load_obstore()
+        obs, key = _load_obstore(), (os.getpid(), patience or self.patience)
         try:
-            if self._opened[0] != os.getpid():
-                _of_parents.append(self._opened)  # to close them here is not safe
-                self._opened = (os.getpid(), _open(obs, self._place, self.patience))
-            return call(obs, self._opened[1])
+            if key not in self._opened:
+                self._opened[key] = _open(obs, self._place, key[1])
+            return call(obs, self._opened[key])
         except Exception as error:
             cause, base = _cause(error), self.uri.partition("?")[0]
             where = f"{base}/{path}" if path else base
             if isinstance(error, FileNotFoundError) and not _NO_BUCKET.search(cause):
                 raise StoredFileMissing(f"{where} is missing") from None
-            if isinstance(
-                error, obs.exceptions.AlreadyExistsError | obs.exceptions.PreconditionError
-            ):
+            if type(error).__name__ in ("AlreadyExistsError", "PreconditionError"):
                 raise _OtherVersionError from None
             for secret in (self._place.user, self._place.password):
                 cause = cause.replace(secret, "***") if secret else cause
@@ -481,24 +487,23 @@ def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
 
 def _open(obs: Any, place: _Place, patience: Patience) -> Any:
     """obstore's store of the place."""
+    seconds = lambda value: timedelta(seconds=value)  # noqa: E731
     client: dict[str, Any] = {
-        "connect_timeout": timedelta(seconds=min(patience.timeout_s, 10.0)),
-        "read_timeout": timedelta(seconds=patience.timeout_s),
+        "connect_timeout": seconds(min(patience.timeout_s, 10.0)),
+        "read_timeout": seconds(patience.timeout_s),
         "timeout": timedelta(days=1),  # of a whole download
     }
     wait = {
-        "init_backoff": timedelta(seconds=patience.first_wait_s),
-        "max_backoff": timedelta(seconds=patience.longest_wait_s),
+        "init_backoff": seconds(patience.first_wait_s),
+        "max_backoff": seconds(patience.longest_wait_s),
         "base": 2,
     }
-    settings: dict[str, Any] = {
-        "client_options": client,
-        "retry_config": {
-            "max_retries": patience.retries,
-            "retry_timeout": timedelta(seconds=patience.give_up_s),
-            "backoff": wait,
-        },
+    retry = {
+        "max_retries": patience.retries,
+        "retry_timeout": seconds(patience.give_up_s),
+        "backoff": wait,
     }
+    settings: dict[str, Any] = {"client_options": client, "retry_config": retry}
     if place.scheme in _AZURE:
         return obs.store.AzureStore.from_url(place.public, **settings)
     settings["prefix"] = place.folder
@@ -527,8 +532,9 @@ def _open(obs: Any, place: _Place, patience: Patience) -> Any:
     return obs.store.S3Store(place.host, disable_bulk_delete=True, **settings)
 
 
-_of_parents: list[Any] = []
 _loading = threading.Lock()
+_release = _loading.release  # no thread is loading while a process forks
+os.register_at_fork(before=_loading.acquire, after_in_parent=_release, after_in_child=_release)
 _loaded_by = 0  # this process, or the one that it was forked from
 _obstore_folder = ""
 
@@ -551,14 +557,6 @@ def _load_obstore() -> Any:
                 sys.path.remove(folder)
         _loaded_by = os.getpid()
     return sys.modules["obstore"]
-
-
-def _after_fork() -> None:
-    global _loading
-    _loading = threading.Lock()  # a thread of the parent may hold the other
-
-
-os.register_at_fork(after_in_child=_after_fork)
 
 
 # ---- What obstore's failures mean, and what to do ------------------------------------------------

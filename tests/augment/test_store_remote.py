@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.jobs.store import Patience, RemoteStore, StoredFileMissing, open_store
 
 BIG = b"0123456789" * 1_100_000  # three parts of an upload
-QUICK = Patience(3, 0.001, 0.002, timeout_s=5.0, give_up_s=5.0)
+QUICK = Patience(3, 0.001, 0.002, timeout_s=5.0)
 TRIES = QUICK.retries + 1
 FAULTS = [{"status": 500}, {"status": 503}, {"cut": "upload"}, {"cut": "answer"}]
 
@@ -79,7 +79,7 @@ def test_other_operations_outlast_failures(server, store):
 
 def test_a_server_that_stands_still_is_left(server, store):
     store.write("a", b"1")
-    impatient = RemoteStore(store.uri, Patience(6, 0.001, 0.001, timeout_s=1.0, give_up_s=9.0))
+    impatient = RemoteStore(store.uri, Patience(6, 0.001, 0.001, timeout_s=1.0))
     server.fail(1, method="PUT", delay_s=1.6, status=500)
     impatient.write("a", b"2")
     assert store.read("a") == b"2"
