@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
 import shutil
@@ -244,9 +245,11 @@ def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch, call):
     assert trees.snapshot(source) == before
 
 
-@pytest.mark.parametrize("number", [errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP])
-def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch, number):
+def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch):
+    numbers = itertools.cycle([errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP])
+
     def refuse(*_, **__):
+        number = next(numbers)
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "link", refuse)
@@ -375,27 +378,22 @@ def test_a_source_that_is_a_link_itself(source, tmp_path):
     assert not done.folder.is_symlink()
 
 
-@pytest.mark.parametrize(
-    ("link", "text", "message"),
-    [
+def test_what_a_copy_cannot_have_is_refused(source, out, tmp_path):
+    """Links that lead out of the dataset, and what is neither file nor folder nor link."""
+    (tmp_path / "secret").write_text("secret")
+    for name, text, message in (
         ("camera/secret", "../../secret", r"camera/secret is a link to .*secret, outside"),
         ("camera/front/09.png", "/etc/hostname", r"09\.png is a link to /etc/hostname, outside"),
         ("sweeps", "../gone", r"sweeps is a link to .*gone, which does not exist"),
         ("loop", "..", r"loop is a link to .*, which holds the dataset itself"),
-    ],
-)
-def test_links_that_lead_out_are_refused(source, out, tmp_path, link, text, message):
-    (tmp_path / "secret").write_text("secret")
-    (source / link).symlink_to(text)
-    with pytest.raises(AdapterError, match=message):
-        trees.mirror(source, out)
+        ("lidar/pipe", None, r"pipe is neither a file nor a folder nor a link"),
+    ):
+        path = source / name
+        os.mkfifo(path) if text is None else path.symlink_to(text)
+        with pytest.raises(AdapterError, match=message):
+            trees.mirror(source, out)
+        path.unlink()
     assert not (out / "source/fog-000").exists()
-
-
-def test_what_is_no_file_is_refused(source, out):
-    os.mkfifo(source / "lidar/pipe")
-    with pytest.raises(AdapterError, match="pipe is neither a file nor a folder nor a link"):
-        trees.mirror(source, out)
 
 
 @pytest.mark.parametrize("place", ["", "drive", "drive/camera"])
@@ -460,9 +458,8 @@ def test_an_output_folder_in_the_dataset_is_refused(source, place):
 
 
 @pytest.mark.parametrize(
-    ("scale", "method"), [(0.5, cv2.INTER_CUBIC), (2.0, cv2.INTER_AREA)], ids=["up", "down"]
+    ("scale", "method", "suffix"), [(0.5, cv2.INTER_CUBIC, "png"), (2.0, cv2.INTER_AREA, "jpg")]
 )
-@pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
     source, out = trees.write_dataset(tmp_path / "drive", suffix=suffix), tmp_path / "out"
     trees.render(source, out, scale=scale, image=suffix)
@@ -552,16 +549,14 @@ def test_a_rendered_image_that_is_gone_or_damaged_is_said(tmp_path):
         trees.mirror(source, out)
 
 
-@pytest.mark.parametrize(
-    ("names", "format"),
-    [(["a.jpg", "b.JPEG"], "jpg"), (["a.png"], "png"), (["a.png", "b.jpg"], "png")],
-)
-def test_the_format_to_render_in(names, format):
+def test_the_format_to_render_in():
     frame = batch_scenes.make_frame(0)
-    paths = {str(number): name for number, name in enumerate(names)}
-    assert dataset_format([trees.dataclasses.replace(frame, image_paths=paths)]) == format
-
-
-def test_a_scene_without_recorded_images_is_refused():
+    for names, found in (
+        (["a.jpg", "b.JPEG"], "jpg"),
+        (["a.png"], "png"),
+        (["a.png", "b.jpg"], "png"),
+    ):
+        paths = {str(number): name for number, name in enumerate(names)}
+        assert dataset_format([trees.dataclasses.replace(frame, image_paths=paths)]) == found
     with pytest.raises(AdapterError, match="knows no recorded image"):
-        dataset_format([batch_scenes.make_frame(0)])
+        dataset_format([frame])
