@@ -34,7 +34,7 @@ from augment.errors import OutputError
 from augment.jobs.atomic import (
     flush_folder,
     make_folder,
-    output_error,
+    refusals_of,
     remove_temporaries,
     temporary_beside,
     write_atomic,
@@ -320,10 +320,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
     # What killed runs left half-written, too; safetensors has temporary names of its own.
     for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
         if state is None or path.name != state.file:
-            try:
+            with refusals_of(path):
                 path.unlink(missing_ok=True)
-            except OSError as error:
-                raise output_error(path, error) from error
     return plan
 
 
@@ -402,15 +400,14 @@ def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
     """
     temporary = temporary_beside(path)
     try:
-        make_folder(path.parent)
-        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
-        with temporary.open("rb") as file:
-            checksum = hashlib.file_digest(file, "sha256").hexdigest()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        flush_folder(path.parent)
-    except OSError as error:
-        raise output_error(path, error) from error
+        with refusals_of(path):
+            make_folder(path.parent)
+            save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
+            with temporary.open("rb") as file:
+                checksum = hashlib.file_digest(file, "sha256").hexdigest()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            flush_folder(path.parent)
     except SafetensorError as error:  # how it reports a full disk
         raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
     finally:

@@ -309,22 +309,27 @@ _EPS = 1e-15
 
 
 class DenseAdam:
-    """Adam on one small float32 array, which is updated in place; moments in float64."""
+    """Adam on a small array, which is updated in place as a whole or a row at a time; moments in
+    float64, updates counted by rows.
+    """
 
-    def __init__(self, values: np.ndarray) -> None:
-        self._values = values
-        self._m = np.zeros(values.shape)
-        self._v = np.zeros(values.shape)
-        self._count = np.zeros(1, np.int64)
+    def __init__(self, values: np.ndarray, eps: float = _EPS) -> None:
+        self._values, self._eps = values, eps
+        self._m, self._v = np.zeros(values.shape), np.zeros(values.shape)
+        self._count = np.zeros(len(values), np.int64)
 
-    def update(self, gradient: np.ndarray, rate: float) -> None:
-        self._count += 1
-        self._m += (1 - BETA1) * (gradient - self._m)
-        self._v += (1 - BETA2) * (gradient * gradient - self._v)
-        n = int(self._count[0])
-        first = self._m / (1 - BETA1**n)
-        second = self._v / (1 - BETA2**n)
-        self._values -= (rate * first / (np.sqrt(second) + _EPS)).astype(np.float32)
+    def update(
+        self, gradient: np.ndarray, rate: float | np.ndarray, row: int | None = None
+    ) -> None:
+        at = slice(None) if row is None else slice(row, row + 1)
+        m, v = self._m[at], self._v[at]
+        self._count[at] += 1
+        m += (1 - BETA1) * (gradient - m)
+        v += (1 - BETA2) * (gradient * gradient - v)
+        n = int(self._count[at][0])
+        first, second = m / (1 - BETA1**n), v / (1 - BETA2**n)
+        step = rate * first / (np.sqrt(second) + self._eps)
+        self._values[at] -= step.astype(self._values.dtype)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The moments and counts themselves, by name."""

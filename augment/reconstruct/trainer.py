@@ -63,7 +63,7 @@ from augment.sky import CubemapSky
 # above all, shares what its neighbours found.
 
 # Forces are some 1e-4 a metre: what is smaller than this is rounding, and must not be a direction.
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-10
+_EPS = 1e-10
 
 
 class Knots:
@@ -79,8 +79,7 @@ class Knots:
         self._firsts = np.cumsum([0, *(len(times) for times in times_ns)])
         shape = (int(self._firsts[-1]), width)
         self.values = np.zeros(shape)
-        self._m, self._v = np.zeros(shape), np.zeros(shape)
-        self._count = np.zeros(shape[0], np.int64)
+        self._adam = DenseAdam(self.values, _EPS)
 
     def at(self, number: int, timestamp_ns: int) -> np.ndarray | None:
         """The thing's correction, float64 [D], at a time; None where it has no knots."""
@@ -96,10 +95,10 @@ class Knots:
             return
         for row, weight in zip(*place, strict=True):
             if weight > 0:
-                self._step(row, weight * gradient + pull * self.values[row], rates)
+                self._adam.update(weight * gradient + pull * self.values[row], rates, row)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"values": self.values, "m": self._m, "v": self._v, "count": self._count}
+        return {"values": self.values, **self._adam.arrays()}
 
     def _place(self, number: int, timestamp_ns: int) -> tuple[list[int], np.ndarray] | None:
         """Rows of `values` around a time, and their weights."""
@@ -113,14 +112,6 @@ class Knots:
         span = int(times[after]) - int(times[after - 1])
         part = (timestamp_ns - int(times[after - 1])) / span
         return [first + after - 1, first + after], np.array([1 - part, part])
-
-    def _step(self, row: int, gradient: np.ndarray, rates: np.ndarray) -> None:
-        self._count[row] += 1
-        n = int(self._count[row])
-        self._m[row] += (1 - _BETA1) * (gradient - self._m[row])
-        self._v[row] += (1 - _BETA2) * (gradient * gradient - self._v[row])
-        first, second = self._m[row] / (1 - _BETA1**n), self._v[row] / (1 - _BETA2**n)
-        self.values[row] -= rates * first / (np.sqrt(second) + _EPS)
 
 
 @dataclass(frozen=True, eq=False)

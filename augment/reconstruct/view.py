@@ -56,11 +56,6 @@ class RecordedView:
                     f"{list(shape)}; got {value.dtype} {list(value.shape)}"
                 )
 
-    @property
-    def nbytes(self) -> int:
-        arrays = (self.rgb, self.weight, self.sky, self.depth_pixels, self.depth_m)
-        return sum(a.nbytes for a in arrays) + self.depth_weight.nbytes
-
 
 @runtime_checkable
 class ViewSource(Protocol):

@@ -218,15 +218,7 @@ def psnr(scene: Scene, source: Recorded, keys) -> float:
     return float(-10 * np.log10(np.mean(errors)))
 
 
-def quick(
-    scene: Scene,
-    source: ViewSource,
-    steps: int = STEPS,
-    *,
-    device="cpu",
-    depth_weight=2.0,
-    **tuning,
-) -> Trainer:
+def quick(scene, source, steps=STEPS, *, device="cpu", depth_weight=2.0, **tuning) -> Trainer:
     """A trainer of 600 splats at most, in which splats are added soon."""
     config = FitConfig(max_splats=600, depth_weight=depth_weight)
     tuned = dataclasses.replace(QUICK, **tuning)
@@ -276,14 +268,13 @@ def test_cameras_learn_their_exposure(recorded):
     assert set(trainer.scene().color_maps) == {"left", "right"}
 
 
-@pytest.mark.parametrize(("shift", "turn_rad"), [((0.0, 0.03, -0.02), 0.0), ((0, 0, 0), 0.03)])
-def test_labelled_boxes_move_to_where_the_images_show_them(recorded, shift, turn_rad):
+def test_labelled_boxes_move_to_where_the_images_show_them(recorded):
     """With all else right and held still: else splats would move in their box instead."""
     names = ("means", "means_end", "quats", "scales", "opacities", "sh_dc", "sh_rest", "sky")
     still = LearningRates(color_map=0.0, **dict.fromkeys(names, 0.0))
-    labelled = truth(actors=(car(shift=shift, turn_rad=turn_rad),))
-    trainer = quick(labelled, recorded, 300, rates=still, growth=Growth(every=1000))
-    run(trainer, 300)
+    labelled = truth(actors=(car(shift=(0.0, 0.03, -0.02), turn_rad=0.03),))
+    trainer = quick(labelled, recorded, 200, rates=still, growth=Growth(every=1000))
+    run(trainer, 200)
 
     def errors(scene: Scene) -> list[float]:
         """Metres between corners of the box and their true places, frame by frame."""
@@ -299,40 +290,27 @@ def test_labelled_boxes_move_to_where_the_images_show_them(recorded, shift, turn
 
 
 @pytest.mark.usefixtures("any_threads")
-def test_same_bits_for_any_number_of_threads_and_every_time(recorded):
-    trainers = []
-    for threads in (1, 2, 2):
-        limit_threads(threads)
-        trainer = quick(start(), recorded)
-        losses = [record.loss for record in run(trainer, 50)]
-        trainers.append((trainer, losses))
-    for trainer, losses in trainers[1:]:
-        assert losses == trainers[0][1]
-        assert_same_state(trainer, trainers[0][0])
-
-
-@pytest.mark.parametrize("stop", [7, 33])
-def test_a_saved_state_continues_to_the_same_bits(recorded, stop):
-    """Before, at and after the densifications at steps 20 and 40, into a trainer made anew."""
+def test_a_saved_state_continues_to_the_same_bits_with_any_number_of_threads(recorded):
+    """Between the densifications at steps 20 and 40, into a trainer made anew."""
+    limit_threads(1)
     whole = quick(start(), recorded)
     expected = run(whole, 45)
+    limit_threads(2)
     first = quick(start(), recorded)
-    run(first, stop)
+    run(first, 33)
     arrays, facts = first.state()
     facts = json.loads(json.dumps(facts))
     kept = {name: array.copy() for name, array in arrays.items()}
     run(first, 3)
-    for name, array in arrays.items():
-        assert np.array_equal(array, kept[name]), f"{name} went on changing"
     second = quick(start(), recorded)
     second.load_state(arrays, facts)
-    assert second.step == stop
-    records = run(second, 45 - stop)
+    assert second.step == 33
+    records = run(second, 12)
     assert_same_state(second, whole)
-    for got, want in zip(records, expected[stop:], strict=True):
+    for got, want in zip(records, expected[33:], strict=True):
         assert dataclasses.replace(got, stage_s={}) == dataclasses.replace(want, stage_s={})
     for name, array in arrays.items():
-        assert np.array_equal(array, kept[name]), f"{name} is shared with the trainer"
+        assert np.array_equal(array, kept[name]), f"{name} is shared with a trainer"
 
 
 def test_the_scene_a_fit_starts_from_is_left_alone(recorded):
