@@ -411,8 +411,7 @@ class ApplyOptions(Command):
     def run(self) -> int:
         from tools.style import apply_style
 
-        asked = dict(self)
-        write_json(asked.pop("json_file"), apply_style(asked.pop("scene"), **asked))
+        write_json(self.json_file, apply_style(self))
         return 0
 
 

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -68,6 +68,9 @@ from tools.training import (
     train,
     write_curves,
 )
+
+if TYPE_CHECKING:
+    from tools.cli import ApplyOptions
 
 # OUT of a training holds the network, the report and its curves; OUT/checkpoint what an unfinished
 # one goes on from.
@@ -303,48 +306,35 @@ def _show_end(out: Path, report: dict[str, Any]) -> None:
     print(f"network: {out / NETWORK_FILE}")
 
 
-Method = Literal["mkl", "reinhard", "gscm"]
 VIEWS = 2  # that are drawn and measured
 VIEW_WIDTH = 640  # px
 VISIBLE = 1 / 255  # a difference of colour
 
 
-def apply_style(
-    scene_uri: str,
-    style: str,
-    out: Path,
-    *,
-    method: Method = "mkl",
-    strength: float = 1.0,
-    per_region: bool = False,
-    mask: Path | None = None,
-    checkpoint: Path | None = None,
-    overwrite: bool = False,
-) -> dict[str, Any]:
+def apply_style(options: ApplyOptions) -> dict[str, Any]:
     """Writes the styled scene and its picture, prints what was done, and returns it as facts.
-
-    style: an image file, or the name of a style preset (a file of the same name is ./NAME).
 
     Raises:
         StyleError: the style cannot be used. SceneError: the scene cannot. OutputError: OUT holds
             something, or cannot be written.
     """
-    check_scene_out(out, may_replace=overwrite)
+    out = options.out
+    check_scene_out(out, may_replace=options.overwrite)
     picture_file = picture_path(out)
-    requested = _style(style, method, strength, per_region, mask, checkpoint)
+    requested = _style(options)
     # Compile the kernel where it is not yet, so that times are of the work.
     eye = torch.eye(3, 4) / 2
     style_gaussians(Gaussians.empty(), StyleMaps(eye[None], eye, eye))
     begun = time.perf_counter()
-    scene = open_scene(scene_uri)
+    scene = open_scene(options.scene)
     for problem in scene.problems:
         print_note(f"note: {problem}")
     scene = storable(scene)
     opened = time.perf_counter()
-    if requested.changes and method == "gscm":
+    if requested.changes and requested.method == "gscm":
         content_pictures(scene)
     elif requested.changes:
-        content_statistics(scene, per_region=per_region)
+        content_statistics(scene, per_region=requested.per_region)
     measured = time.perf_counter()
     maps = style_maps(scene, requested)
     mapped = time.perf_counter()
@@ -385,27 +375,17 @@ def style_text(facts: Mapping[str, Any]) -> str:
     return fill("style.txt", **facts)
 
 
-def _style(
-    style: str,
-    method: Method,
-    strength: float,
-    per_region: bool,
-    mask: Path | None,
-    checkpoint: Path | None,
-) -> Style:
-    is_preset = style in style_preset_names()
-    if not is_preset and not Path(style).exists() and not Path(style).suffix:
-        raise StyleError(f"{style} is no image file, and {STYLES.refusal(style)}")
+def _style(options: ApplyOptions) -> Style:
+    """Of an image file, or of the preset of that name (a file of the same name is ./NAME)."""
+    source = options.style
+    is_preset = source in style_preset_names()
+    if not is_preset and not Path(source).exists() and not Path(source).suffix:
+        raise StyleError(f"{source} is no image file, and {STYLES.refusal(source)}")
+    how = options.model_dump(
+        mode="json", include={"method", "strength", "per_region", "mask", "checkpoint"}
+    )
     try:
-        return Style(
-            image=None if is_preset else style,
-            preset=style if is_preset else None,
-            method=method,
-            strength=float(strength),
-            per_region=per_region,
-            mask=None if mask is None else str(mask),
-            checkpoint=None if checkpoint is None else str(checkpoint),
-        )
+        return Style(**{"preset" if is_preset else "image": source}, **how)
     except ValidationError as error:
         message = "; ".join(
             f"{'.'.join(map(str, e['loc'])) + ': ' if e['loc'] else ''}"

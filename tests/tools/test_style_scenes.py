@@ -14,7 +14,12 @@ from augment.errors import OutputError, StyleError
 from augment.files.scene_file import load_scene_parts, save_scene
 from recipes.style import Style
 from tests.fitted_scenes import fitted_scene
+from tools.cli import ApplyOptions
 from tools.style import apply_style, picture_path, style_text
+
+
+def styled(scene, style, out, **options):
+    return apply_style(ApplyOptions(scene=scene, style=style, out=out, **options))
 
 
 @pytest.fixture
@@ -37,7 +42,7 @@ def files_of(folder) -> dict[str, bytes]:
 
 def test_the_scene_is_written_in_its_new_colours(scene_uri, photo, tmp_path, capsys):
     out = tmp_path / "new" / "styled"
-    facts = apply_style(scene_uri, str(photo), out)
+    facts = styled(scene_uri, str(photo), out)
     before, after = open_scene(scene_uri), open_scene(f"scene:{out}")
     maps = style_maps(before, Style(image=str(photo)))
     assert torch.equal(after.background.sh, style_gaussians(before.background, maps).sh)
@@ -63,16 +68,16 @@ def test_the_scene_is_written_in_its_new_colours(scene_uri, photo, tmp_path, cap
 def test_the_same_bytes_again_and_a_second_style_on_top(scene_uri, photo, tmp_path):
     one, two, three = (tmp_path / name for name in ("one", "two", "three"))
     for out in (one, two):
-        apply_style(scene_uri, str(photo), out, strength=0.5)
+        styled(scene_uri, str(photo), out, strength=0.5)
     assert files_of(one) == files_of(two)
-    apply_style(f"scene:{one}", "dusk", three, method="reinhard")
+    styled(f"scene:{one}", "dusk", three, method="reinhard")
     styles = open_scene(f"scene:{three}").made_by["styles"]
     assert [s.get("preset") for s in styles] == [None, "dusk"]
     assert styles[1]["scene"] == f"scene:{one}"
 
 
 def test_no_strength_keeps_every_bit(scene_uri, photo, tmp_path):
-    facts = apply_style(scene_uri, str(photo), tmp_path / "same", strength=0)
+    facts = styled(scene_uri, str(photo), tmp_path / "same", strength=0)
     before, after = files_of(tmp_path / "scene"), files_of(tmp_path / "same")
     for name in ("gaussians.safetensors", "sky.safetensors"):
         assert before[name] == after[name]
@@ -88,7 +93,7 @@ def test_where_folding_differs_is_counted(scene_uri, tmp_path):
     sh[::2, 3] = -4.0
     lit = dataclasses.replace(scene, background=dataclasses.replace(g, sh=sh))
     save_scene(lit, tmp_path / "lit")
-    facts = apply_style(f"scene:{tmp_path / 'lit'}", "overcast", tmp_path / "out")
+    facts = styled(f"scene:{tmp_path / 'lit'}", "overcast", tmp_path / "out")
     assert 0.02 < facts["clamped"]["pixels off a render under the style"] < 1
 
 
@@ -97,7 +102,7 @@ def test_clamps_are_counted(scene_uri, tmp_path):
     path = tmp_path / "dots.png"
     dots = np.random.default_rng(0).uniform(size=(64, 64, 1)) < 0.15
     assert cv2.imwrite(str(path), np.repeat(dots, 3, 2).astype(np.uint8) * 255)
-    clamped = apply_style(scene_uri, str(path), tmp_path / "out")["clamped"]
+    clamped = styled(scene_uri, str(path), tmp_path / "out")["clamped"]
     assert clamped["Gaussians"]["below 0"][1] > clamped["Gaussians"]["below 0"][0] + 0.1
     assert all(0 <= share <= 1 for pair in clamped["pixels"].values() for share in pair)
     # Splats of one colour are folded as they show, so the clamp makes no difference.
@@ -110,7 +115,7 @@ def test_a_recording_that_is_away_today_is_not_forgotten(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "elsewhere")
     save_scene(fitted_scene(recorded_source="recording:data/drive"), tmp_path / "scene")
     monkeypatch.chdir(tmp_path)
-    apply_style("scene:scene", "dusk", tmp_path / "out")
+    styled("scene:scene", "dusk", tmp_path / "out")
     written = load_scene_parts(tmp_path / "out")
     assert written.recorded_source == f"recording:{tmp_path}/elsewhere/data/drive"
     assert written.problems == fitted_scene().problems
@@ -118,25 +123,25 @@ def test_a_recording_that_is_away_today_is_not_forgotten(tmp_path, monkeypatch):
 
 def test_a_scene_without_cameras_has_no_picture(photo, tmp_path):
     save_scene(dataclasses.replace(fitted_scene(), frames=()), tmp_path / "blind")
-    facts = apply_style(f"scene:{tmp_path / 'blind'}", str(photo), tmp_path / "out")
+    facts = styled(f"scene:{tmp_path / 'blind'}", str(photo), tmp_path / "out")
     assert "picture" not in facts and "pixels" not in facts["clamped"]
     assert not picture_path(tmp_path / "out").exists()
 
 
 def test_what_stands_there_is_kept(scene_uri, photo, tmp_path):
     out = tmp_path / "out"
-    apply_style(scene_uri, str(photo), out)
+    styled(scene_uri, str(photo), out)
     before = files_of(out)
     with pytest.raises(OutputError, match="--overwrite"):
-        apply_style(scene_uri, "dusk", out)
+        styled(scene_uri, "dusk", out)
     assert files_of(out) == before
-    apply_style(scene_uri, "dusk", out, overwrite=True)
+    styled(scene_uri, "dusk", out, overwrite=True)
     assert files_of(out) != before
     other = tmp_path / "other"
     other.mkdir()
     (other / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="something else than a scene"):
-        apply_style(scene_uri, "dusk", other, overwrite=True)
+        styled(scene_uri, "dusk", other, overwrite=True)
     assert files_of(other) == {"notes.txt": b"mine"}
 
 
@@ -148,5 +153,5 @@ def test_styles_that_cannot_be_used(scene_uri, tmp_path):
         ("dusk", {"strength": 3}, "strength"),
     ):
         with pytest.raises(StyleError, match=message):
-            apply_style(scene_uri, style, tmp_path / "out", **options)
+            styled(scene_uri, style, tmp_path / "out", **options)
         assert not (tmp_path / "out").exists()
