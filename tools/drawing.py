@@ -160,7 +160,7 @@ def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
     """
     places = {name: (math.inf, 0.0, name) for name in pc.unique(table["camera"]).to_pylist()}
     read = cache(lambda path: {e["frame"]: e for e in json.loads(store.read(path))["frames"]})
-    placed = table.filter(pc.is_valid(table["calibration_path"]))
+    placed = table.select(["camera", "frame", "calibration_path"]).drop_null()
     for row in placed.take(first_of_each(placed, "camera")).to_pylist():
         name = row["camera"]
         with suppress(OutputError), reading_back("calibration", ""):

@@ -136,7 +136,12 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     beside, own = _beside(store, html)
     listing = store.list("")
     files = ReportFiles(store, listing)
-    finished = table.filter(pc.equal(table["status"], OK))
+    is_ok, columns = pc.equal(table["status"], OK), {}
+    for name in table.column_names:  # a million paths take 50 MB: they are not held twice
+        columns[name] = table[name].filter(is_ok)
+        if name.endswith("_path") or name == "checksum":
+            table = table.drop_columns(name)
+    finished = pa.table(columns)
     recipes = group_by(table, "recipe")
     draws = find_draws(finished)
     clear = set(draws.filter(draws["is_clear"])["draw"].to_pylist())
@@ -280,13 +285,13 @@ def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
     """Boxes by class, the most frequent first: (class, boxes, tracks). Of every scene's first
     variant that has labels: they are the same in the others.
     """
-    labelled = table.filter(pc.is_valid(table["labels_path"]))
+    labelled = table.select(["scene", "draw", "labels_path"]).drop_null()
     first = labelled["draw"].take(first_of_each(labelled, "scene")).combine_chunks()
     labelled = labelled.filter(pc.is_in(labelled["draw"], value_set=first))
     rows = first_of_each(labelled, "labels_path").tolist()
     boxes, tracks, read = Counter[str](), set[tuple[str, str, str]](), 0
     chosen = pa.array(evenly(rows, MAX_BOX_FILES), pa.int64())
-    for row in labelled.select(["scene", "labels_path"]).take(chosen).to_pylist():
+    for row in labelled.take(chosen).to_pylist():
         found = files.read_columns(row["labels_path"], ("label", "track_id"))
         if found is None or found.num_columns < 2:
             continue
@@ -354,7 +359,7 @@ def _count_by_recipe(
     """
     found, read, there = [], 0, 0
     for recipe in recipes:
-        own = table.filter(pc.equal(table["recipe"], recipe))
+        own = table.select(["recipe", *columns]).filter(pc.equal(table["recipe"], recipe))
         sets = own.group_by(columns, use_threads=False).aggregate([]).to_pylist()
         sets = [paths for paths in sets if any(paths.values())]
         sets.sort(key=lambda paths: str([*paths.values()]))

@@ -28,7 +28,7 @@ from augment.jobs.manifest import Row
 from augment.jobs.store import Store, StoredFile, StoredFileMissing
 from augment.jobs.tables import read_table
 from augment.semantics import SemanticClass
-from tools.drawing import color_mapped, evenly, first_of_each, resized
+from tools.drawing import color_mapped, evenly, resized
 from tools.report_numbers import weather_text
 
 Value = TypeVar("Value")
@@ -129,22 +129,28 @@ class ReportFiles:
         return self.read_image(row["image_path"], decode_image, row["checksum"])
 
 
-def pick_images(table: pa.Table, number: int, shift: int = 0) -> list[Row]:
+def rows_with(table: pa.Table, column: str, value: str) -> np.ndarray:
+    """int64: the numbers of the rows with that value; of a million rows a copy is large."""
+    return np.flatnonzero(pc.equal(table[column], value).to_numpy())
+
+
+def pick_images(table: pa.Table, among: np.ndarray, number: int, shift: int = 0) -> list[Row]:
     """At most `number` rows: one each of evenly chosen variants, wandering over frames and cameras.
 
     Evenly spaced rows would mostly show one camera: the numbers of frames and cameras divide them.
-    shift: of the place, so that calls for one row each do not all take the same.
+    among: the rows to choose from. shift: of the place, so that calls for one row each do not all
+    take the same.
     """
-    starts = first_of_each(table, "draw").tolist()
-    bounds, number = [*starts, table.num_rows], min(number, table.num_rows)
-    rows: set[int] = set()
+    draws = table["draw"].to_numpy()[among]
+    bounds = [*np.flatnonzero(np.diff(draws, prepend=-1)).tolist(), len(among)]
+    number, rows = min(number, len(among)), set[int]()
     for i in range(number):
-        group = int((i + (0.5 + (i + shift) * _GOLDEN) % 1) * len(starts) / number)
+        group = int((i + (0.5 + (i + shift) * _GOLDEN) % 1) * (len(bounds) - 1) / number)
         low, size = bounds[group], bounds[group + 1] - bounds[group]
         inside = int(size * ((0.5 + (i + shift) * _SILVER) % 1))
         free = (low + (inside + k) % size for k in range(size))
         rows |= {next((row for row in free if row not in rows), low)}
-    return table.take(pa.array(sorted(rows), pa.int64())).to_pylist()
+    return table.take(among[sorted(rows)]).to_pylist()
 
 
 def pick_places(table: pa.Table, clear: set[int], places: int, variants: int) -> list[list[Row]]:
@@ -156,13 +162,14 @@ def pick_places(table: pa.Table, clear: set[int], places: int, variants: int) ->
     """
     names, candidates = sorted(pc.unique(table["scene"]).to_pylist()), []
     for name in evenly(names, 8 * places):  # reading rows of thousands of scenes takes seconds
-        candidates.append(_place_of(table.filter(pc.equal(table["scene"], name)), clear, variants))
+        candidates.append(_place_of(table, rows_with(table, "scene", name), clear, variants))
     candidates = [rows for rows in candidates if len(rows) >= 2]
     paired = [rows for rows in candidates if len({row["draw"] in clear for row in rows}) == 2]
     return evenly(paired or candidates, places)
 
 
-def _place_of(rows: pa.Table, clear: set[int], variants: int) -> list[Row]:
+def _place_of(table: pa.Table, among: np.ndarray, clear: set[int], variants: int) -> list[Row]:
+    rows = table.select(["frame", "camera", "draw"]).take(among)
     counted = rows.group_by(["frame", "camera"], use_threads=False)
     seen = counted.aggregate([("draw", "count_distinct")]).to_pylist()
     most = max(entry["draw_count_distinct"] for entry in seen)
@@ -171,7 +178,8 @@ def _place_of(rows: pa.Table, clear: set[int], variants: int) -> list[Row]:
     camera, _ = min(full, key=lambda key: ("front" not in key[0].lower(), len(key[0]), key[0]))
     frames = sorted(number for name, number in full if name == camera)
     is_frame = pc.equal(rows["frame"], frames[len(frames) // 2])
-    shown = rows.filter(pc.and_(is_frame, pc.equal(rows["camera"], camera))).to_pylist()
+    here = pc.and_(is_frame, pc.equal(rows["camera"], camera)).to_numpy()
+    shown = table.take(among[here]).to_pylist()
     bare = [row for row in shown if row["draw"] in clear]
     others = [row for row in shown if row["draw"] not in clear] or bare[1:]
     # Of each recipe its first variant; all of them where there is one recipe only.
@@ -273,27 +281,26 @@ class Gallery:
         each = max(1, min(8, self.shares.thumbnails // max(len(chosen), 1)))
         strips = []
         for recipe in chosen:
-            own = self.table.filter(pc.equal(self.table["recipe"], recipe))
-            rows = sorted(pick_images(own, each), key=self._place_on_car)
+            own = rows_with(self.table, "recipe", recipe)
+            rows = sorted(pick_images(self.table, own, each), key=self._place_on_car)
             found = [
                 self._figure(row, _SMALL, self.shares.small_bytes, weather_text(row))
                 for row in rows
             ]
             figures = [figure for figure in found if figure is not None]
-            strips.append({"recipe": recipe, "images": own.num_rows, "figures": figures})
+            strips.append({"recipe": recipe, "images": len(own), "figures": figures})
         return {"strips": strips, "of": len(recipes)}
 
     def buffers(self, recipes: Sequence[str]) -> list[list[Figure]]:
         """Images of some recipes with their depth, classes and masks."""
-        paths = self.table["depth_path"], self.table["semantic_path"]
-        table = self.table.filter(pc.or_(*map(pc.is_valid, paths)))
-        present = set(pc.unique(table["recipe"]).to_pylist())
+        having = pc.or_(*(pc.is_valid(self.table[f"{k}_path"]) for k in ("depth", "semantic")))
+        table, present = self.table, set(pc.unique(self.table["recipe"].filter(having)).to_pylist())
         limits, found = (_BUFFER, self.shares.buffer_bytes), []
-        for i, recipe in enumerate(
-            evenly([r for r in recipes if r in present], self.shares.samples)
-        ):
-            own = table.filter(pc.equal(table["recipe"], recipe))
-            for row in pick_images(own, 1, shift=i):
+        chosen = evenly([r for r in recipes if r in present], self.shares.samples)
+        for i, recipe in enumerate(chosen):
+            own = rows_with(table, "recipe", recipe)
+            own = own[having.to_numpy()[own]]
+            for row in pick_images(table, own, 1, shift=i):
                 image = self._figure(row, *limits)
                 others = read_buffers(row, self.files, *limits)[: _SAMPLE - 1]
                 found.append(others if image is None else [image, *others])

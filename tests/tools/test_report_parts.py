@@ -180,11 +180,14 @@ def test_depth_goes_from_near_to_far_and_none_is_grey() -> None:
 
 def test_picked_images_differ_and_are_spread() -> None:
     table = as_table(street_rows(scenes=3, frames=4))
-    picked = report_pictures.pick_images(table, 10)
+    rows = np.arange(table.num_rows)
+    picked = report_pictures.pick_images(table, rows, 10)
     keys = {(r["scene"], r["variant"], r["frame"], r["camera"]) for r in picked}
-    assert len(keys) == 10 and str(picked) == str(report_pictures.pick_images(table, 10))
+    assert len(keys) == 10 and str(picked) == str(report_pictures.pick_images(table, rows, 10))
     assert len({k[0] for k in keys}) == 3 and len({k[3] for k in keys}) == 2
-    assert len(report_pictures.pick_images(table, 10_000)) == table.num_rows
+    assert len(report_pictures.pick_images(table, rows, 10_000)) == table.num_rows
+    few = report_pictures.pick_images(table, rows[table.num_rows - 3 :], 9)
+    assert {(r["scene"], r["variant"]) for r in few} == {("street-2", "wet-000")} and len(few) == 3
     assert evenly(list(range(10)), 3) == [1, 5, 8]
 
 
