@@ -92,7 +92,7 @@ def measure(
         facts, rows = _read(folder, case, repeats)
         live = _render_live(case, repeats)
         large = _write_manifest_of(scratch / "large", folder, case.rows)
-        held = WeatherDataset(large).rows.nbytes / 2**20
+        held = WeatherDataset(large).rows.batch.nbytes / 2**20
         peak = peak_mib_in_subprocess(_opening_of, (large,)) if case.memory else None
     title = "{images} JPEGs of {width}x{height}, {kib:.0f} KiB each, batches of ".format(**facts)
     rates, memory = ("what", "workers", "images/s"), ("rows", "MiB held", "MiB at most")
@@ -129,7 +129,7 @@ def _opening_of(folder: Path) -> Action:
 def _read(folder: Path, case: DatasetCase, repeats: int) -> tuple[Figures, list[tuple]]:
     dataset = WeatherDataset(folder)
     files = [(folder / path).read_bytes() for path in dataset.table["image_path"].to_pylist()]
-    size = {name: int(dataset.rows[name][0]) for name in ("width", "height")}
+    size = {name: dataset.rows.row(0)[name] for name in ("width", "height")}
     facts = {"images": len(files), **size, "kib": sum(map(len, files)) / len(files) / 1024}
     rows: list[tuple] = []
     for workers in case.workers:
