@@ -75,9 +75,7 @@ class RenderOptions(Command):
 
     recipes: Positional[
         Annotated[
-            tuple[str, ...],
-            arg(metavar="RECIPE [RECIPE ...]", help_behavior_hint="(required)"),
-            Field(min_length=1),
+            tuple[str, ...], arg(metavar="RECIPE [RECIPE ...]", help_behavior_hint="(required)")
         ]
     ]
     scene: str
@@ -93,6 +91,12 @@ class RenderOptions(Command):
     sheet: bool = True
     layout: Literal["standard", "source"] = "standard"
     links: Links = "hard"
+
+    @model_validator(mode="after")
+    def _names_recipes(self) -> Self:
+        if not self.recipes:
+            raise ValueError("no recipe is named: climategs render RECIPE --scene URI --out OUT")
+        return self
 
     def run(self) -> int:
         from tools.render import render_recipes

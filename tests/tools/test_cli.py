@@ -188,6 +188,7 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
     here = ["render", "clear", "--scene", scene_uri, *out]
     for arguments, message in (
+        (["render", "--scene", scene_uri, *out], "no recipe is named"),
         (["render", "no-such", "--scene", scene_uri, *out], "no such file"),
         (["render", "clear", "--scene", "nowhere:x", *out], "nowhere"),
         ([*here, "--frames", "x"], "--frames 'x'"),
