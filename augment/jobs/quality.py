@@ -116,6 +116,11 @@ Step = tuple[str, Value]
 MIN_SAVED = 0.02  # of the reference's time: less is noise of a few pictures
 
 
+def first_settings(ladders: Ladders) -> Settings:
+    """Those that a search begins with."""
+    return {path: values[-1] for path, values in ladders.items()}
+
+
 def search(
     ladders: Ladders, keeps: Callable[[Settings], bool], steps: Iterable[Step] | None = None
 ) -> Settings:
@@ -125,7 +130,7 @@ def search(
     wanted most first. A step is taken where it leads towards what is wanted and `keeps` says that
     the settings with it keep the bound.
     """
-    settings = {path: values[-1] for path, values in ladders.items()}
+    settings = first_settings(ladders)
     if steps is None:
         steps = [(path, value) for path, values in ladders.items() for value in values[:-1]]
     for path, value in steps:
@@ -224,13 +229,6 @@ class Bench:
         worst = max(self._flip(_columns(picture), _columns(truth)) for picture, truth in pairs)
         return Cost(value, _median_ms(trials), worst)
 
-    def hand_over(self, settings: Settings, scene: Scene) -> None:
-        """Let another object of the scene know what images of these settings share."""
-        if self.cameras is None and self.renderer is None:
-            recipe = resolved_recipe(self.recipe, settings)
-            share_effects(Sharing(self.scene, [recipe], backend=self.backend))
-            memo_of(scene).update(memo_of(self.scene).shared())
-
     def _timed(self, settings: Settings) -> list[Trial]:
         return [self._trial(view, settings) for view in (self.views[0], *self.views)][1:]
 
@@ -296,32 +294,32 @@ def resolve_quality(
     recipe: Recipe,
     scene: Scene,
     *,
-    views: Sequence[View] | None = None,
-    cameras: Sequence[Camera] | None = None,
+    camera_path: Sequence[Frame] | None = None,
     backend: str = "auto",
     renderer: Renderer | None = None,
     progress: bool = False,
 ) -> Resolved:
     """The recipe with the settings that its max_flip or budget_ms chooses in this scene. With
     max_flip the choice is the same every time; with budget_ms it is this machine's. A budget that
-    cannot be kept is logged as a warning, and the fastest settings are taken. views: what is
-    rendered to find out, `calibration_views` of the scene's frames if None. cameras: all of a
-    camera path, where one is to be rendered; None for the scene's. renderer:
-    `augment.views.render_view` if None. progress: a bar on stderr. Raises
-    SceneError: the scene cannot be rendered under the recipe.
+    cannot be kept is logged as a warning, and the fastest settings are taken. camera_path: frames
+    that are rendered in place of the scene's own. renderer: `augment.views.render_view` if None.
+    progress: a bar on stderr. Raises SceneError: the scene cannot be rendered under the recipe.
     """
     wish = recipe.quality
     if not wish.is_open:
         return Resolved(recipe)
     started = perf_counter()
-    views = calibration_views(scene.frames) if views is None else tuple(views)
+    views = calibration_views(scene.frames if camera_path is None else camera_path)
+    cameras = None
+    if camera_path is not None:
+        cameras = [camera for frame in camera_path for camera in frame.cameras.values()]
     # An object of its own, which takes along what is found of settings that are not chosen.
     tried_on = copy.copy(scene)
     options = _options(recipe)
     bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
     with bar:
         while True:
-            reference = reference_settings(options)
+            reference = first_settings(options)
             given = (recipe, tried_on, views, reference, backend, cameras, renderer)
             try:
                 bench = Bench(*given, bar.update)
@@ -338,7 +336,10 @@ def resolve_quality(
             settings = _within_budget(bench, options, wish.budget_ms)
             ms, reference_ms = bench.ms(settings), bench.ms(reference)
         worst = bench.flip(settings)
-    bench.hand_over(settings, scene)
+    resolved = resolved_recipe(recipe, settings)
+    if cameras is None and renderer is None:  # what images of these settings share is known here
+        share_effects(Sharing(tried_on, [resolved], backend=backend))
+        memo_of(scene).update(memo_of(tried_on).shared())
     is_met = ms is None or ms <= (wish.budget_ms or 0)
     if not is_met:
         _log.warning(
@@ -350,7 +351,6 @@ def resolve_quality(
             wish.budget_ms,
         )
     shown, seconds = tuple((v.frame, v.name) for v in views), perf_counter() - started
-    resolved = resolved_recipe(recipe, settings)
     return Resolved(resolved, settings, is_met, worst, shown, ms, reference_ms, seconds)
 
 
@@ -367,7 +367,8 @@ def _within_budget(bench: Bench, options: Ladders, budget_ms: float) -> Settings
         path: [*(bench.cost(path, v) for v in values[:-1]), Cost(values[-1], reference_ms, 0.0)]
         for path, values in options.items()
     })  # fmt: skip
-    return search(ladders, keeps, steps if keeps(search(ladders, keeps, ())) else ())
+    fastest = first_settings(ladders)
+    return search(ladders, keeps, steps) if keeps(fastest) else fastest
 
 
 def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
@@ -390,13 +391,9 @@ def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     if not recipe.quality.is_open:
         return [recipe]
     options = _options(recipe)
-    reference = reference_settings(options)
+    reference = first_settings(options)
     single = [{path: value} for path, values in options.items() for value in values[:-1]]
     return [resolved_recipe(recipe, reference | changes) for changes in [{}, *single]]
-
-
-def reference_settings(options: Ladders) -> Settings:
-    return {path: values[-1] for path, values in options.items()}
 
 
 def _options(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
@@ -473,22 +470,17 @@ def resolve_quality_for(
 ) -> Recipe:
     """The recipe with the settings that the output has for it in this scene, or that are chosen
     now; the same recipe where its quality has nothing to choose. A new choice is kept before anyone
-    sees it; where another process is choosing, its choice is waited for. camera_path: frames that
-    are rendered in place of the scene's own. anew: choose whatever there is, and keep that in its
-    place. keep: whether a new choice is kept. The others and errors: as of `resolve_quality`.
+    sees it; where another process is choosing, its choice is waited for. anew: choose whatever
+    there is, and keep that in its place. keep: whether a new choice is kept. The others and errors:
+    as of `resolve_quality`.
     """
     if not recipe.quality.is_open:
         return recipe
     question = Question(recipe, scene.name, scene.source, trajectory_id(camera_path), backend)
 
     def choose() -> Resolved:
-        frames, cameras = scene.frames, None
-        if camera_path is not None:
-            frames = camera_path
-            cameras = [camera for frame in camera_path for camera in frame.cameras.values()]
-        views = calibration_views(frames)
         given = {"backend": backend, "renderer": renderer, "progress": progress}
-        return resolve_quality(recipe, scene, views=views, cameras=cameras, **given)
+        return resolve_quality(recipe, scene, camera_path=camera_path, **given)
 
     if not anew and (found := recorded(store, question)):
         return found
