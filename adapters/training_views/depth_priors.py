@@ -37,6 +37,8 @@ _ROUNDS = 30
 _MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
 _MIN_CORRELATION = 0.5
 _NEAREST_M, _FURTHEST_M = 0.5, 120.0
+_GRID_PX = 4  # dense maps are used at every such pixel of every such row
+_RELATIVE_WEIGHT = 0.1  # of relative maps beside LiDAR, which is 1
 _NEAREST_IN_FILE_M, _FURTHEST_IN_FILE_M = 0.1, 1000.0  # what a file may call a depth
 # A return is clearly behind another from this ratio of depths and this many metres more.
 _BEHIND_RATIO, _BEHIND_M = 1.05, 0.5
@@ -270,11 +272,11 @@ def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
     return PriorPixels.of(pixels[usable], value[usable])
 
 
-def metric_prior(path: Path, camera: Camera, sky: np.ndarray, grid_px: int) -> PriorPixels:
+def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> PriorPixels:
     """A dense map in metres at the pixels of a grid, 0 and sky left out."""
     depth = read_metric(path)
     check_aspect(path, depth.shape, camera)
-    rows, columns = _grid(camera, grid_px)
+    rows, columns = _grid(camera)
     # The nearest pixel: between a car and the wall behind it there is no surface.
     y = ((rows + 0.5) * depth.shape[0] / camera.height).astype(np.int64)
     x = ((columns + 0.5) * depth.shape[1] / camera.width).astype(np.int64)
@@ -284,7 +286,7 @@ def metric_prior(path: Path, camera: Camera, sky: np.ndarray, grid_px: int) -> P
 
 
 def relative_prior(
-    path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray, grid_px: int
+    path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray
 ) -> PriorPixels:
     """A dense inverse depth map, aligned to the reference depth [H, W] (0 where unknown), at the
     pixels of a grid."""
@@ -301,29 +303,29 @@ def relative_prior(
             f"{path} does not agree with the {int(known.sum())} known distances: there must be "
             f"some, and larger values must be nearer (inverse depth, not depth)"
         )
-    rows, columns = _grid(camera, grid_px)
+    rows, columns = _grid(camera)
     at = found.depth_m(relative[rows, columns])
     usable = np.isfinite(at) & ~sky[rows, columns]
     return PriorPixels.of((rows * camera.width + columns)[usable], at[usable])
 
 
-def beside(dense: PriorPixels, known: PriorPixels, camera: Camera, grid_px: int) -> PriorPixels:
+def beside(dense: PriorPixels, known: PriorPixels, camera: Camera) -> PriorPixels:
     """The dense prior where no cell of its grid holds anything better known."""
     if len(known) == 0:
         return dense
-    columns = -(-camera.width // grid_px)
+    columns = -(-camera.width // _GRID_PX)
 
     def cells(prior: PriorPixels) -> np.ndarray:
         row, column = prior.pixels // camera.width, prior.pixels % camera.width
-        return row // grid_px * columns + column // grid_px
+        return row // _GRID_PX * columns + column // _GRID_PX
 
     return dense.select(~np.isin(cells(dense), cells(known)))
 
 
-def _grid(camera: Camera, grid_px: int) -> tuple[np.ndarray, np.ndarray]:
+def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Rows [R, 1] and columns [1, C] in the middles of the grid's cells."""
-    rows = np.arange(min(grid_px // 2, camera.height - 1), camera.height, grid_px)
-    columns = np.arange(min(grid_px // 2, camera.width - 1), camera.width, grid_px)
+    rows = np.arange(min(_GRID_PX // 2, camera.height - 1), camera.height, _GRID_PX)
+    columns = np.arange(min(_GRID_PX // 2, camera.width - 1), camera.width, _GRID_PX)
     return rows[:, None], columns[None]
 
 
@@ -397,21 +399,12 @@ class DepthPriors:
     lidar: the scene's sweeps. sparse_dir: Street Gaussians' lidar_depth folder. metric_dir: dense
     depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where unknown, as `climategs
     render` writes. relative_dir: dense inverse depth up to scale and shift, as monocular networks
-    give, DIR/<camera>/<frame>.npy or .png. grid_px: dense maps are used at every grid_px-th pixel
-    of every grid_px-th row. relative_weight: how much those maps count beside LiDAR, which is 1."""
+    give, DIR/<camera>/<frame>.npy or .png."""
 
     lidar: bool = True
     sparse_dir: Path | None = None
     metric_dir: Path | None = None
     relative_dir: Path | None = None
-    grid_px: int = 4
-    relative_weight: float = 0.1
-
-    def __post_init__(self) -> None:
-        if self.grid_px < 1:
-            raise ValueError(f"grid_px must be >= 1; got {self.grid_px}")
-        if not 0 < self.relative_weight <= 1:
-            raise ValueError(f"relative_weight must be > 0 and <= 1; got {self.relative_weight}")
 
 
 class DepthSource:
@@ -429,7 +422,7 @@ class DepthSource:
         """cameras: every view, at the training resolution. reference: distances that relative
         maps are brought to metres by where the frame has no LiDAR."""
         self.problems: list[str] = []
-        self._scene, self._cameras, self._options = scene, cameras, options
+        self._scene, self._cameras = scene, cameras
         self._reference = reference
         self._has_sweeps = options.lidar and _has_sweeps(scene, cameras)
         self._maps = _find_all(scene, cameras, options, self.problems)
@@ -476,7 +469,7 @@ class DepthSource:
         return found
 
     def _combine(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
-        camera, grid_px = self._cameras[key], self._options.grid_px
+        camera = self._cameras[key]
         paths = {kind: maps.get(key) for kind, maps in self._maps.items()}
         known = self.lidar(key)
         for kind, path in paths.items():  # in the order in which they are believed
@@ -486,14 +479,14 @@ class DepthSource:
                 if kind == "sparse":
                     found = sparse_prior(path, camera)
                 elif kind == "metric":
-                    found = metric_prior(path, camera, sky, grid_px)
+                    found = metric_prior(path, camera, sky)
                 else:
                     reference = known.image(camera)
                     if len(known) == 0 and self._reference is not None:
                         reference = self._reference(key, camera)
-                    found = relative_prior(path, camera, reference, sky, grid_px)
-                    found = found.weighing(self._options.relative_weight)
-                    found = beside(found, known, camera, grid_px)
+                    found = relative_prior(path, camera, reference, sky)
+                    found = found.weighing(_RELATIVE_WEIGHT)
+                    found = beside(found, known, camera)
             except AdapterError as error:
                 sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
                 logger.warning("%s", sentence)

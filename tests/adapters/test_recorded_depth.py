@@ -139,7 +139,7 @@ def test_relative_depth_is_aligned_to_the_lidar(scene, tmp_path, kind):
         np.save(folder / "000.npy", relative.astype(np.float32))
     else:
         cv2.imwrite(str(folder / "000.png"), relative.astype(np.uint16))
-    options = DepthPriors(relative_dir=folder.parent, grid_px=4)
+    options = DepthPriors(relative_dir=folder.parent)
     views = RecordedViews(scene, scale=1.0, depth=options)
     view = views.load(KEY)
     mono = view.depth_weight < 1
@@ -176,10 +176,10 @@ def test_metric_depth_is_read_as_climategs_writes_it(tmp_path):
     folder.mkdir(parents=True)
     depth = floor_depth(drives.camera())
     cv2.imwrite(str(folder / "000000.png"), np.round(depth * 256).astype(np.uint16))
-    options = DepthPriors(metric_dir=folder.parent, grid_px=2)
+    options = DepthPriors(metric_dir=folder.parent)
     view = RecordedViews(scene, scale=0.5, depth=options).load(KEY)
     rows, columns = view.depth_pixels // 32, view.depth_pixels % 32
-    assert sorted(set(columns % 2)) == [1] and (view.depth_weight == 1).all()
+    assert sorted(set(columns % 4)) == [2] and (view.depth_weight == 1).all()
     truth = depth[2 * rows + 1, 2 * columns + 1]
     np.testing.assert_allclose(view.depth_m, truth, atol=1 / 512 + 1e-6)  # half a level
     assert rows.min() >= 12  # nothing above the horizon

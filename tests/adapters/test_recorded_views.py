@@ -12,7 +12,6 @@ import pytest
 
 from adapters.plain_files import ImageFault
 from adapters.training_views.byte_cache import ByteCache
-from adapters.training_views.depth_priors import DepthPriors
 from adapters.training_views.views import RecordedViews, holdout_step, read_scaled
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
@@ -141,8 +140,6 @@ def test_wrong_arguments(scene):
     for scale in (0, 1.5, float("nan")):
         with pytest.raises(ValueError, match="scale"):
             RecordedViews(scene, scale=scale)
-    with pytest.raises(ValueError, match="grid_px"):
-        DepthPriors(grid_px=0)
 
 
 def test_jpegs_are_reduced_by_area(tmp_path):
