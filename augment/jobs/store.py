@@ -315,19 +315,14 @@ def _parse(uri: str) -> _Place:
 
 @dataclass(frozen=True)
 class Patience:
-    """How long failures that pass (timeouts, lost connections, 500, 503) are waited out. A request
-    may stand still for timeout_s, and none begins after give_up_s. Before each is a random wait,
-    every time longer.
+    """How failures that pass (timeouts, lost connections, 500, 503) are waited out: so many times,
+    each after a longer random wait, for three minutes at most. A request may stand still for
+    timeout_s.
     """
 
     retries: int = 6
     first_wait_s: float = 0.5
-    longest_wait_s: float = 10.0
     timeout_s: float = 30.0
-    give_up_s: float = 120.0
-
-
-PATIENCE = Patience()
 
 
 @dataclass(frozen=True)
@@ -348,7 +343,7 @@ class RemoteStore:
 
     local_dir = None
 
-    def __init__(self, uri: str, patience: Patience = PATIENCE) -> None:
+    def __init__(self, uri: str, patience: Patience = Patience()) -> None:
         self._place = _parse(uri)
         self.uri = self._place.public
         self.patience = patience
@@ -406,8 +401,7 @@ class RemoteStore:
                 self._call("delete", names[0], lambda obs, at: obs.delete(at, names))
         except StoredFileMissing:  # not of S3: one that is missing hides the others
             for name in names:
-                with contextlib.suppress(StoredFileMissing):
-                    self._call("delete", name, lambda obs, at, name=name: obs.delete(at, name))
+                self.delete_once(name)
 
     def delete_once(self, path: str) -> None:
         """Delete without trying again: of two requests, the second might hit a later object."""
@@ -462,6 +456,8 @@ class RemoteStore:
             if key not in self._opened:
                 self._opened[key] = _open(obs, self._place, key[1])
             return call(obs, self._opened[key])
+        except OutputError:  # of a file that the URI names
+            raise
         except Exception as error:
             cause, base = _cause(error), self.uri.partition("?")[0]
             where = f"{base}/{path}" if path else base
@@ -487,21 +483,11 @@ def _mark(facts: Mapping[str, Any]) -> dict[str, str]:
 
 def _open(obs: Any, place: _Place, patience: Patience) -> Any:
     """obstore's store of the place."""
-    seconds = lambda value: timedelta(seconds=value)  # noqa: E731
+    wait = {"init_backoff": timedelta(seconds=patience.first_wait_s)}
+    retry = {"max_retries": patience.retries, "backoff": wait}
     client: dict[str, Any] = {
-        "connect_timeout": seconds(min(patience.timeout_s, 10.0)),
-        "read_timeout": seconds(patience.timeout_s),
+        "read_timeout": timedelta(seconds=patience.timeout_s),
         "timeout": timedelta(days=1),  # of a whole download
-    }
-    wait = {
-        "init_backoff": seconds(patience.first_wait_s),
-        "max_backoff": seconds(patience.longest_wait_s),
-        "base": 2,
-    }
-    retry = {
-        "max_retries": patience.retries,
-        "retry_timeout": seconds(patience.give_up_s),
-        "backoff": wait,
     }
     settings: dict[str, Any] = {"client_options": client, "retry_config": retry}
     if place.scheme in _AZURE:
@@ -520,13 +506,14 @@ def _open(obs: Any, place: _Place, patience: Patience) -> Any:
         file = Path(options["tls_ca_file_path"])
         with _reading(file):
             client["root_certificate"] = file.read_bytes()
+    is_virtual = options.get("force_virtual_addressing", "").lower() in ("true", "1")
+    settings["virtual_hosted_style_request"] = is_virtual
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
     if "endpoint_override" in options:
         scheme, _, host = options["endpoint_override"].rpartition("://")
-        is_virtual = options.get("force_virtual_addressing", "").lower() in ("true", "1")
         bucket = f"{place.host}." if is_virtual else ""
         endpoint = f"{scheme or options.get('scheme', 'https')}://{bucket}{host}"
-        settings |= {"endpoint": endpoint, "virtual_hosted_style_request": is_virtual}
+        settings["aws_endpoint_url_s3"] = endpoint  # which goes before the environment's
     client["allow_http"] = endpoint.startswith("http://")
     # Not every server knows requests that delete many.
     return obs.store.S3Store(place.host, disable_bulk_delete=True, **settings)
@@ -548,7 +535,8 @@ def _load_obstore() -> Any:
         if _loaded_by == 0:
             _obstore_folder = str(Path(importlib.import_module("obstore").__file__ or "").parent)
         elif _loaded_by != os.getpid():
-            with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(tempfile.gettempdir())
+            with refusals_of(temporary), tempfile.TemporaryDirectory() as folder:
                 shutil.copytree(_obstore_folder, f"{folder}/obstore")
                 for name in [name for name in sys.modules if name.split(".")[0] == "obstore"]:
                     del sys.modules[name]

@@ -18,7 +18,7 @@ from augment.errors import OutputError
 from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
 from augment.jobs.store import Patience, RemoteStore, open_store
 
-QUICK = Patience(2, 0.001, 0.002, timeout_s=5.0)
+QUICK = Patience(2, 0.001, timeout_s=5.0)
 OFTEN = ClaimTimes(renewal_s=0.05, lifetime_s=60.0)
 SHORT = ClaimTimes(renewal_s=60.0, lifetime_s=1.0)
 
@@ -201,7 +201,7 @@ def test_lost_requests_lose_no_claim(server, remote):
 
 
 def test_a_renewal_that_arrives_late_is_the_holders(server, remote):
-    impatient = RemoteStore(remote.uri, Patience(0, 0.001, 0.001, timeout_s=0.5))
+    impatient = RemoteStore(remote.uri, Patience(0, 0.001, timeout_s=0.5))
     with try_claim(impatient, "a", ClaimTimes(0.1, 60.0)) as claim:
         server.fail(2, method="PUT", path="claims/a", delay_s=0.8)
         wait_for(lambda: not any(fault.left for fault in server._faults))
@@ -211,7 +211,7 @@ def test_a_renewal_that_arrives_late_is_the_holders(server, remote):
 
 
 def test_a_late_deletion_hits_no_other_claim(server, remote):
-    impatient = RemoteStore(remote.uri, Patience(2, 0.001, 0.001, timeout_s=0.5))
+    impatient = RemoteStore(remote.uri, Patience(2, 0.001, timeout_s=0.5))
     claims = [try_claim(impatient, "a")]
     server.fail(1, method="DELETE", path="claims/a", delay_s=0.8)
     claims[0].release()

@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.jobs.store import Patience, RemoteStore, StoredFileMissing, open_store
 
 BIG = b"0123456789" * 1_100_000  # three parts of an upload
-QUICK = Patience(3, 0.001, 0.002, timeout_s=5.0)
+QUICK = Patience(3, 0.001, timeout_s=5.0)
 TRIES = QUICK.retries + 1
 FAULTS = [{"status": 500}, {"status": 503}, {"cut": "upload"}, {"cut": "answer"}]
 
@@ -79,7 +79,7 @@ def test_other_operations_outlast_failures(server, store):
 
 def test_a_server_that_stands_still_is_left(server, store):
     store.write("a", b"1")
-    impatient = RemoteStore(store.uri, Patience(6, 0.001, 0.001, timeout_s=1.0))
+    impatient = RemoteStore(store.uri, Patience(6, 0.001, timeout_s=1.0))
     server.fail(1, method="PUT", delay_s=1.6, status=500)
     impatient.write("a", b"2")
     assert store.read("a") == b"2"
@@ -109,6 +109,19 @@ def test_nobody_answers():
     store = RemoteStore("s3://bucket/out?endpoint_override=127.0.0.1:1&scheme=http", QUICK)
     with pytest.raises(OutputError, match=r"list s3://bucket/out: .*3 retries.*AWS_ENDPOINT_URL"):
         store.list("")
+
+
+def test_options_go_before_the_environment(server, monkeypatch):
+    for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"):
+        monkeypatch.setenv(name, "http://127.0.0.1:1")
+    store = RemoteStore(server.uri("out"), QUICK)
+    store.write("a", b"1")
+    assert store.read("a") == b"1"
+    uri = "s3://box/out?endpoint_override=nowhere.invalid&force_virtual_addressing=true"
+    with pytest.raises(OutputError, match=r"https://box\.nowhere\.invalid"):
+        RemoteStore(uri, QUICK).list("")
+    with pytest.raises(OutputError, match=r"cannot read /none\.pem"):
+        open_store(f"{store.uri}&tls_ca_file_path=/none.pem").list("")
 
 
 def test_credentials_stay_inside(server):
