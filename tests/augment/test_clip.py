@@ -10,10 +10,9 @@ import pytest
 import torch
 
 from augment.effects.flood.water_plane import mirrored_camera
-from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MODE_DEPTH, RGB
+from augment.render.buffers import ALPHA, BUFFERS, RGB
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
-from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, sh_of, stack
@@ -57,9 +56,9 @@ def floor(z: float) -> Gaussians:
     return sheet(np.c_[grid, np.full(len(grid), z)], 2, 0.4)
 
 
-@pytest.mark.parametrize("keep", ["above", "below"])
-@pytest.mark.parametrize("z_m", [-0.6, 0.0, 0.21])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("seed", "z_m", "keep"), [(0, -0.6, "above"), (1, 0.0, "below"), (0, 0.21, "below")]
+)
 def test_kernels_match_the_definition(seed, z_m, keep):
     gaussians = random_gaussians(300, seed=seed)
     clip, camera = HeightClip(z_m, keep), camera_ahead()
@@ -83,16 +82,6 @@ def test_posed_parts_and_the_mirrored_eye(pose):
     assert_images_close(actual.rgb, expected.rgb, p999=2e-3, max_flips=4)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("keep", ["above", "below"])
-def test_a_clip_that_cuts_nothing_changes_no_bit(keep):
-    gaussians, camera = random_gaussians(300), camera_ahead()
-    z_m = -50.0 if keep == "above" else 50.0
-    clipped, plain = render(gaussians, camera, HeightClip(z_m, keep)), render(gaussians, camera)
-    for name in ALL - {EXPECTED_DEPTH, MODE_DEPTH}:  # which clips define more finely
-        assert torch.equal(getattr(clipped, name), getattr(plain, name)), name
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_clip_that_leaves_nothing(backend):
     image = render(random_gaussians(50), camera_ahead(), HeightClip(50.0, "above"), backend)
@@ -100,7 +89,7 @@ def test_a_clip_that_leaves_nothing(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("z_m", [-0.52, 0.0, 0.33])
+@pytest.mark.parametrize("z_m", [-0.52, 0.33])
 def test_a_wall_is_cut_along_its_waterline(z_m, backend):
     """The wall stands 5 m ahead, so the cut is the row that looks at height z_m there."""
     camera = camera_ahead(40, 60, 60.0)
@@ -119,7 +108,7 @@ def test_a_wall_is_cut_along_its_waterline(z_m, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("depth_m", [0.01, 0.2])
+@pytest.mark.parametrize("depth_m", [0.01])
 def test_a_flat_road_is_on_one_side_however_shallow_the_water(depth_m, backend):
     """Discs of 0.4 m seen at a grazing angle: told apart by their surface, not by their centre."""
     camera = camera_ahead(40, 60, 60.0)
@@ -155,39 +144,10 @@ def test_the_sign_follows_the_height_not_the_distance():
     assert float(render(ceiling, camera, HeightClip(-2.0, "below")).alpha.max()) < 0.02
 
 
-def test_bits_do_not_depend_on_the_number_of_threads():
-    gaussians, camera = random_gaussians(2000, seed=5), camera_ahead(200, 150, 180.0)
-    images = []
-    for count in (1, 2):
-        limit_threads(count)
-        images.append(render(gaussians, camera, HeightClip(-0.2, "above")))
-    limit_threads(None)
-    for name in ALL:
-        assert torch.equal(getattr(images[0], name), getattr(images[1], name)), name
-
-
-def test_gradients_take_the_definition():
-    gaussians = random_gaussians(20, seed=1)
-    means = gaussians.means.clone().requires_grad_()
-    part = PosedGaussians(dataclasses.replace(gaussians, means=means))
-    image = rasterize([part], camera_ahead(), clip=HeightClip(0.0, "above"))
-    image.rgb.sum().backward()
-    assert bool(torch.isfinite(means.grad).all()) and float(means.grad.abs().max()) > 0
-    with pytest.raises(ValueError, match="gradients of a clip are asked for"):
-        rasterize([part], camera_ahead(), clip=HeightClip(0.0, "above"), backend="cpu")
-
-
 @pytest.mark.parametrize(("z_m", "keep"), [(math.nan, "above"), (math.inf, "below")])
 def test_what_no_clip_can_be(z_m, keep):
     with pytest.raises(ValueError, match="a clip keeps"):
         HeightClip(z_m, keep)
-
-
-def test_expected_depth_of_what_is_left():
-    camera = camera_ahead(40, 60, 60.0)
-    image = render(stack(wall(5.0), floor(-1.5)), camera, HeightClip(-0.5, "above"))
-    covered = image.alpha > 0.9
-    assert float((image.expected_depth[covered] - 5.0).abs().max()) < 0.05
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -83,8 +83,10 @@ def skies() -> dict[str, Sky]:
     }
 
 
-@pytest.mark.parametrize("smog", [None, UNIFORM, LAYERED], ids=["clear", "uniform", "layered"])
-@pytest.mark.parametrize("name", skies())
+@pytest.mark.parametrize(
+    ("name", "smog"),
+    [("cube", LAYERED), ("constant", None), ("panorama", UNIFORM), ("another", LAYERED)],
+)
 def test_the_sky_behind_the_splats(away, name, smog):
     sky = skies()[name]
     for seed in range(2 if name == "cube" else 1):

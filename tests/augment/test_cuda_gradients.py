@@ -216,14 +216,6 @@ def test_every_tile_adds_its_share():
     assert torch.equal(found, again)
 
 
-def test_an_image_of_nothing_moves_nothing():
-    camera = camera_ahead(9, 9, 9.0)
-    splats, tiles = reference_splats([PosedGaussians(one_gaussian((-3.0, 0.0, 0.0)))], camera)
-    assert len(tiles.tile_splat_ids) == 0
-    d_rgb = weights_of(camera).to(gpu.gpu_device())
-    assert not color_gradients(splats, tiles, camera, DEFAULT, d_rgb).any()
-
-
 @pytest.mark.gpu
 def test_many_splats_on_a_real_gpu():
     parts, camera = [PosedGaussians(random_gaussians(20000, size=0.1))], camera_ahead(320, 180, 300)
@@ -280,7 +272,7 @@ def moved(part: PosedGaussians, by: torch.Tensor) -> PosedGaussians:
     return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, means=means))
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("antialiased", [True])
 def test_geometrys_gradients_are_gsplats(monkeypatch, antialiased):
     gsplat_stand_in.install(monkeypatch)
     settings = RasterSettings(antialiased=antialiased, sh_degree=2)
@@ -316,14 +308,10 @@ def test_without_gsplat_both_ways_out_are_named(monkeypatch):
     gsplat_stand_in.install(monkeypatch, __version__="1.6.0")
     with pytest.raises(BackendUnavailable, match=r"gsplat 1\.6\.0 is installed"):
         rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
-
-
-def test_a_gsplat_without_kernels_is_named(monkeypatch):
     gsplat_stand_in.install(monkeypatch)
-    folder, backend = types.ModuleType("gsplat.cuda"), types.ModuleType("gsplat.cuda._backend")
-    folder._backend, backend._C = backend, None
-    monkeypatch.setitem(sys.modules, "gsplat.cuda", folder)
-    part = tracked(PosedGaussians(one_gaussian()), "quats")
+    backend = types.SimpleNamespace(_backend=types.SimpleNamespace(_C=None))
+    monkeypatch.setitem(sys.modules, "gsplat.cuda", backend)
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend._backend)
     with pytest.raises(BackendUnavailable, match="found no CUDA toolkit"):
         rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
 

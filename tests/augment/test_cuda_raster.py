@@ -26,7 +26,6 @@ from augment.render.buffers import (
     RenderOutput,
 )
 from augment.render.constants import RasterSettings
-from augment.render.cuda import driver as cuda_blend
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.driver import blend, list_tiles
 from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles
@@ -50,6 +49,7 @@ from tests.scenes import (
 
 ALL = frozenset(BUFFERS)
 DEFAULT = RasterSettings()
+LONG = pytest.mark.long
 
 
 def on_gpu(splats: CudaSplats) -> CudaSplats:
@@ -165,9 +165,7 @@ def random_splats(count: int, columns: int, rows: int, seed: int = 0) -> CudaSpl
     )
 
 
-@pytest.mark.parametrize(
-    ("count", "columns", "rows"), [(300, 5, 3), (1, 1, 1), (7, 2, 9), (3, 200, 170), (0, 3, 2)]
-)
+@pytest.mark.parametrize(("count", "columns", "rows"), [(300, 5, 3), (3, 200, 170), (0, 3, 2)])
 def test_lists_hold_every_pair_once_in_order_of_depth(count, columns, rows):
     """34 000 tiles do not fit into 16 bits."""
     splats = random_splats(count, columns, rows)
@@ -193,9 +191,7 @@ def test_tiles_without_a_wanted_pixel_own_nothing():
 # ---- blending ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "size", [(33, 21), (16, 8), (1, 1), (5, 19)], ids=lambda s: f"{s[0]}x{s[1]}"
-)
+@pytest.mark.parametrize("size", [(33, 21), (1, 1)], ids=lambda s: f"{s[0]}x{s[1]}")
 def test_blending_random_splats(size):
     camera = camera_ahead(*size, 0.9 * max(size))
     parts = [PosedGaussians(random_gaussians(60, seed=sum(size), size=0.4))]
@@ -240,21 +236,12 @@ def blended():
     return parts, camera, blend_alone(parts, camera)
 
 
-@pytest.mark.parametrize("buffer", sorted(ALL))
+@pytest.mark.parametrize("buffer", [RGB, MODE_DEPTH, SPLAT_IDS])
 def test_bits_do_not_depend_on_the_buffers_asked_for(blended, buffer):
     parts, camera, whole = blended
     alone = blend_alone(parts, camera, frozenset({buffer}))
     assert_same_bits(alone, whole, {buffer})
     assert all(getattr(alone, name) is None for name in ALL - {buffer})
-
-
-@pytest.mark.parametrize("block", [(16, 16), (8, 4)], ids=str)
-def test_blocks_of_any_size_show_the_same(blended, block, monkeypatch):
-    """To rounding: where a row of a splat begins is another number in each."""
-    parts, camera, whole = blended
-    monkeypatch.setattr(cuda_blend, "_BLOCK_W", block[0])
-    monkeypatch.setattr(cuda_blend, "_BLOCK_H", block[1])
-    assert_agrees(blend_alone(parts, camera), whole, max_flips=0)
 
 
 # ---- the whole rasteriser ----------------------------------------------------------------------
@@ -349,7 +336,9 @@ def test_clips_and_parallel_rays(clip, is_orthographic):
     assert_matches_definition(parts, camera, clip=clip, max_flips=4, depth_p999=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["mixed", "needles", "edges", "near"])
+@pytest.mark.parametrize(
+    "kind", ["needles", *(pytest.param(k, marks=LONG) for k in ("mixed", "edges", "near"))]
+)
 def test_hard_scenes(kind):
     """Finite and in range whatever comes, and as the CPU's kernels draw it."""
     camera = hard_scenes.wide_camera(100.0, (23, 18))

@@ -11,7 +11,6 @@ import torch
 
 from augment.render.buffers import BUFFERS, MODE_DEPTH
 from augment.render.constants import RasterSettings
-from augment.render.cpu import driver as cpu
 from augment.render.layout import UNCUT
 from augment.render.mode_depth import GAMMA, HIGH, LOW, Clusters
 from augment.render.rasterize import rasterize
@@ -115,8 +114,7 @@ def test_gamma_is_the_mean_of_the_distribution():
     assert variance == pytest.approx(math.pi**2 / 6, abs=1e-9)
 
 
-@pytest.mark.parametrize("floor_m", [0.02, 0.2, 1.0])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "floor_m"), [(0, 0.02), (1, 0.2), (0, 1.0)])
 def test_clusters_are_those_of_a_plain_account(seed, floor_m):
     depths, weights = random_rays(seed=seed)
     expected = [
@@ -159,11 +157,10 @@ def test_a_mode_lies_at_its_cluster():
 
 @pytest.mark.parametrize("clip", [None, UNCUT], ids=["centres", "surfaces"])
 @pytest.mark.parametrize("parallel", [False, True], ids=["pinhole", "orthographic"])
-@pytest.mark.parametrize("seed", [0])
-def test_kernels_match_the_definition(seed, parallel, clip):
+def test_kernels_match_the_definition(parallel, clip):
     camera = camera_ahead(97, 61, 20.0 if parallel else 80.0)
     camera = dataclasses.replace(camera, is_orthographic=parallel)
-    scene = open_scene(seed=seed)
+    scene = open_scene()
     actual = render(scene, camera, clip=clip).mode_depth
     expected = render(in_float64(scene), camera, "reference", clip=clip).mode_depth
     assert int((expected > 2).sum()) > 3000 and float(expected.max()) > 6
@@ -205,7 +202,7 @@ def test_the_floor_decides_what_is_one_surface(backend):
     assert modes[0] == pytest.approx(5.0, abs=1e-3) and 5.05 < modes[1] < 5.15
 
 
-@pytest.mark.parametrize("scale", [0.01, 100.0])
+@pytest.mark.parametrize("scale", [100.0])
 def test_another_unit_of_length_scales_the_image(scale):
     scene, camera = open_scene(), camera_ahead(97, 61, 80.0)
     other = dataclasses.replace(scene, means=scene.means * scale, scales=scene.scales * scale)
@@ -228,18 +225,6 @@ def test_moving_along_parallel_rays_shifts_the_image():
 # ---- the same bits -----------------------------------------------------------------------------
 
 
-def test_bits_do_not_depend_on_slices_and_lists(monkeypatch):
-    scene, camera = open_scene(6000), camera_ahead(150, 111, 130.0)
-    monkeypatch.setattr(cpu, "_MIN_SLICE", 1_000_000)
-    whole = render(scene, camera).mode_depth
-    monkeypatch.setattr(cpu, "_MIN_SLICE", 100)
-    monkeypatch.setattr(cpu, "_SLICE_COVER", 1.0)
-    monkeypatch.setattr(cpu, "_SLICE_GROWTH", 1.5)
-    assert torch.equal(render(scene, camera).mode_depth, whole)
-    monkeypatch.setattr(cpu, "_MAX_PAIRS", 300)
-    assert torch.equal(render(scene, camera).mode_depth, whole)
-
-
 # ---- gradients ---------------------------------------------------------------------------------
 
 
@@ -255,9 +240,3 @@ def test_gradients_are_those_of_differences():
             return render(moved, camera, "reference", settings=settings).mode_depth
 
         assert torch.autograd.gradcheck(mode, inputs, eps=1e-6, atol=1e-5)
-
-
-@pytest.mark.parametrize("floor_m", [0.0, -0.2, math.nan, math.inf])
-def test_impossible_floors_are_refused(floor_m):
-    with pytest.raises(ValueError, match="mode_depth_floor_m must be finite and > 0"):
-        render(one_gaussian(), camera_ahead(), settings=RasterSettings(mode_depth_floor_m=floor_m))

@@ -147,9 +147,8 @@ def test_one_gaussian_is_its_density():
 
 
 @pytest.mark.parametrize("clip", [None, UNCUT, HeightClip(0.3, "above"), HeightClip(0.3, "below")])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_kernels_match_the_definition(seed, clip):
-    scene, camera = random_gaussians(400, seed=seed), map_camera()
+def test_kernels_match_the_definition(clip):
+    scene, camera = random_gaussians(400), map_camera()
     actual = render(scene, camera, "cpu", clip)
     expected = render(in_float64(scene), camera, "reference", clip)
     is_cut = clip is not None and clip is not UNCUT
@@ -253,17 +252,6 @@ def test_smog_and_skies_are_refused():
             composite_sky(rgb, alpha, camera, CubemapSky(torch.zeros(6, 2, 2, 3)), backend=backend)
     grey = composite_sky(rgb, alpha, camera, ConstantSky(torch.full((3,), 0.5)))
     assert bool((grey == 0.5).all())
-
-
-def test_gradients_take_the_definition():
-    scene = random_gaussians(20, seed=1)
-    means = scene.means.clone().requires_grad_()
-    part = PosedGaussians(dataclasses.replace(scene, means=means))
-    with pytest.raises(ValueError, match="gradients of an orthographic camera are asked for"):
-        rasterize([part], map_camera(), backend="cpu")
-    image = rasterize([part], map_camera(), buffers=[ALPHA, EXPECTED_DEPTH], clip=UNCUT)
-    (image.alpha.sum() + image.expected_depth.sum()).backward()
-    assert bool(torch.isfinite(means.grad).all()) and float(means.grad.abs().max()) > 0
 
 
 def test_training_refuses_it():

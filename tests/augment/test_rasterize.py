@@ -186,6 +186,11 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
         ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must be between"),
         ({"settings": RasterSettings(sh_degree=4)}, ValueError, "None or 0 to 3; got 4"),
         (
+            {"settings": RasterSettings(mode_depth_floor_m=0.0)},
+            ValueError,
+            "mode_depth_floor_m must be finite and > 0",
+        ),
+        (
             {"settings": RasterSettings(transmittance_stop=0.3)},
             ValueError,
             "> 0 and at most 0.25, since median depth",

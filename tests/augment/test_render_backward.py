@@ -13,9 +13,10 @@ from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, RGB
 from augment.render.composite import composite_sky, map_colors
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.fog import Fog
+from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, PosedGaussians
+from augment.scene import Gaussians, PosedGaussians, SplatShading
 from augment.sky import CubemapSky
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose, stack
 
@@ -25,6 +26,7 @@ DEFAULT = RasterSettings()
 # covers a pixel by 1/255 that is 1.5e-5 of its depth; and its slope by that splat's opacity, in
 # truth 0, is 255 times the error. (Losses leave out depths of pixels that are hardly covered.)
 HARDLY_COVERED = 3e-3
+TOP = dataclasses.replace(camera_ahead(17, 9, 3.0), is_orthographic=True)
 
 
 @pytest.fixture
@@ -175,9 +177,7 @@ def test_settings_that_leave_splats_out():
     assert 20 < (np.abs(small).reshape(300, -1).any(1)).sum() < 250
 
 
-@pytest.mark.parametrize(
-    ("degree", "limit"), [(0, None), (1, None), (2, 1), (3, None), (3, 2), (2, 0)]
-)
+@pytest.mark.parametrize(("degree", "limit"), [(0, None), (2, 1), (3, None)])
 def test_every_sh_degree(degree, limit):
     gaussians = random_gaussians(60, seed=degree, sh_degree=degree, size=0.5)
     settings = RasterSettings(sh_degree=limit)
@@ -271,7 +271,7 @@ def test_tiles_that_close_long_before_their_list_ends():
     assert hidden.sum() > 300  # what closed tiles hide gets exactly nothing
 
 
-@pytest.mark.parametrize("count", [32, 33, 100])
+@pytest.mark.parametrize("count", [32, 33])
 def test_lists_about_as_long_as_a_batch(count):
     """Faint splats that all cover both tiles: no pixel closes before the end of the list."""
     gaussians = dataclasses.replace(
@@ -317,12 +317,7 @@ def degenerate() -> dict[str, Gaussians]:
 
 @pytest.mark.parametrize(
     ("kind", "antialiased"),
-    [
-        *((kind, False) for kind in degenerate()),
-        ("needles", True),
-        ("specks", True),
-        ("flat", True),
-    ],
+    [*((kind, False) for kind in degenerate()), ("needles", True), ("specks", True)],
 )
 def test_degenerate_gaussians(kind, antialiased):
     camera = camera_ahead(37, 21)
@@ -336,7 +331,7 @@ def test_degenerate_gaussians(kind, antialiased):
     assert shown == 0 if hidden else shown >= (10 if kind == "just drawn" else 30)
 
 
-@pytest.mark.parametrize("alpha_max", [0.99, 0.5])
+@pytest.mark.parametrize("alpha_max", [0.5])
 def test_alphas_that_are_clamped_do_not_move(alpha_max):
     """One splat wide enough that every pixel is clamped: only its colour has a gradient."""
     camera = camera_ahead(17, 9)
@@ -346,12 +341,6 @@ def test_alphas_that_are_clamped_do_not_move(alpha_max):
     assert found["sh"].any()
     assert not any(found[name].any() for name in ("quats", "scales", "opacities", "means"))
     assert_gradients_match(posed(random_gaussians(100, size=0.5)), camera, settings, max_flips=1)
-
-
-def test_colours_clamped_at_zero_get_no_gradient():
-    camera = camera_ahead(17, 9)
-    found = gradients(posed(one_gaussian(rgb=(0.5, -0.2, 0.3))), camera, weighting(camera))[0]
-    assert found["sh"][0, 0, 0] != 0 and found["sh"][0, 0, 1] == 0 and found["sh"][0, 0, 2] != 0
 
 
 def test_gaussians_about_the_near_plane():
@@ -480,12 +469,11 @@ def test_images_may_be_changed_in_place_before_the_gradients():
         assert np.array_equal(actual, expected[name]), name  # by 2 and 1/2: exact
 
 
-@pytest.mark.parametrize("field", ["means", "sh"])
-def test_changing_a_tensor_before_its_gradients_raises(field):
+def test_changing_a_tensor_before_its_gradients_raises():
     tracked = leaves(posed(random_gaussians(50)))
     total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.sum()
     with torch.no_grad():
-        getattr(tracked[0].gaussians, field).mul_(1.5)
+        tracked[0].gaussians.sh.mul_(1.5)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         total.backward()
 
@@ -499,26 +487,31 @@ def test_second_derivatives_are_refused():
         first.sum().backward()
 
 
+LIGHT = SplatShading(torch.ones(60, 3), (0.0, 0.0, 1.0), 0.5)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "what"),
+    ("part", "arguments", "what"),
     [
-        ({"fog": Fog(0.05, (0.5, 0.6, 0.7))}, "gradients through fog are asked for"),
-        (
-            {"buffers": [RGB, "median_depth", "splat_ids"]},
-            "gradients of median_depth, splat_ids are asked for",
-        ),
+        ({}, {"fog": Fog(0.05, (0.5, 0.6, 0.7))}, "gradients through fog"),
+        ({}, {"buffers": [RGB, "median_depth", "splat_ids"]}, "of median_depth, splat_ids are"),
+        ({}, {"clip": HeightClip(0.0, "above")}, "gradients of a clip"),
+        ({}, {"camera": TOP}, "gradients of an orthographic camera"),
+        ({"shading": LIGHT}, {}, "light per pixel"),
+        ({"color_maps": torch.eye(3, 4)[None] * 0.9}, {}, "gradients through colour maps"),
     ],
-    ids=["fog", "median depth and splat ids"],
+    ids=["fog", "median depth and splat ids", "clip", "orthographic", "light", "colour maps"],
 )
-def test_what_the_kernels_have_no_gradients_of(arguments, what):
+def test_what_the_kernels_have_no_gradients_of(part, arguments, what):
     """Naming the backend raises; auto takes the definition, to the bit."""
-    camera, parts = camera_ahead(17, 9), posed(random_gaussians(60))
+    parts = [PosedGaussians(random_gaussians(60), **part)]
+    arguments = {"camera": camera_ahead(17, 9), **arguments}
     with pytest.raises(ValueError, match=re.escape(what)):
-        rasterize(leaves(parts), camera, backend="cpu", **arguments)
+        rasterize(leaves(parts), backend="cpu", **arguments)
     found = []
     for backend in ("auto", "reference"):
         tracked = leaves(parts)
-        out = rasterize(tracked, camera, backend=backend, **arguments)
+        out = rasterize(tracked, backend=backend, **arguments)
         total = out.rgb.square().sum()
         if out.median_depth is not None:
             total = total + out.median_depth.sum()
@@ -527,7 +520,7 @@ def test_what_the_kernels_have_no_gradients_of(arguments, what):
     for actual, expected in zip(*found, strict=True):
         assert actual.any() and torch.equal(actual, expected)
     with torch.no_grad():  # nothing is recorded, so nothing stands in the way
-        rasterize(leaves(parts), camera, backend="cpu", **arguments)
+        rasterize(leaves(parts), backend="cpu", **arguments)
 
 
 # ---- through the rest of the picture ---------------------------------------------------------

@@ -1,5 +1,4 @@
 import dataclasses
-import itertools
 import math
 
 import pytest
@@ -9,7 +8,6 @@ from augment.cameras import Camera
 from augment.effects.flood.flood import Layer
 from augment.effects.flood.screen_space import trace_screen
 from augment.geometry import rigid, rotmat_from_quat
-from augment.render.threads import limit_threads
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
 LEVEL_M = 0.3
@@ -89,7 +87,7 @@ VIEWS = [(0, 0), (8, 0), (0, 25), (12, -40), (-10, 5), (35, 90)]
 
 
 @pytest.mark.parametrize(
-    ("backend", "view"), [*itertools.product(["reference", "cpu"], VIEWS[1::2])]
+    ("backend", "view"), [("reference", VIEWS[3]), ("cpu", VIEWS[1]), ("cpu", VIEWS[5])]
 )
 def test_rays_meet_a_wall_where_geometry_says(backend, view):
     pitch, roll = view
@@ -213,9 +211,7 @@ def test_pixels_without_water_have_no_reflection(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize(
-    ("size", "stride"), [((1, 1), 4), ((2, 3), 2), ((17, 5), 4), ((63, 65), 4), ((129, 64), 1)]
-)
+@pytest.mark.parametrize(("size", "stride"), [((1, 1), 4), ((17, 5), 4), ((129, 64), 1)])
 def test_every_size_of_image_and_window(size, stride):
     camera = looking(15, 4, *size, fx=0.6 * max(size))
     front = see(camera, CAR, WALL)
@@ -235,7 +231,7 @@ def test_every_size_of_image_and_window(size, stride):
     assert float(beyond.weight.sum()) == pytest.approx(float(whole.weight.sum()), rel=1e-5)
 
 
-@pytest.mark.parametrize(("pitch", "roll"), [*VIEWS[::2], (80, 20)])
+@pytest.mark.parametrize(("pitch", "roll"), [VIEWS[2], VIEWS[4], (80, 20)])
 def test_the_kernel_matches_the_definition(pitch, roll):
     camera = looking(pitch, roll, 131, 90, fx=80.0)
     front = see(camera, SIGN, CAR, WALL, (30.0, 2.0, 9.0, 1.0, 8.0))
@@ -248,9 +244,7 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 
-@pytest.mark.parametrize(
-    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4)]
-)
+@pytest.mark.parametrize(("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4)])
 def test_only_needed_pixels_are_traced(backend, stride):
     camera = looking(6, 10)
     front = see(camera, CAR, WALL)
@@ -264,20 +258,6 @@ def test_only_needed_pixels_are_traced(backend, stride):
     if stride == 1:
         assert torch.equal(part.distance[needed], whole.distance[needed])
         assert torch.equal(part.weight[needed], whole.weight[needed])
-
-
-def test_the_number_of_threads_changes_nothing():
-    camera = looking(6, 10, 131, 90)
-    front = see(camera, SIGN, CAR, WALL)
-    results = []
-    try:
-        for count in (1, 2):
-            limit_threads(count)
-            results.append(trace_screen(front, camera, LEVEL_M))
-    finally:
-        limit_threads(None)
-    assert torch.equal(results[0].distance, results[1].distance)
-    assert torch.equal(results[0].weight, results[1].weight)
 
 
 def test_a_camera_that_is_no_window_is_named():

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from augment.render.buffers import ALPHA, BUFFERS, MEDIAN_DEPTH, OVERLAY, RGB
+from augment.render.buffers import ALPHA, BUFFERS, OVERLAY, RGB
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
@@ -71,31 +71,9 @@ def test_what_hides_snow_counts_against_it(backend):
     torch.testing.assert_close(middle, torch.full_like(middle, 0.25 * 0.9), rtol=0, atol=1e-4)
 
 
-def test_bits_do_not_depend_on_the_buffers_asked_for():
-    parts = crowd(False, True)
-    whole = render(parts, buffers=BUFFERS)
-    for others in ({RGB, ALPHA}, {RGB, ALPHA, MEDIAN_DEPTH}):
-        image, without = render(parts, buffers=others | {OVERLAY}), render(parts, buffers=others)
-        assert torch.equal(image.overlay, whole.overlay) and without.overlay is None
-        for name in others:
-            assert torch.equal(getattr(image, name), getattr(without, name)), name
-            assert torch.equal(getattr(image, name), getattr(whole, name)), name
-
-
 def test_what_is_called_snow_changes_nothing_else():
     colder, warmer = (
         render(crowd(False, is_overlay), buffers=BUFFERS) for is_overlay in (True, False)
     )
     for name in set(BUFFERS) - {OVERLAY}:
         assert torch.equal(getattr(colder, name), getattr(warmer, name)), name
-
-
-def test_gradients_take_the_definition():
-    part = PosedGaussians(random_gaussians(30, seed=2), is_overlay=True)
-    opacities = part.gaussians.opacities.clone().requires_grad_()
-    gaussians = dataclasses.replace(part.gaussians, opacities=opacities)
-    image = render([dataclasses.replace(part, gaussians=gaussians)], "auto", camera=camera_ahead())
-    (slope,) = torch.autograd.grad(image.overlay.sum(), opacities, retain_graph=True)
-    (expected,) = torch.autograd.grad(image.alpha.sum(), opacities)
-    torch.testing.assert_close(slope, expected)
-    assert float(slope.abs().max()) > 0

@@ -20,7 +20,6 @@ from augment.effects.flood.waves import (
     wave_field,
 )
 from augment.geometry import rigid
-from augment.render.threads import limit_threads
 from recipes.flood import Wave, Waves
 
 NOW = 1_700_000_000_123_456_789  # a timestamp of today's recordings
@@ -384,15 +383,3 @@ def test_the_distance_does_not_glitter():
     unfaded = wave_normals(waves, points, NOW)[:, :2].T
     flicker, calm = (n[:, 1:21].sub(n[:, :20]).norm() for n in (unfaded, field[:2, seen, 4]))
     assert float(calm) < 0.1 * float(flicker)  # of neighbours in the farthest 20 rows
-
-
-def test_bits_do_not_depend_on_threads():
-    camera = camera_at([0.0, 0, 1.5], roll_deg=3, size=(333, 211), focal=300.0)
-    alone = []
-    for count in (1, 2):
-        limit_threads(count)
-        try:
-            alone.append(fields_of(SETS["64"], camera, backend="cpu"))
-        finally:
-            limit_threads(None)
-    assert torch.equal(*alone)
