@@ -229,8 +229,8 @@ def group_by(table: pa.Table, *column: str) -> list[dict[str, Any]]:
         table = table.append_column(name, values)
     counted = table.group_by([*column]).aggregate([*_COUNTS.values()])
     named = counted.rename_columns([*("name" for _ in column), *_COUNTS])
-    groups = [{name: value or 0 for name, value in row.items()} for row in named.to_pylist()]
-    return sorted(groups, key=lambda group: group.get("name", ""))
+    groups = sorted(named.to_pylist(), key=lambda group: group.get("name"))
+    return [{k: 0 if value is None else value for k, value in row.items()} for row in groups]
 
 
 def group_failures(table: pa.Table) -> list[dict[str, Any]]:

@@ -131,6 +131,8 @@ def test_groups_count_images_variants_frames_and_cameras() -> None:
     (whole,) = report.group_by(table)
     assert (whole["finished"] + whole["failed"], whole["scenes"], whole["variants"]) == (41, 2, 11)
     assert report.group_by(table.slice(0, 0))[0]["finished"] == 0
+    nameless = report.group_by(as_table([make_row(), make_row(recipe="")]), "recipe")
+    assert [group["name"] for group in nameless] == ["", "clear"]
 
 
 def test_files_are_counted_by_kind() -> None:
