@@ -105,7 +105,7 @@ def test_buckets_must_exist(server):
         assert not isinstance(caught.value, StoredFileMissing)
 
 
-def test_nobody_answers():
+def test_nobody_answers(server):
     store = RemoteStore("s3://bucket/out?endpoint_override=127.0.0.1:1&scheme=http", QUICK)
     with pytest.raises(OutputError, match=r"list s3://bucket/out: .*3 retries.*AWS_ENDPOINT_URL"):
         store.list("")
