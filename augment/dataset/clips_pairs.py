@@ -446,11 +446,20 @@ def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
     known = {names[code]: code for code in np.unique(camera)}
     if cameras is not None and (unknown := [name for name in cameras if name not in known]):
         raise ValueError(f"no camera {unknown}; there are {', '.join(known) or 'none'}")
-    asked = None if cameras is None else np.array([known[name] for name in cameras], camera.dtype)
     for numbers in _by_variant(rows):
         codes = camera[numbers]
-        wanted = np.unique(codes) if asked is None else asked
-        yield from _runs_of(numbers, frames[numbers], times[numbers], codes, wanted)
+        wanted = np.unique(codes) if cameras is None else [known[name] for name in cameras]
+        present, place = np.unique(frames[numbers], return_inverse=True)
+        table = np.full((len(present), len(wanted)), -1, np.int64)
+        for column, code in enumerate(wanted):
+            own = codes == code
+            table[place[own], column] = numbers[own]
+        whole = (table >= 0).all(axis=1)
+        if whole.any():
+            # Frame numbers farther apart than the variant's closest ones, and late images.
+            usual = np.diff(present).min(initial=np.iinfo(np.int64).max)
+            breaks = (np.diff(present[whole]) > usual) | _late(times[table[whole]])
+            yield from np.split(table[whole], np.flatnonzero(breaks) + 1)
 
 
 def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
@@ -458,33 +467,6 @@ def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
     group = rows.groups()[1]
     order = np.argsort(group, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else ()
-
-
-def _runs_of(
-    numbers: np.ndarray,
-    frames: np.ndarray,
-    times: np.ndarray,
-    codes: np.ndarray,
-    wanted: np.ndarray,
-) -> Iterator[np.ndarray]:
-    """The runs of one variant. numbers, frames, times, codes (of cameras): [N] of its rows."""
-    present, place = np.unique(frames, return_inverse=True)
-    table = np.full((len(present), len(wanted)), -1, np.int64)
-    clock_ns = np.zeros_like(table)
-    for column, code in enumerate(wanted):
-        own = codes == code
-        table[place[own], column] = numbers[own]
-        clock_ns[place[own], column] = times[own]
-    whole = (table >= 0).all(axis=1)
-    if whole.any():
-        breaks = _gaps(present, present[whole]) | _late(clock_ns[whole])
-        yield from np.split(table[whole], np.flatnonzero(breaks) + 1)
-
-
-def _gaps(every: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """bool [F - 1]: where frame numbers are farther apart than the variant's closest ones."""
-    usual = np.diff(every).min(initial=np.iinfo(np.int64).max)
-    return np.diff(present) > usual
 
 
 def _late(clock_ns: np.ndarray) -> np.ndarray:

@@ -137,12 +137,12 @@ def make_sample(
     """One sample as the module describes it. images: as files store them, RGB [H, W, 3] and [H, W],
     by the names of `load`. described: weather, paths and NAMES.
     """
-    made: Sample = {name: None for name in loadable()}
+    made: Sample = dict.fromkeys(loadable())
     for name, image in images.items():
-        is_picture = name == "image"
-        made[name] = (
-            image_tensor(image, options.image_type) if is_picture else buffers()[name].tensor(image)
-        )
+        if name == "image":
+            made[name] = image_tensor(image, options.image_type)
+        else:
+            made[name] = buffers()[name].tensor(image)
     origins = {"ego": world_from_ego, "camera": camera.world_from_camera}
     placed = (options.box_frame, origins.get(options.box_frame, torch.eye(4)).numpy())
     if labels.boxes is not None:
@@ -265,7 +265,7 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return {side: collate_frames([pair[side] for pair in samples]) for side in first}
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
     for key in ("image", *buffers()):
-        if key not in mask_names():
+        if key == "image" or buffers()[key].in_all:
             _check_in_all(key, samples)
         batch[key] = stack_alike(batch[key], _stack_shared)
     batch["camera"] = stack_cameras(batch["camera"], _stack_shared)

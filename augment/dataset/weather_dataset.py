@@ -60,7 +60,8 @@ pc: Any = pyarrow.compute  # type checkers do not see the functions that it make
 _PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
 _FOLDERS = "/folders"  # what follows a path's name in the name of its column of folders
 _DIGEST = pa.binary(32)  # a SHA-256
-_MANY = 1 << 16  # values of one column
+_MANY = 1 << 16  # values of a column
+_FEW = 1 << 12
 _OUTPUT = "output"
 
 Row = Mapping[str, Any]
@@ -135,8 +136,8 @@ class Rows:
 
     @cached_property
     def _lookups(self) -> tuple[list[tuple[str, Any, Any]], list[tuple[str, Any, Any]]]:
-        """Of every column a row's code and the codes' values: as Python's objects, ten times as
-        fast, or Arrow's where these are so many that no worker may have its own.
+        """Of every column the rows' codes and the codes' values: as Python's objects, which are ten
+        times as fast; as Arrow's where there are many, for each worker has its own objects.
         """
         few, many = [], []
         for name, column in zip(self.batch.schema.names, self.batch.columns, strict=True):
@@ -144,7 +145,7 @@ class Rows:
             if pa.types.is_dictionary(column.type):
                 indices: Any = column.indices.to_numpy()
                 codes, values = memoryview(indices), column.dictionary
-            if values is column or len(values) > _MANY:
+            if values is column or len(values) > _FEW:
                 many.append((name, codes, values))
             else:
                 few.append((name, codes, values.to_pylist()))

@@ -158,15 +158,6 @@ def test_indices_behave_as_a_lists(written: Path) -> None:
             files[index]
 
 
-def test_bytes_on_request(written: Path) -> None:
-    files = WeatherDataset(written, variants=["fog-000"], image_type="uint8")
-    live = SceneDataset(
-        open_fake("fake:street"), make_recipe(), image_type="uint8", renderer=fake_render
-    )
-    assert files[0]["image"].dtype == torch.uint8
-    assert torch.equal(files[0]["image"], live[0]["image"])
-
-
 def test_in_a_data_loader_with_workers(written: Path) -> None:
     files = WeatherDataset(written, variants=["fog-000", "clear-009"], frames=[2, 3])
     assert ForkingPickler.dumps(files)  # a worker started by spawn would receive this

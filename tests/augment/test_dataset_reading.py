@@ -111,12 +111,14 @@ def test_only_what_is_asked_for_is_read(remote: MemoryStore, kind: str) -> None:
 
 
 def test_options_that_there_are_not(written: Path, unchecked) -> None:
-    with pytest.raises(ValueError, match=r"load must be some of image, .*; got 'depth'"):
-        WeatherDataset(written, load="depth")
-    with pytest.raises(ValueError, match=r"load must be some of image, .*; got \['flow'\]"):
-        WeatherDataset(written, load=["flow"])
-    with pytest.raises(ValueError, match="box_frame must be one of world, ego, camera; got 'car'"):
-        WeatherDataset(written, box_frame="car")
+    for options, message in (
+        ({"load": "depth"}, r"load must be some of image, .*; got 'depth'"),
+        ({"load": ["flow"]}, r"load must be some of image, .*; got \['flow'\]"),
+        ({"box_frame": "car"}, "box_frame must be one of world, ego, camera; got 'car'"),
+        ({"image_type": "int8"}, "image_type must be one of float32, uint8; got 'int8'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            WeatherDataset(written, **options)
     with pytest.raises(ValueError, match="load must not have 'lidar' for a live scene"):
         SceneDataset(open_fake("fake:street"), CLEAR, load=ALL, renderer=fake_render)
 
@@ -150,12 +152,14 @@ def test_boxes_and_points_in_other_frames(written: Path, frame) -> None:
 
 
 def test_live_samples_have_the_same_options(written: Path) -> None:
-    options = {"load": ("depth", "boxes"), "box_frame": "camera", "transform": lambda s: [s]}
+    options = {"load": ("image", "boxes"), "box_frame": "camera", "transform": lambda s: [s]}
+    options |= {"image_type": "uint8"}
     scene = open_fake("fake:street")
     live = SceneDataset(scene, FLOODED, renderer=fake_render, **options)
     files = WeatherDataset(written, variants=["clear-009"], **options)
     assert_same_sample(live[3][0], files[3][0], but=("paths",))
-    assert live[3][0]["image"] is None and live[3][0]["boxes"]["frame"] == "camera"
+    assert live[3][0]["depth"] is None and live[3][0]["boxes"]["frame"] == "camera"
+    assert live[3][0]["image"].dtype == torch.uint8
 
 
 def test_visibility_of_boxes(written: Path) -> None:
