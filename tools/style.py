@@ -50,6 +50,7 @@ from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.style import STYLES, Style, style_preset_names
+from recipes.template import readable
 from tools.drawing import captioned, strip, write_rgb
 from tools.options import StyleTrainOptions, uri_text
 from tools.output import check_scene_out, fill, path_beside, print_note
@@ -387,12 +388,7 @@ def _style(options: ApplyOptions) -> Style:
     try:
         return Style(**{"preset" if is_preset else "image": source}, **how)
     except ValidationError as error:
-        message = "; ".join(
-            f"{'.'.join(map(str, e['loc'])) + ': ' if e['loc'] else ''}"
-            f"{e['msg'].removeprefix('Value error, ')}"
-            for e in error.errors()
-        )
-        raise StyleError(f"the style cannot be used: {message}") from None
+        raise StyleError(f"the style cannot be used: {'; '.join(readable(error))}") from None
 
 
 def _style_facts(style: Style) -> dict[str, Any]:

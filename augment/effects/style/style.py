@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int16
+from pydantic import ValidationError, field_validator
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -47,7 +48,9 @@ from augment.render.buffers import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
 from recipes.errors import RecipeError
+from recipes.fields import Closed, Number, Unit
 from recipes.style import Style, style_preset_text
+from recipes.template import readable
 from recipes.yaml_tree import read_plain
 
 if TYPE_CHECKING:
@@ -167,7 +170,28 @@ def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float
 
 # Of a street's picture; they only matter where a map of the whole stands in for land and sky.
 SHARES: Mapping[str, float] = {LAND: 0.75, SKY: 0.25}
-_FIELDS = {"mean": (3,), "covariance": (3, 3)}
+_Triple = tuple[Number, Number, Number]
+
+
+class _Moments(Closed):
+    mean: tuple[Unit, Unit, Unit]
+    covariance: tuple[_Triple, _Triple, _Triple]
+
+    @field_validator("covariance")
+    @classmethod
+    def _check(cls, rows: tuple[_Triple, ...]) -> tuple[_Triple, ...]:
+        matrix = np.array(rows)
+        if not np.array_equal(matrix, matrix.T):
+            raise ValueError(f"must be symmetric; got {matrix.tolist()}")
+        least = float(np.linalg.eigvalsh(matrix)[0])
+        if least < -1e-9:
+            raise ValueError(f"must have no variance below zero; got {least:g} in a direction")
+        return rows
+
+
+class _Preset(Closed):
+    land: _Moments
+    sky: _Moments
 
 
 def preset_statistics(name: str) -> Statistics:
@@ -186,18 +210,19 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
     """The statistics in a preset's YAML: mean and covariance (display-encoded) of land and of sky.
 
     Raises:
-        StyleError: keys are missing or unknown, numbers are not finite or of another count, a mean
-            is outside [0, 1], a covariance is not symmetric or is negative definite.
+        StyleError: it is not as it should be; says where.
     """
     try:
-        document = read_plain(text, source=source)
+        preset = _Preset.model_validate(read_plain(text, source=source))
     except RecipeError as error:
         raise StyleError(str(error)) from None
-    regions = _fields(document, tuple(SHARES), source)
-    found = {
-        region: _statistics(regions[region], share, f"{source}: {region}")
-        for region, share in SHARES.items()
-    }
+    except ValidationError as error:
+        raise StyleError(f"{source}: {'; '.join(readable(error))}") from None
+    found: dict[str, ColorStatistics] = {}
+    for region, share in SHARES.items():
+        moments: _Moments = getattr(preset, region)
+        mean, covariance = np.array(moments.mean), np.array(moments.covariance)
+        found[region] = ColorStatistics(mean, covariance, share)
     return {WHOLE: together(tuple(found.values())), **found}
 
 
@@ -211,42 +236,6 @@ def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
         off = part.mean - mean
         second += part.share / share * (part.covariance + np.outer(off, off))
     return ColorStatistics(mean, second, share)
-
-
-def _fields(value: Any, expected: tuple[str, ...], where: str) -> dict[str, Any]:
-    if not isinstance(value, dict) or set(value) != set(expected):
-        got = sorted(map(str, value)) if isinstance(value, dict) else type(value).__name__
-        raise StyleError(f"{where}: expected the keys {', '.join(expected)}; got {got}")
-    return value
-
-
-def _statistics(value: Any, share: float, where: str) -> ColorStatistics:
-    fields = _fields(value, tuple(_FIELDS), where)
-    mean, covariance = (
-        _numbers(fields[key], shape, f"{where}.{key}") for key, shape in _FIELDS.items()
-    )
-    if not ((mean >= 0) & (mean <= 1)).all():
-        raise StyleError(f"{where}.mean: must be in [0, 1]; got {mean.tolist()}")
-    if not np.array_equal(covariance, covariance.T):
-        raise StyleError(f"{where}.covariance: must be symmetric; got {covariance.tolist()}")
-    least = float(np.linalg.eigvalsh(covariance)[0])
-    if least < -1e-9:
-        raise StyleError(
-            f"{where}.covariance: must have no variance below zero; got {covariance.tolist()}, "
-            f"with {least:g} along one direction"
-        )
-    return ColorStatistics(mean, covariance, share)
-
-
-def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    try:
-        array = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0)
-    if array.shape != shape or array.dtype.kind not in "if" or not np.isfinite(array).all():
-        size = " x ".join(map(str, shape))
-        raise StyleError(f"{where}: expected {size} finite numbers; got {value}")
-    return array.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
