@@ -165,11 +165,11 @@ def useful(costs: Sequence[Cost]) -> list[Cost]:
 
 def steps_back(costs: Mapping[str, Sequence[Cost]]) -> tuple[Ladders, list[Step]]:
     """What to `search` a budget of time with: ladders from reference to the fastest of the useful
-    values, and the steps back; first those that undo the most error for the time that they take.
+    values, and the steps back, first those that undo the most error: the worst shows.
     """
     ladders = {path: useful(each) for path, each in costs.items()}
     steps = {
-        (path, slow.value): (fast.flip - slow.flip) / (slow.ms - fast.ms)
+        (path, slow.value): fast.flip - slow.flip
         for path, ladder in ladders.items()
         for slow, fast in pairwise(ladder)
     }
