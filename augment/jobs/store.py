@@ -557,9 +557,8 @@ _CREDENTIALS = {
 }
 _ENDPOINT = {"s3": ", the region, and the endpoint (endpoint_override or AWS_ENDPOINT_URL)"}
 _ADVICE = {
-    "PermissionDenied|Unauthenticated|(?i:credential)|169\\.254\\.|AuthorizationHeaderMalformed": (
-        "check {credentials}, and that they may read, write, list and delete there"
-    ),
+    "PermissionDenied|Unauthenticated|(?i:credential)|169\\.254\\.|AuthorizationHeaderMalformed"
+    "|Account must": ("check {credentials}, and that they may read, write, list and delete there"),
     f"{_NO_BUCKET.pattern}|PermanentRedirect|status code: 30": (
         "check the bucket's name, that it exists{endpoint}"
     ),
@@ -567,7 +566,9 @@ _ADVICE = {
         "the store lacks such requests; claims need puts with If-None-Match and If-Match"
     ),
     "InvalidPath": "delete what others have put there",
-    "status code: 4(?!08|29)": "the store refuses this for good: check its address and options",
+    "status code: 4(?!08|29)|known pattern": (
+        "the store refuses this for good: check its address and options"
+    ),
     "": "check the network{endpoint}, then run the same command again: every file there is whole",
 }
 
