@@ -52,8 +52,8 @@ from augment.jobs.tables import read_boxes, read_lidar
 
 pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 
-# ---- A manifest's rows in a fifth of its memory, with quick access to single ones ----------------
-# Most of a row in the manifest's table (440 bytes with short names, 84 here) are paths and names
+# ---- A manifest's rows in a quarter of its memory, with quick access to single ones --------------
+# Most of a row in the manifest's table (440 bytes with short names, 110 here) are paths and names
 # that repeat. Here every column is dictionary-encoded with the smallest codes; paths are split into
 # folder and file name, of which there are few. Arrow's buffers are shared by forked workers.
 

@@ -165,7 +165,7 @@ def test_dataset_measures_reading_rendering_and_a_large_manifest():
     assert [row[0] for row in reading] == [dataset.DECODING, *readings]
     assert [row[3] for row in (*reading, *live)][::2] == [1, 1]
     assert all(rate > 0 for *_, rate, _ in (*reading, *live))
-    # Some eighty bytes a row, where the Arrow table has 440.
+    # Some 150 bytes a row with so few images a variant, where the whole table has 440.
     assert rows == 700 and 700 * 32 < held * 2**20 < 700 * 200
 
 
