@@ -75,7 +75,7 @@ LONG = {
     for name in (
         "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
         "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
-        "render_backward", "smog_accuracy", "snow_accuracy",
+        "render_backward", "snow_accuracy",
     )
 }  # fmt: skip
 

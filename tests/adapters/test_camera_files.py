@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from splat_scenes import gaussians_at, street
 
-from adapters.camera_files.camera_files import find_camera_file, read_views
+from adapters.base import open_scene
+from adapters.camera_files.camera_files import PosedView, find_camera_file, look_at_pose, read_views
+from adapters.camera_files.paths import (
+    CAMERA_HEIGHT_M,
+    NO_CAMERAS,
+    frames_from_path_file,
+    frames_from_views,
+    ground_grid,
+    make_default_path,
+    solid_points,
+    split_names,
+    with_camera_path,
+)
+from adapters.world import WorldChange
 from augment.errors import AdapterError
+from augment.files.ply import read_splats, write_ply
+from augment.scene import Scene
+from augment.sky import ConstantSky
 
 # A camera at (1, 2, 3) that looks along world +x with world +z up, OpenCV axes as columns.
 LOOKS_ALONG_X = np.array(
@@ -183,3 +203,382 @@ def test_folders_without_cameras(tmp_path: Path) -> None:
     save(tmp_path / "transforms.json", nerfstudio_file())
     assert find_camera_file(tmp_path) == tmp_path / "transforms.json"
     assert len(read_views(tmp_path).views) == 1
+
+
+def view(name: str, *, position=(0.0, 0.0, 2.0), target=(9.0, 0.0, 2.0), **changes) -> PosedView:
+    fields = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0} | changes
+    return PosedView(
+        name=name, world_from_camera=look_at_pose(position, target, where="test"), **fields
+    )
+
+
+def grouped(names: list[str]) -> list[tuple[int, list[str]]]:
+    frames, problems = frames_from_views([view(name) for name in names], WorldChange())
+    assert problems == ()
+    return [(frame.index, list(frame.cameras)) for frame in frames]
+
+
+def test_folder_per_camera() -> None:
+    names = ["images/left/0010.jpg", "images/front/0010.jpg", "images/front/0009.jpg"]
+    assert grouped(names) == [(9, ["front"]), (10, ["front", "left"])]
+
+
+def test_folder_per_frame() -> None:
+    names = ["0003/cam_l.png", "0003/cam_f.png", "0002/cam_f.png", "0002/cam_l.png"]
+    assert grouped(names) == [(2, ["cam_f", "cam_l"]), (3, ["cam_f", "cam_l"])]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["000012_0.png", "000012_1.png", "000013_0.png", "000013_1.png"],
+        ["000012_0", "000013_1", "000012_1", "000013_0"],
+    ],
+)
+def test_frame_then_camera(names: list[str]) -> None:
+    assert grouped(names) == [(12, ["0", "1"]), (13, ["0", "1"])]
+    words = [name.replace("_0", "_front").replace("_1", "_front_left") for name in names]
+    assert grouped(words)[0] == (12, ["front", "front_left"])
+
+
+def test_camera_then_frame() -> None:
+    names = ["left_0001.jpg", "right_0001.jpg", "left_0002.jpg", "right_0002.jpg"]
+    assert grouped(names) == [(1, ["left", "right"]), (2, ["left", "right"])]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["frame_00002.png", "frame_00010.png", "frame_00001.png"],
+        ["images/IMG_0002.JPG", "images/IMG_0010.JPG", "images/IMG_0001.JPG"],
+        ["DSC10", "DSC2", "DSC1"],
+        ["0001_0", "0002_0", "0010_0"],
+    ],
+)
+def test_one_camera_in_natural_order(names: list[str]) -> None:
+    """10 comes after 2, and a number in the name alone makes no rig."""
+    frames, problems = frames_from_views([view(name) for name in names], WorldChange())
+    assert problems == ()
+    assert [list(frame.cameras) for frame in frames] == [["camera"]] * 3
+    assert [f.index for f in frames] == sorted(f.index for f in frames)
+    assert [f.timestamp_ns for f in frames] == [0, 100_000_000, 200_000_000]
+
+
+def test_phone_dates_are_no_rig() -> None:
+    names = [f"20240131_1200{n:02d}.jpg" for n in range(20)]
+    assert split_names(names) is None
+    assert all(cameras == ["camera"] for _, cameras in grouped(names))
+
+
+def test_repeated_names_are_said() -> None:
+    frames, problems = frames_from_views([view("0001"), view("0001"), view("0002")], WorldChange())
+    assert [list(frame.cameras) for frame in frames] == [["camera"]] * 3
+    assert "2 views are named camera 'camera', frame '0001'" in problems[0]
+
+
+def test_times_count_from_the_start() -> None:
+    views = [
+        view("a", camera="left", frame=0, timestamp_ns=5),
+        view("b", camera="front", frame=0, timestamp_ns=3),
+    ]
+    (frame,), _ = frames_from_views(views, WorldChange(), start_ns=1000)
+    assert frame.timestamp_ns == 1003
+    assert frame.cameras["left"].timestamp_ns == 1005
+
+
+def test_world_change_moves_cameras() -> None:
+    """A y-down source in half-metres, recentred: the camera stays rigid and upright."""
+    rotation = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # source -y is up
+    change = WorldChange(rotation, 0.5, np.array([10.0, 0, 0]))
+    pose = np.eye(4)
+    pose[:3, 3] = [40, -4, 2]
+    source = view("a")
+    source = PosedView(**{**vars(source), "world_from_camera": pose})
+    (frame,), _ = frames_from_views([source], change)
+    camera = frame.cameras["camera"]
+    np.testing.assert_allclose(camera.centre, [10, 1, 2])
+    np.testing.assert_allclose(camera.world_from_camera[:3, 1], [0, 0, -1])  # image down = -z
+    np.testing.assert_allclose(frame.world_from_ego[:3, 0], [0, 1, 0])  # optical axis, level
+
+
+def test_ego_stands_level_at_the_front_camera() -> None:
+    views = [
+        view("0001_back", target=(-9.0, 0, 2)),
+        view("0001_front", position=(1.0, 0, 2), target=(1.0, 5, -3)),
+        view("0001_front_left", target=(0.0, 9, 2)),
+    ]
+    (frame,), _ = frames_from_views(views, WorldChange())
+    expected = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+    torch.testing.assert_close(frame.world_from_ego, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_impossible_numbers_name_the_image() -> None:
+    with pytest.raises(AdapterError, match=r"image 'a\.png': .*fx must be finite"):
+        frames_from_views([view("a.png", fx=float("inf"))], WorldChange())
+
+
+LENS = {"width": 96, "height": 54, "fx": 60.0}
+LEVEL = {"position": [1.0, 2.0, 3.0], "look_at": [5.0, 2.0, 3.0]}
+
+
+def save_path(path: Path, frames: list, **changes) -> Path:
+    path.write_text(json.dumps(LENS | {"frames": frames} | changes))
+    return path
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    write_ply(tmp_path / "street.ply", street())
+    return open_scene(f"{tmp_path}/street.ply?scale=1")
+
+
+def test_look_at_poses_are_upright(tmp_path: Path) -> None:
+    frames = [
+        LEVEL,
+        {"position": [0, 0, 5], "look_at": [0, 0, 0]},
+        {"position": [0, 0, 0], "look_at": [3, 4, 5]},
+    ]
+    level, down, slanted = (
+        v.world_from_camera for v in read_views(save_path(tmp_path / "a.json", frames)).views
+    )
+    expected = [[0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(level, expected, atol=1e-12)
+    np.testing.assert_allclose(down[:3, 2], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(down[:3, 1], [0, -1, 0], atol=1e-12)  # image top towards +y
+    np.testing.assert_allclose(slanted[:3, 2], np.array([3, 4, 5]) / math.sqrt(50), atol=1e-12)
+    assert slanted[2, 0] == 0 and slanted[2, 1] < 0  # no roll, and the right way up
+    assert np.linalg.det(slanted) == pytest.approx(1)
+
+
+def test_defaults_and_matrices(tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = [4, 5, 6]
+    (view,) = read_views(
+        save_path(tmp_path / "a.json", [{"world_from_camera": pose.tolist()}], cx=50, fy=61)
+    ).views
+    np.testing.assert_array_equal(view.world_from_camera, pose)
+    assert (view.fx, view.fy, view.cx, view.cy) == (60, 61, 50, 27)
+
+
+def test_entries_of_one_time_are_one_frame(tmp_path: Path, scene: Scene) -> None:
+    frames = [
+        LEVEL | {"camera": camera, "timestamp_s": time}
+        for time in (0.5, 0.0)
+        for camera in ("front", "left")
+    ]
+    got = frames_from_path_file(save_path(tmp_path / "a.json", frames), scene)
+    assert [(f.index, f.timestamp_ns, list(f.cameras)) for f in got] == [
+        (0, 0, ["front", "left"]),
+        (1, 500_000_000, ["front", "left"]),
+    ]
+
+
+def test_without_times_entries_count_by_camera(tmp_path: Path, scene: Scene) -> None:
+    frames = [LEVEL | {"camera": camera} for camera in ("a", "a", "b", "b", "a")]
+    got = frames_from_path_file(save_path(tmp_path / "a.json", frames), scene)
+    assert [list(f.cameras) for f in got] == [["a", "b"], ["a", "b"], ["a"]]
+    assert [f.timestamp_ns for f in got] == [0, 100_000_000, 200_000_000]
+
+
+@pytest.mark.parametrize(
+    ("frames", "changes", "message"),
+    [
+        ([], {}, "frames: List should have at least 1 item"),
+        ([LEVEL | {"look_at": None}], {}, r"frames\.0: .*either position and look_at, or world"),
+        ([LEVEL, LEVEL | {"world_from_camera": np.eye(4).tolist()}], {}, r"frames\.1: .*either"),
+        ([LEVEL | {"position": [1, 2]}], {}, r"frames\.0\.position\.2: Field required"),
+        ([LEVEL | {"position": [1, 2, math.inf]}], {}, r"frames\.0\.position\.2: .*finite"),
+        ([LEVEL | {"look_att": [1, 2, 3]}], {}, r"frames\.0\.look_att: Extra inputs"),
+        ([LEVEL | {"look_at": LEVEL["position"]}], {}, r"frames\.0: look_at must differ"),
+        ([LEVEL | {"camera": "../up"}], {}, r"frames\.0\.camera: .*match pattern"),
+        ([LEVEL | {"timestamp_s": 1}, LEVEL], {}, r"in 1 of 2 \(missing first in frames\.1\)"),
+        ([LEVEL | {"timestamp_s": 1}] * 2, {}, "camera 'camera' stands 2 times at timestamp_s 1"),
+        ([{"world_from_camera": (2 * np.eye(4)).tolist()}], {}, r"frames\.0: the rotation must be"),
+        ([LEVEL], {"fx": 0}, "fx: Input should be greater than 0 "),
+        ([LEVEL], {"width": 10**9}, "width: Input should be less than or equal to 65536"),
+        ([LEVEL], {"speed": 3}, "speed: Extra inputs are not permitted"),
+    ],
+)
+def test_bad_paths_name_the_field(tmp_path: Path, frames, changes, message: str) -> None:
+    with pytest.raises(AdapterError, match=message):
+        read_views(save_path(tmp_path / "a.json", frames, **changes))
+
+
+def test_scene_with_a_path_opens_again(tmp_path: Path, scene: Scene) -> None:
+    path = save_path(tmp_path / "a path.json", [LEVEL])
+    changed = with_camera_path(scene, path)
+    assert [list(f.cameras) for f in changed.frames] == [["camera"]]
+    assert changed.background is scene.background
+    assert not any("no cameras" in p for p in changed.problems)
+    again = open_scene(changed.source)
+    assert again.source == changed.source
+    assert again.frames[0].cameras["camera"].centre.tolist() == [1, 2, 3]
+    twice = with_camera_path(changed, save_path(tmp_path / "b.json", [LEVEL, LEVEL]))
+    assert len(open_scene(twice.source).frames) == 2
+
+
+def test_paths_follow_the_recentring_and_the_clock(tmp_path: Path, scene: Scene) -> None:
+    """Poses are in the world before recentring; times count from the scene's first frame."""
+    start = 1_557_000_000_000_000_000
+    first = dataclasses.replace(scene.frames[0], timestamp_ns=start)
+    moved = dataclasses.replace(
+        scene, world_origin_m=np.array([1000.0, 0, 0]), frames=(first, *scene.frames[1:])
+    )
+    pose = {"position": [1001, 2, 3], "look_at": [1005, 2, 3], "timestamp_s": 0.25}
+    (frame,) = frames_from_path_file(save_path(tmp_path / "a.json", [pose]), moved)
+    assert frame.cameras["camera"].centre.tolist() == [1, 2, 3]
+    assert frame.timestamp_ns == start + 250_000_000
+
+
+def test_labels_do_not_follow(tmp_path: Path) -> None:
+    class Labels:
+        def boxes(self, frame_index: int):
+            raise AssertionError("not asked for")
+
+        def lidar(self, frame_index: int):
+            raise AssertionError("not asked for")
+
+    scene = Scene(
+        name="s", source="procedural:street", background=street(), actors=(),
+        sky=ConstantSky(torch.zeros(3)), frames=(), labels=Labels(),
+    )  # fmt: skip
+    changed = with_camera_path(scene, save_path(tmp_path / "a.json", [LEVEL]))
+    assert changed.labels is None
+    assert "boxes and LiDAR are left out" in changed.problems[0]
+    assert changed.source == f"procedural:street?camera_path={tmp_path}/a.json"
+
+
+def test_other_formats_serve_as_paths(tmp_path: Path, scene: Scene) -> None:
+    pose = np.diag([1.0, -1, -1, 1])  # OpenGL axes: this camera looks along world +z
+    frame = {"file_path": "0001.png", "transform_matrix": pose.tolist()}
+    nerfstudio = {"w": 9, "h": 9, "fl_x": 9, "frames": [frame]}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(nerfstudio))
+    (got,) = frames_from_path_file(path, scene)
+    np.testing.assert_array_equal(got.cameras["camera"].world_from_camera, np.eye(4))
+    with pytest.raises(AdapterError, match="no such file"):
+        frames_from_path_file(tmp_path / "absent.json", scene)
+
+
+def along_and_across(positions: np.ndarray, heading_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    angle = math.radians(heading_deg)
+    forward = np.array([math.cos(angle), math.sin(angle)])
+    left = np.array([-forward[1], forward[0]])
+    return positions[:, :2] @ forward, positions[:, :2] @ left
+
+
+@pytest.mark.parametrize(("heading_deg", "slope"), [(0.0, 0.0), (30.0, 0.05), (117.0, -0.05)])
+def test_drive_follows_the_road(heading_deg: float, slope: float) -> None:
+    path = make_default_path(street(heading_deg=heading_deg, slope=slope), is_metric=True)
+    front = [v for v in path.views if v.camera == "front"]
+    assert [v.frame for v in front] == list(range(len(front)))
+    assert {v.camera for v in path.views} == {"front", "left", "right"}
+    eyes = np.stack([v.world_from_camera[:3, 3] for v in front])
+    along, across = along_and_across(eyes, heading_deg)
+    assert np.ptp(along) > 30  # of 60 m of road, 30 % are left ahead
+    # In the free part of the road: cars stand at -4 to -2 m, the wall at 4 m, a car is 2.5 m wide.
+    assert across.min() > -1.5 and across.max() < 3.5
+    # The ground is a low quantile within cells of 1 m: half a metre of slope off, and smoothed.
+    np.testing.assert_allclose(eyes[:, 2] - slope * along, CAMERA_HEIGHT_M, atol=0.35)
+    ahead = front[0].world_from_camera[:2, 2]
+    angle = math.radians(heading_deg)
+    assert abs(ahead @ [math.cos(angle), math.sin(angle)]) > math.cos(math.radians(6))
+    assert path.ground_z_m == pytest.approx(min(0, slope * along.max()), abs=0.6)
+    assert path.note.startswith(NO_CAMERAS) and "straight drive" in path.note
+
+
+def test_a_scene_of_any_extent_gets_a_drive_of_a_kilometre_at_most(ends_soon) -> None:
+    for size in (500.0, 4e3, 1e7):
+        ground = torch.rand(5000, 3, generator=torch.Generator().manual_seed(1))
+        ground = gaussians_at(ground * torch.tensor([size, 0.5 * size, 0.4]))
+        path = make_default_path(replace(ground, scales=ground.scales + size / 500), is_metric=True)
+        positions = np.array([v.world_from_camera[:3, 3] for v in path.views])
+        extent = np.ptp(positions[:, :2], axis=0)
+        assert 300 < np.hypot(*extent) <= 1000.1
+        assert (positions[:, :2] >= 0).all() and (positions[:, :2] <= [size, size / 2]).all()
+
+
+def test_what_floats_far_away_does_not_move_the_drive() -> None:
+    rng = torch.Generator().manual_seed(4)
+    road = street(heading_deg=0)
+    far = 900 + 300 * torch.rand(len(road) // 4, 3, generator=rng)
+    alone = make_default_path(road, is_metric=True)
+    path = make_default_path(gaussians_at(torch.cat([road.means, far])), is_metric=True)
+    for one, other in zip(alone.views, path.views, strict=True):
+        np.testing.assert_array_equal(one.world_from_camera, other.world_from_camera)
+
+
+def test_a_road_above_its_foundations_is_driven_on() -> None:
+    """Layers some decimetres below a road, as foundations and floaters leave them."""
+    road = street(heading_deg=0)
+    rng = torch.Generator().manual_seed(6)
+    low = torch.rand(2000, 3, generator=rng) * torch.tensor([60.0, 8, 0.15])
+    low += torch.tensor([0.0, -4, -0.45])
+    path = make_default_path(gaussians_at(torch.cat([road.means, low])), is_metric=True)
+    eyes = np.stack([view.world_from_camera[:3, 3] for view in path.views])
+    np.testing.assert_allclose(eyes[:, 2], CAMERA_HEIGHT_M, atol=0.05)
+    assert path.ground_z_m == pytest.approx(0, abs=0.05)
+
+
+def test_drive_ends_with_scene_ahead() -> None:
+    gaussians = street(heading_deg=0)
+    path = make_default_path(gaussians, is_metric=True)
+    last = [v for v in path.views if v.camera == "front"][-1].world_from_camera
+    ahead = (gaussians.means[:, :2].numpy() - last[:2, 3]) @ last[:2, 2]
+    assert ahead.max() > 15
+
+
+def test_what_blocks_the_road_is_avoided() -> None:
+    """A truck across two thirds of the road: the line passes on the free side or stops before."""
+    rng = torch.Generator().manual_seed(1)
+    low, high = torch.tensor([25.0, -4.0, 0.0]), torch.tensor([33.0, 1.0, 3.0])
+    truck = low + (high - low) * torch.rand(3000, 3, generator=rng)
+    road = street(heading_deg=0)
+    path = make_default_path(gaussians_at(torch.cat([road.means, truck])), is_metric=True)
+    eyes = np.stack([v.world_from_camera[:3, 3] for v in path.views])
+    inside = (eyes[:, 0] > 25) & (eyes[:, 0] < 33) & (eyes[:, 1] < 1)
+    assert not inside.any()
+
+
+@pytest.mark.parametrize("is_metric", [True, False])
+def test_an_object_is_orbited(is_metric: bool) -> None:
+    rng = torch.Generator().manual_seed(2)
+    ball = torch.nn.functional.normalize(torch.randn(500, 3, generator=rng), dim=1) + 5.0
+    path = make_default_path(gaussians_at(ball), is_metric=is_metric)
+    assert "orbit of 48 frames" in path.note
+    assert ("METRES_PER_UNIT" in path.note) is not is_metric
+    for view in path.views:
+        pose = view.world_from_camera
+        towards = np.array([5.0, 5, 5]) - pose[:3, 3]
+        assert pose[:3, 2] @ towards / np.linalg.norm(towards) > 0.99
+        # All of the unit ball is in view: its angle from the axis is within half the image height.
+        assert math.asin(1 / np.linalg.norm(towards)) < math.atan(view.height / 2 / view.fy)
+
+
+def test_kinds_can_be_insisted_on() -> None:
+    assert "orbit" in make_default_path(street(), is_metric=True, kind="orbit").note
+    assert "orbit" in make_default_path(street(), is_metric=False).note
+    assert "drive" in make_default_path(street(), is_metric=False, kind="drive").note
+
+
+@pytest.mark.parametrize("kind", ["auto", "drive", "orbit"])
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_degenerate_scenes_get_a_path(kind, count: int) -> None:
+    """One Gaussian, or many in one place: no division by their extent."""
+    made = make_default_path(gaussians_at(torch.ones(count, 3)), is_metric=True, kind=kind)
+    assert frames_from_views(made.views, WorldChange())[0] and made.note.startswith(NO_CAMERAS)
+
+
+def test_real_tiles_are_driven(shared_dir: Path) -> None:
+    """30 m tiles of a street, so blurred that nothing is free: a drive nonetheless, inside them."""
+    for tile in sorted((shared_dir / "data" / "splats").glob("*.splat")):
+        gaussians = read_splats(tile).gaussians
+        path = make_default_path(gaussians, is_metric=True)
+        assert "straight drive" in path.note
+        eyes = np.stack([v.world_from_camera[:3, 3] for v in path.views])
+        assert np.ptp(eyes[:, :2], axis=0).max() > 8
+        low, high = np.quantile(gaussians.means.numpy(), [0.005, 0.995], axis=0)
+        assert (eyes > low).all() and (eyes < high).all()
+        above = eyes[:, 2] - ground_grid(solid_points(gaussians), cell=1.0).at(eyes)
+        # Their ground jumps by metres from cell to cell; the path is smoothed, so only on average.
+        assert np.nanmedian(above) == pytest.approx(CAMERA_HEIGHT_M, abs=0.8)

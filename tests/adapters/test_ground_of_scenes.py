@@ -82,6 +82,7 @@ def test_all_sources_agree_on_the_made_up_street(drive: Scene) -> None:
     assert lidar.residual_m is not None and lidar.residual_m < 0.01
 
 
+@pytest.mark.long
 def test_the_real_streets_sources_agree(real: Scene) -> None:
     needs_open3d()
     grounds = by_source(real)

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import builtins
 import copyreg
+import encodings.cp437  # noqa: F401  (zipfile decodes the names of a damaged archive by it)
 import gzip
 import operator
 import os
 import pickle
+import struct
+import subprocess
+import sys
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from pandaset_folder import write_table
 
-from adapters.safe_pickle import read_frame
+from adapters.safe_pickle import read_array_dict, read_frame, stream_arrays
 from augment.errors import AdapterError
+from augment.files.checkpoints import load_checkpoint
+from augment.files.pickles import PickleError
 
 
 class Calls:
@@ -190,3 +199,286 @@ def test_the_real_files_are_what_pandas_reads(shared_dir):
             warnings.simplefilter("ignore")  # pandas' own reader may deprecate what it finds
             expected = pd.read_pickle(path)
         pd.testing.assert_frame_equal(read_frame(path), expected)
+
+
+WATCHED = (
+    "import",
+    "exec",
+    "compile",
+    "open",
+    "ctypes.",
+    "os.",
+    "subprocess.",
+    "socket.",
+    "marshal.",
+)
+MUTATIONS = 60  # of each file
+
+
+class _Watch:
+    """An audit hook cannot be removed: it looks only while a path is set."""
+
+    path: str | None = None
+    seen: str | None = None
+
+    def __call__(self, event: str, arguments: tuple) -> None:
+        if self.path is None or not event.startswith(WATCHED):
+            return
+        if event == "open" and (str(arguments[0]) == self.path or isinstance(arguments[0], int)):
+            return  # the file, or a descriptor that is open already
+        self.seen = f"{event} {arguments!r}"[:300]
+
+
+_watch = _Watch()
+
+
+@contextmanager
+def nothing_runs(path: Path) -> Iterator[None]:
+    """Fails if anything is imported, compiled, executed or opened, but the path itself."""
+    if not hasattr(sys, "_watch_is_installed"):
+        sys.addaudithook(_watch)
+        sys._watch_is_installed = True
+    _watch.path, _watch.seen = str(path), None
+    try:
+        yield
+    finally:
+        _watch.path = None
+    assert _watch.seen is None, _watch.seen
+
+
+# ---- what a file may be made of --------------------------------------------------------------
+
+
+def text(value: str) -> bytes:
+    data = value.encode()
+    return b"X" + struct.pack("<I", len(data)) + data
+
+
+def number(value: int) -> bytes:
+    return b"J" + struct.pack("<i", value)
+
+
+def content(value: bytes) -> bytes:
+    return b"B" + struct.pack("<I", len(value)) + value
+
+
+def name(module: str, attribute: str) -> bytes:
+    return b"c" + module.encode() + b"\n" + attribute.encode() + b"\n"
+
+
+def tuple_of(*items: bytes) -> bytes:
+    return b"(" + b"".join(items) + b"t"
+
+
+def called(function: bytes, *arguments: bytes) -> bytes:
+    return function + tuple_of(*arguments) + b"R"
+
+
+NONE, FALSE, TRUE = b"N", b"\x89", b"\x88"
+DTYPE, NDARRAY = name("numpy", "dtype"), name("numpy", "ndarray")
+CORE = "numpy.core.multiarray"
+
+
+def dtype(
+    code="f8", order="<", sub=NONE, names=NONE, fields=NONE, size=-1, align=-1, flags=0, more=()
+):
+    state = tuple_of(
+        number(3),
+        text(order),
+        sub,
+        names,
+        fields,
+        number(size),
+        number(align),
+        number(flags),
+        *more,
+    )
+    return called(DTYPE, text(code), FALSE, TRUE) + state + b"b"
+
+
+def array(kind=None, shape=None, data=None, target=NDARRAY, order=FALSE, more=()) -> bytes:
+    kind = dtype() if kind is None else kind
+    shape = tuple_of(number(2)) if shape is None else shape
+    data = content(bytes(16)) if data is None else data
+    made = called(name(CORE, "_reconstruct"), target, tuple_of(number(0)), content(b"b"))
+    return made + tuple_of(number(1), shape, kind, order, data, *more) + b"b"
+
+
+def dictionary(value: bytes) -> bytes:
+    """A .npy file of {"a": value}, as `np.save` frames it."""
+    pickled = b"\x80\x02}" + text("a") + value + b"s."
+    header = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + pickled
+
+
+OBJECTS = dtype("O8", order="|", flags=63)
+FIELD = b"}" + text("rc") + tuple_of(dtype("i8"), number(-32)) + b"s"
+HUGE = b"\x8a\x08" + struct.pack("<q", 1 << 60)
+FILLED = tuple_of(number(1), tuple_of(number(2)), dtype(), FALSE, content(bytes(16))) + b"b"
+TITLE = b"}" + text("t") + tuple_of(dtype(), number(0), text("T")) + b"s"
+HOSTILE = {
+    "fields": array(dtype("V8", names=tuple_of(text("rc")), fields=FIELD, size=8)),
+    "fields of a plain code": array(dtype("f8", names=tuple_of(text("rc")), fields=FIELD)),
+    "sub-array": array(dtype("V16", sub=tuple_of(dtype(), tuple_of(number(2))), size=16)),
+    "sub-array of a plain code": array(dtype(sub=tuple_of(dtype(), tuple_of(number(2))))),
+    "titles": array(dtype("f8", fields=TITLE)),
+    "metadata": array(dtype(more=(b"}",))),
+    "objects without their flag": array(dtype("O8", order="|", flags=0), data=content(bytes(16))),
+    "objects of raw bytes": array(OBJECTS, data=content(bytes(16))),
+    "numbers with objects' flag": array(dtype(flags=63)),
+    "size of its own": array(dtype(size=1 << 20)),
+    "alignment of its own": array(dtype(align=4)),
+    "records": array(called(DTYPE, text("f4,f4"), FALSE, TRUE)),
+    "dates": array(dtype("M8")),
+    "texts": array(dtype("U2")),
+    "void": array(dtype("V8", size=8)),
+    "a list as type": array(called(DTYPE, b"]" + text("f8") + b"a", FALSE, TRUE)),
+    "aligned type": array(called(DTYPE, text("f8"), TRUE, TRUE)),
+    "wrong size": array(data=content(bytes(15))),
+    "negative side": array(shape=tuple_of(number(-1), number(-2))),
+    "huge shape": array(shape=tuple_of(HUGE)),
+    "huge empty shape": array(shape=tuple_of(HUGE, HUGE, number(0)), data=content(b"")),
+    "a shape of True": array(shape=tuple_of(TRUE)),
+    "bytes for a list": array(OBJECTS, data=content(b"ab")),
+    "a cell that is a list": array(OBJECTS, data=b"](]]e"),
+    "filled twice": array() + FILLED,
+    "subclass": array(target=name("numpy", "matrix")),
+    "subclass by its module": array(target=name("numpy.core.records", "recarray")),
+    "_reconstruct of dtype": array(target=DTYPE),
+    "memory by ndarray": called(NDARRAY, tuple_of(number(1)), dtype(), content(b"x"), number(8)),
+    "scalar of raw bytes": called(name(CORE, "scalar"), OBJECTS, content(bytes(8))),
+    "scalar of void": called(name(CORE, "scalar"), dtype("V64", size=64), content(bytes(64))),
+    "scalar longer than its bytes": called(name(CORE, "scalar"), dtype(), content(bytes(4))),
+    "state of a name": NDARRAY + b"}" + text("__init__") + number(1) + b"sb",
+    "state of a text": text("x") + b"}b",
+    "state of a list": b"]}b",
+    "state of a tuple": b")}b",
+    "state of a number": number(1) + b"}b",
+    "a call of what was made": array() + b")R",
+    "a call by a list": NDARRAY + b"]R",
+    "a new object by keywords": NDARRAY + b")}\x92",
+    "an instance": b"(inumpy\nndarray\n",
+    "an object": b"(" + NDARRAY + b"o",
+    "an extension": b"\x82\x01",
+    "a long extension": b"\x84\x01\x00\x00\x00",
+    "a persistent id": text("x") + b"Q",
+    "a buffer out of band": b"\x97",
+    "a buffer made read-only": content(b"x") + b"\x98",
+    "what the memo lacks": b"h\x07",
+    "the array itself in its state": array()[:-1] + b"q\x01h\x01b",
+    "a dotted name": b"\x8c\x05numpy\x8c\x10ndarray.__init__\x93",
+    "a name by a number": number(1) + number(2) + b"\x93",
+    "another codec": called(name("_codecs", "encode"), text("x"), text("rot13")),
+    "an endless number": b"\x8b" + struct.pack("<i", 1 << 30),
+    "axes that are not there": called(
+        name("numpy.core.numeric", "_frombuffer"), content(bytes(16)), dtype(),
+        tuple_of(number(2)), text("K"), tuple_of(number(5)),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_what_a_pickle_says_of_arrays_is_believed_in_plain_cases_only(tmp_path, what):
+    path = tmp_path / "a.npy"
+    path.write_bytes(dictionary(array()))
+    assert read_array_dict(path)["a"].tolist() == [0, 0]  # the frame of all the cases is sound
+    path.write_bytes(dictionary(HOSTILE[what]))
+    with nothing_runs(path), pytest.raises(AdapterError, match=r"a\.npy"):
+        read_array_dict(path)
+
+
+def test_a_dictionary_cannot_hold_one_array_twice(tmp_path):
+    (tmp_path / "a.npy").write_bytes(dictionary(array() + b"q\x01s" + text("b") + b"h\x01"))
+    with pytest.raises(AdapterError, match="one array twice"):
+        read_array_dict(tmp_path / "a.npy")
+
+
+def test_the_known_attack_by_numpys_own_constructors_is_refused(tmp_path, shared_dir):
+    tool = shared_dir / "tools" / "hostile-pickle"
+    if not tool.is_file():
+        pytest.skip(f"no {tool}")
+    path, marker = tmp_path / "hostile.pkl.gz", tmp_path / "marker"
+    subprocess.run([sys.executable, str(tool), str(path), str(marker)], check=True)
+    with nothing_runs(path), pytest.raises(AdapterError, match=r"hostile\.pkl\.gz was not read"):
+        read_frame(path)
+    assert not marker.exists()
+
+
+# ---- real files, changed at random -----------------------------------------------------------
+
+
+def pickled_table() -> pd.DataFrame:
+    frame = pd.DataFrame({
+        "x": pd.Series([1.5, -2.0, np.nan]),
+        "d": pd.Series([0, 1, 0]),
+        "label": pd.Series(["Car", None, np.nan], dtype=object),
+        "stationary": pd.Series([True, False, True]),
+    })  # fmt: skip
+    frame.columns = pd.Index(list(frame.columns), dtype=object)
+    return frame
+
+
+def _stream(path: Path) -> None:
+    with open(path, "rb") as file:
+        for _ in stream_arrays(file):
+            pass
+
+
+def _files(folder: Path) -> list[tuple[Path, Callable[[Path], object]]]:
+    for protocol in (2, 3, 4, 5):
+        (folder / f"{protocol}.pkl").write_bytes(pickle.dumps(pickled_table(), protocol))
+    (folder / "table.pkl.gz").write_bytes(gzip.compress(pickle.dumps(pickled_table(), 4), 1))
+    np.save(folder / "a.npy", {"mask": np.eye(3), "value": np.arange(4)})
+    arrays = {n: np.arange(6.0).reshape(2, 3) for n in range(3)}
+    (folder / "stream.pkl").write_bytes(pickle.dumps(arrays, 4))
+    weights = {
+        "w": torch.nn.Parameter(torch.arange(6.0).reshape(2, 3)),
+        "step": 4,
+        "half": torch.ones(2).half(),
+    }
+    torch.save(weights, folder / "new.pth")
+    torch.save(weights, folder / "old.pth", _use_new_zipfile_serialization=False)
+    readers = {
+        ".pkl": read_frame,
+        ".gz": read_frame,
+        ".npy": read_array_dict,
+        ".pth": load_checkpoint,
+    }
+    return [
+        (path, _stream if path.name == "stream.pkl" else readers[path.suffix])
+        for path in sorted(folder.iterdir())
+    ]
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """Bytes changed, cut out, doubled, or moved."""
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        at, other = rng.integers(0, len(changed), 2)
+        length = int(rng.integers(1, 24))
+        match rng.integers(0, 5):
+            case 0:
+                changed[at] = rng.integers(0, 256)
+            case 1:
+                changed[at] ^= 1 << rng.integers(0, 8)
+            case 2:
+                del changed[at : at + length]
+            case 3:
+                changed[at:at] = changed[other : other + length]
+            case _:
+                changed[at : at + length] = changed[other : other + length]
+        changed = changed or bytearray(b"x")
+    return bytes(changed)
+
+
+def test_files_changed_at_random_run_nothing_and_give_our_errors(tmp_path):
+    rng = np.random.default_rng(11)
+    (tmp_path / "whole").mkdir()
+    for whole, read in _files(tmp_path / "whole"):
+        read(whole)  # whatever is imported at first use
+        data = whole.read_bytes()
+        path = tmp_path / whole.name
+        for _ in range(MUTATIONS):
+            path.write_bytes(mutated(data, rng))
+            with nothing_runs(path), suppress(AdapterError, PickleError):
+                read(path)

@@ -235,7 +235,7 @@ def images_of(view: WeatheredView) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     "name",
     [
-        "layered smog on buffers, early stop",
+        pytest.param("layered smog on buffers, early stop", marks=pytest.mark.long),
         pytest.param("smog, style on the picture", marks=pytest.mark.long),
         pytest.param("snow, bare images", marks=pytest.mark.long),
     ],

@@ -247,6 +247,7 @@ def test_bits_do_not_depend_on_the_buffers_asked_for(blended, buffer):
 # ---- the whole rasteriser ----------------------------------------------------------------------
 
 
+@LONG
 def test_a_stored_render(shared_dir):
     check_stored_render(shared_dir, "opaque", "a99_aa")
 

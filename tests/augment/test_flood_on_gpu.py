@@ -147,6 +147,7 @@ def test_water_that_something_hides_is_not_shaded(monkeypatch):
         assert flooded("cuda", camera(), water, None, deferred=False, hidden_by=wall).is_hidden
 
 
+@pytest.mark.long
 def test_a_small_flooded_view_from_its_splats_on(monkeypatch):
     view, water = camera(17, 11, roll=0.0), medium("sky", "still")
     few = parts()[0].gaussians.select(torch.arange(6, 14))

@@ -48,7 +48,9 @@ def test_weathered_frames_do_not_depend_on_order_and_threads(effect):
     np.testing.assert_equal(dict(shuffled.masks), dict(first.masks))
 
 
-@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
+@pytest.mark.parametrize(
+    "shading", ["per_splat", pytest.param("per_pixel", marks=pytest.mark.long)]
+)
 def test_frames_in_all_weathers_do_not_depend_on_threads(shading):
     """Of a street: snow is made anew, in waves of wind, styled, close to the eye and glinting."""
     data = {

@@ -1,10 +1,28 @@
+"""Scores of pictures and depths, and whether views agree with each other, what moves included."""
+
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
+from scenes import camera_ahead
 from scipy import ndimage
+from walls import BOARD_SIZE_M, FRAME_NS, board_boxes, board_centre, driving_camera, wall_view
 
+from augment.jobs.tables import FrameBoxes
+from augment.labels import Boxes
+from augment.metrics.consistency import (
+    MAX_GAP_NS,
+    STILL_M,
+    ActorPaths,
+    DepthView,
+    carry,
+    consistency_of,
+    find_warp,
+    warp_view,
+    warped_consistency,
+)
 from augment.metrics.image import (
     PIXELS_PER_DEGREE,
     DepthErrors,
@@ -220,3 +238,210 @@ def test_ssim_is_the_one_that_reconstruction_learns_with():
     a, b = pictures(17, 40)
     learnt = ssim_map(torch.from_numpy(a), torch.from_numpy(b))
     assert ssim(a, b) == pytest.approx(float(learnt.mean()), abs=1e-11)  # both float64
+
+
+WALL_M = 8.0
+
+
+def wall_color(y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Linear in the plane: bilinear interpolation of it has no error."""
+    return np.stack([0.5 + 0.05 * y, 0.5 - 0.04 * z, 0.4 + 0.03 * (y + z)], -1)
+
+
+def view_of_wall(camera, *, wall_m: float = WALL_M, shift: float = 0.0) -> DepthView:
+    """The plane x = wall_m seen from anywhere before it, its colours raised by `shift`."""
+    rays = camera.ray_directions(torch.float64).numpy()
+    centre = camera.centre.numpy()
+    depth = (wall_m - centre[0]) / rays[..., 0]  # rays have unit depth
+    hit = centre + depth[..., None] * rays
+    return DepthView(
+        camera, wall_color(hit[..., 1], hit[..., 2]) + shift, depth, np.ones_like(depth)
+    )
+
+
+def moved(**kwargs):
+    return camera_ahead(61, 41, 50.0, **kwargs)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.1, -0.2])
+@pytest.mark.parametrize("position", [(0, 0, 0), (0.3, 0.5, -0.2), (-1, -0.7, 0.3)])
+def test_a_wall_agrees_with_itself(yaw, position):
+    a, b = view_of_wall(moved()), view_of_wall(moved(position=position, yaw=yaw))
+    found = warped_consistency(a, b)
+    # Perspective bends the linear colours within a pixel where the wall is seen at an angle.
+    assert found.rmse < (1e-12 if yaw == 0 else 2e-5)
+    assert found.share > 0.5
+
+
+def test_an_offset_is_the_error():
+    a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.4, 0)), shift=0.07)
+    found = warped_consistency(a, b)
+    assert found.rmse == pytest.approx(0.07, rel=1e-9)
+    assert found.relative == pytest.approx(0.07 / found.spread, rel=1e-9)
+
+
+def test_the_share_is_the_overlap():
+    """A camera moved sideways by whole pixels loses as many columns, and one for its bilinear."""
+    camera = moved()
+    step = WALL_M / camera.fx  # of a pixel, metres
+    b = view_of_wall(moved(position=(0, -7.25 * step, 0)))
+    _, counts = warp_view(view_of_wall(camera), b)
+    assert counts.any(1)[:-1].all()
+    columns = counts[:-1].all(0)
+    # Pixel c of A lies at c - 7.25 of B: from 8 on; the last row and column have no neighbour.
+    assert not columns[:8].any() and columns[8:].all()
+
+
+def test_linear_maps_scale_the_error_and_not_the_relative_one():
+    a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.4, 0)), shift=0.02)
+    one = warped_consistency(a, b)
+    paler = [dataclasses.replace(v, picture=0.3 + 0.5 * v.picture) for v in (a, b)]
+    other = warped_consistency(*paler)
+    assert other.rmse == pytest.approx(one.rmse / 2, rel=1e-9)
+    assert other.relative == pytest.approx(one.relative, rel=1e-9)
+
+
+def test_what_is_hidden_does_not_count():
+    """A board before the wall hides a part of it from B only."""
+    a = view_of_wall(moved())
+    b = view_of_wall(moved(position=(0, 0.5, 0)))
+    board = slice(10, 30), slice(20, 40)
+    b.depth_m[board] = 3.0
+    b.picture[board] = 0.9
+    warped, counts = warp_view(a, b)
+    found = warped_consistency(a, b)
+    free = warped_consistency(a, view_of_wall(b.camera))
+    assert found.rmse < 1e-12
+    assert found.share == pytest.approx(
+        free.share - 21 * 21 / counts.size, abs=2 * 21 / counts.size
+    )
+    assert (warped[~counts] == 0).all()
+
+
+def test_a_board_in_a_does_not_count_where_b_sees_past_it():
+    a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.5, 0)))
+    a.depth_m[5:15, 5:25] = 3.0
+    a.picture[5:15, 5:25] = 0.0
+    _, counts = warp_view(a, b)
+    assert not counts[5:15, 5:25].any()
+    assert warped_consistency(a, b).rmse < 1e-12
+
+
+@pytest.mark.parametrize("side", ["a", "b"])
+def test_the_sky_does_not_count(side):
+    views = {"a": view_of_wall(moved()), "b": view_of_wall(moved(position=(0, 0.1, 0)))}
+    views[side].alpha[:20] = 0.5
+    views[side].picture[:20] = 1.0
+    found = warped_consistency(views["a"], views["b"])
+    assert found.rmse < 1e-12 and 0.2 < found.share < 0.55
+
+
+def test_nothing_in_common_gives_nan():
+    a, b = view_of_wall(moved()), view_of_wall(moved())
+    b = dataclasses.replace(b, camera=moved(yaw=math.pi))
+    found = warped_consistency(a, b)
+    assert found.share == 0 and math.isnan(found.rmse) and math.isnan(found.relative)
+    b.depth_m[:] = math.nan
+    assert warped_consistency(b, a).share == 0
+
+
+def test_sizes_must_fit():
+    view = view_of_wall(moved())
+    with pytest.raises(ValueError, match=r"alpha must be floats \[41, 61\].*\[61, 41\]"):
+        dataclasses.replace(view, alpha=view.alpha.T)
+
+
+FRAMES = 9
+
+
+def compared(paths, a, b, **kwargs):
+    """(consistency over the pixels that moved, over all, what moved and counts)."""
+    carried = carry(paths, a, b, **kwargs)
+    clear = dataclasses.replace(b, alpha=np.where(carried.unclear_b, 0.0, b.alpha))
+    warp = find_warp(a, clear, carried.points_m)
+    warped = warp.sample(b.picture)
+    moved = warp.counts & carried.moved
+    return consistency_of(a, warped, moved), consistency_of(a, warped, warp.counts), moved
+
+
+@pytest.mark.parametrize("apart", [1, 7])
+def test_a_board_goes_along_with_its_box(apart):
+    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(apart))
+    moving, whole, moved = compared(ActorPaths(board_boxes(FRAMES)), a, b)
+    on_board = a.depth_m < 7
+    assert moved.sum() > 0.5 * on_board.sum() and not (moved & ~on_board).any()
+    assert moving.rmse < 1e-6 and whole.rmse < 1e-6
+    # As if it stood the board agrees in depth, and its paint does not.
+    standing = find_warp(a, b)
+    apart_m = apart * FRAME_NS * 1e-9 * 2.0
+    wrong = consistency_of(a, standing.sample(b.picture), standing.counts & on_board)
+    assert wrong.rmse == pytest.approx(0.2 * apart_m * np.sqrt(2 / 3), rel=0.05)
+
+
+def test_the_surroundings_of_a_moving_board_do_not_count():
+    """Half a metre around it, in both pictures: shadows and what reaches beyond the label."""
+    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(1))
+    for view in (a, b):  # a floor under the board, painted as its shadow
+        gap = np.abs(view.depth_m - 6.2) < 1
+        below = np.zeros_like(gap)
+        below[1:] = gap[:-1] & ~gap[1:]
+        view.depth_m[below] = 6.2
+        view.picture[below] = 0.0
+    carried = carry(ActorPaths(board_boxes(FRAMES)), a, b)
+    shadow = (a.picture == 0).all(-1)
+    assert shadow.any() and np.isnan(carried.points_m[shadow]).all()
+    assert carried.unclear_b[(b.picture == 0).all(-1)].all()
+
+
+def test_poses_are_interpolated_between_labels():
+    paths = ActorPaths(board_boxes(FRAMES))
+    pose = paths.at(FRAME_NS * 5 // 2)["board"]
+    assert pose.known
+    assert np.allclose(pose.world_from_box[:3, 3], board_centre(FRAME_NS * 5 // 2), atol=1e-9)
+    assert np.allclose(pose.size_m, BOARD_SIZE_M)
+
+
+def test_what_moves_and_whose_pose_is_not_known_does_not_count():
+    """The second picture is taken half a frame after the last label."""
+    late = dataclasses.replace(driving_camera(2), timestamp_ns=2 * FRAME_NS + FRAME_NS // 2)
+    a, b = wall_view(driving_camera(1)), wall_view(late)
+    carried = carry(ActorPaths(board_boxes(3)), a, b)
+    on_board = a.depth_m < 7
+    assert not carried.moved.any() and np.isnan(carried.points_m[on_board]).all()
+    assert np.isfinite(carried.points_m[:, :5]).all()
+
+
+def test_a_box_that_stands_is_the_worlds():
+    frames = {n: dataclasses.replace(f, timestamp_ns=n) for n, f in board_boxes(2).items()}
+    for frame in frames.values():
+        frame.boxes.centers_m[0] = board_centre(0)
+    frames[1].boxes.centers_m[0, 1] += 0.9 * STILL_M  # a label that trembles
+    frames = {n: FrameBoxes(n * FRAME_NS, f.boxes) for n, f in frames.items()}
+    a = wall_view(driving_camera(0))
+    b = wall_view(dataclasses.replace(driving_camera(1), timestamp_ns=0))
+    b = dataclasses.replace(b, camera=driving_camera(1))
+    carried = carry(ActorPaths(frames), a, b)
+    assert not carried.moved.any() and not carried.unclear_b.any()
+    assert np.isfinite(carried.points_m).all()
+    after = dataclasses.replace(b, camera=dataclasses.replace(b.camera, timestamp_ns=2 * FRAME_NS))
+    assert np.isfinite(carry(ActorPaths(frames), a, after).points_m).all()
+
+
+def test_actors_outside_of_every_box_do_not_count():
+    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(1))
+    bonnet = np.zeros(a.depth_m.shape, bool)
+    bonnet[-4:] = True
+    is_actor = bonnet | (a.depth_m < 7)
+    carried = carry(ActorPaths(board_boxes(FRAMES)), a, b, is_actor)
+    assert np.isnan(carried.points_m[bonnet]).all() and carried.moved.any()
+
+
+def test_labels_without_numbers_or_far_in_time_are_no_boxes():
+    frames = board_boxes(1)
+    broken = Boxes(("x",), ("Car",), np.full((1, 3), np.nan), np.ones((1, 3)), np.ones((1, 4)))
+    frames[1] = FrameBoxes(FRAME_NS, broken)
+    paths = ActorPaths(frames)
+    assert set(paths.at(0)) == {"board"}
+    assert paths.at(MAX_GAP_NS)["board"].known is False
+    assert paths.at(MAX_GAP_NS + 1) == {}
+    assert ActorPaths({}).at(0) == {}

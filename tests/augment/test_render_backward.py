@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, RGB
+from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, OVERLAY, RGB
 from augment.render.composite import composite_sky, map_colors
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.fog import Fog
@@ -497,7 +497,7 @@ LIGHT = SplatShading(torch.ones(60, 3), (0.0, 0.0, 1.0), 0.5)
         ({}, {"buffers": [RGB, "median_depth", "splat_ids"]}, "of median_depth, splat_ids are"),
         ({}, {"clip": HeightClip(0.0, "above")}, "gradients of a clip"),
         ({}, {"camera": TOP}, "gradients of an orthographic camera"),
-        ({"shading": LIGHT}, {}, "light per pixel"),
+        ({"shading": LIGHT}, {"buffers": [RGB, ALPHA, OVERLAY]}, "light per pixel"),
         ({"color_maps": torch.eye(3, 4)[None] * 0.9}, {}, "gradients through colour maps"),
     ],
     ids=["fog", "median depth and splat ids", "clip", "orthographic", "light", "colour maps"],

@@ -33,7 +33,6 @@ from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, PosedGaussians, Track
 from augment.semantics import SemanticClass
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
@@ -167,18 +166,6 @@ def test_the_side_towards_the_sun_is_brighter_than_the_other():
     relief, reverse = (lit - flat).numpy(), (back - flat).numpy()
     assert float(lit.std()) > 1.2 * float(flat.std())
     assert np.abs(relief + reverse).max() < 1e-5
-
-
-def test_the_same_bits_on_any_number_of_threads():
-    snow, view = sheet(), camera()
-    many = split_near(snow, None, view, SUN, GRAIN).fine
-    try:
-        limit_threads(1)
-        one = split_near(snow, None, view, SUN, GRAIN).fine
-    finally:
-        limit_threads(None)
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(many, name), getattr(one, name))
 
 
 # ---- Against definitions, and on a GPU -----------------------------------------------------------

@@ -1,12 +1,18 @@
 """Folding a style into SH and sky: against the definition, the algebra, and to the bit."""
 
 import dataclasses
+import pickle
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
+from augment.dataset import SceneDataset
+from augment.effects.snow.effect import snow_layers_of
+from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import (
     CLASSES,
     StyleMaps,
@@ -16,14 +22,23 @@ from augment.effects.style.color_maps import (
     style_sky,
     styled_scene,
 )
+from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
+from augment.memo import memo_of
+from augment.plan import make_plan
 from augment.render.composite import composite_sky, map_colors
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
-from augment.render.threads import limit_threads
-from augment.scene import Actor, ColorWaves, PosedGaussians, Track
+from augment.scene import Actor, ColorWaves, PosedGaussians, Scene, Track
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
+from augment.views import render_buffers, render_view
+from recipes.flood import Flood, Waves
+from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.snow import Snow
+from recipes.style import Style
 from tests.augment.pretend_gpu import pretended_gpu
+from tests.snow_scenes import box_car, drive, sheet, side_wall
 
 IDENTITY_MAPS = StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
 
@@ -128,16 +143,6 @@ def test_into_given_memory():
         assert torch.equal(out, expected)
     styled = style_gaussians(gaussians, maps, out=gaussians.sh)
     assert styled.sh is gaussians.sh and torch.equal(gaussians.sh, expected)
-
-
-def test_bits_do_not_depend_on_threads():
-    gaussians, maps = with_classes(9000, 3), maps_by_class()
-    expected = style_gaussians(gaussians, maps).sh
-    try:
-        limit_threads(1)
-        assert torch.equal(style_gaussians(gaussians, maps).sh, expected)
-    finally:
-        limit_threads(None)
 
 
 def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(monkeypatch):
@@ -297,3 +302,261 @@ def test_colours_that_change_over_time_are_mapped_at_all_times():
             expected = style_gaussians(actor.gaussians_at(timestamp_ns), maps).sh
             got = styled.gaussians_at(timestamp_ns).sh
             torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+
+
+ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
+STYLE = Style(preset="dusk")
+STILL = Waves(preset="still")
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A road, a wall beside it, and a car."""
+    ground = sheet((-2.0, 24.0), (-4.0, 4.0), semantic=ROAD)
+    wall = side_wall(4.0, (2.0, 24.0), (0.0, 1.0))
+    wall = dataclasses.replace(wall, semantic=torch.full((len(wall),), BUILDING, dtype=torch.int16))
+    car = box_car(start=(8.0, -2.0), moved_m=3.0, size=(3.0, 1.8, 1.0), semantic=CAR)
+    return drive(ground, wall, actors=[car])
+
+
+def gentle(seed: int, spread: float = 0.3) -> torch.Tensor:
+    """A map that takes no colour of the scene out of [0, 1]."""
+    rng = torch.Generator().manual_seed(seed)
+    return (
+        torch.eye(3, 4) * 0.6 + 0.1 * torch.eye(3, 4) + spread * torch.rand(3, 4, generator=rng) / 4
+    )
+
+
+def known_maps(scene: Scene, style: Style = STYLE) -> StyleMaps:
+    """Maps that the scene takes for its style's from now on."""
+    maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
+    memo_of(scene).put(("style maps", style), maps, shared=True)
+    return maps
+
+
+def camera_of(scene: Scene, frame: int = 0):
+    return scene.frames[frame].cameras["ahead"]
+
+
+def recipe_of(style: Style | None = STYLE, *, classes: bool = True, **weather) -> Recipe:
+    output = Output(semantic=classes, instance=classes)
+    return Recipe(style=style, weather=Weather(**weather), output=output)
+
+
+def buffers_of(scene: Scene, recipe: Recipe, backend: str = "auto"):
+    return render_buffers(scene, camera_of(scene), make_plan(recipe, scene), backend=backend)
+
+
+def mapped(rgb: torch.Tensor, color_map: torch.Tensor) -> torch.Tensor:
+    return rgb @ color_map[:, :3].T + color_map[:, 3]
+
+
+def ran(scene: Scene, recipe: Recipe) -> dict[str, bool]:
+    return {step.name: step.runs for step in make_plan(recipe, scene).steps}
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_splats_and_sky_are_mapped_each_by_its_own(scene, backend):
+    maps = known_maps(scene)
+    clean = buffers_of(scene, recipe_of(None), backend)
+    styled = buffers_of(scene, recipe_of(), backend)
+    alpha = clean.raster.alpha[..., None]
+    splats, sky = clean.raster.rgb, scene.sky.rgb
+    expected = splats @ maps.splats[0, :, :3].T + alpha * maps.splats[0, :, 3]
+    expected = expected + (1 - alpha) * mapped(sky, maps.sky)
+    torch.testing.assert_close(styled.rgb, expected, rtol=0, atol=2e-5)
+    assert (styled.rgb - clean.rgb).abs().max() > 0.1
+
+
+def test_every_class_takes_its_map(scene):
+    splats = torch.eye(3, 4).repeat(CLASSES, 1, 1)
+    splats[CAR] = gentle(5)
+    maps = StyleMaps(splats, torch.eye(3, 4), gentle(3))
+    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
+    clean = render_view(scene, camera_of(scene), recipe_of(None))
+    styled = render_view(scene, camera_of(scene), recipe_of())
+    changed = (styled.rgb.astype(int) != clean.rgb).any(-1)
+    sure = clean.semantic == CAR
+    assert changed[sure].mean() > 0.95
+    reach = cv2.dilate(sure.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+    assert not changed[~reach].any()
+
+
+def test_only_colours_change(scene):
+    known_maps(scene)
+    clean, styled = (render_view(scene, camera_of(scene), recipe_of(s)) for s in (None, STYLE))
+    for name in ("depth_m", "semantic", "instance"):
+        assert np.array_equal(getattr(clean, name), getattr(styled, name))
+
+
+@pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1)}])
+def test_no_strength_is_no_style_to_the_bit(scene, weather):
+    none = Style(preset="dusk", strength=0)
+    plan = make_plan(recipe_of(none, **weather), scene)
+    assert plan.placed["style"].data is None
+    assert not any(runs for name, runs in ran(scene, recipe_of(none)).items() if "style" in name)
+    clean, same = (render_view(scene, camera_of(scene), recipe_of(s, **weather))
+                   for s in (None, none))  # fmt: skip
+    assert np.array_equal(clean.rgb, same.rgb)
+
+
+def test_a_picture_is_mapped_with_its_weather(scene):
+    style = Style(preset="dusk", applied_to="picture")
+    maps = known_maps(scene, style)
+    weather = {"smog": Smog(visibility_m=50)}
+    clean = buffers_of(scene, recipe_of(None, **weather))
+    styled = buffers_of(scene, recipe_of(style, **weather))
+    torch.testing.assert_close(styled.rgb, mapped(clean.rgb, maps.picture), rtol=0, atol=1e-5)
+    steps = ran(scene, recipe_of(style))
+    assert steps["style on the picture"] and not steps["style on the scene"]
+
+
+def test_smog_keeps_its_colour(scene):
+    known_maps(scene)
+    dense = {"smog": Smog(extinction_per_m=50, color=(0.3, 0.5, 0.7))}
+    view = render_view(scene, camera_of(scene), recipe_of(**dense))
+    assert (np.abs(view.rgb.astype(int) - np.array([77, 128, 179])) <= 1).all()
+
+
+def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
+    maps = known_maps(scene)
+    recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
+    plan = make_plan(recipe, scene)
+    look = scene_style_of(scene, STYLE)
+    snow = plan.placed["snow"].data
+    styled, plain = (snow_layers_of(scene, snow, light) for light in (look.lighting_scene, None))
+    parts = look.on(styled.parts_for(scene, camera_of(scene)))
+    assert any(part.is_overlay for part in parts)
+    assert all((part.color_maps is None) == part.is_overlay for part in parts)
+    # Its light is read from the mapped ground and sky, and differs from the bare scene's.
+    mean = {name: cover.ground.gaussians.sh.mean((0, 1))
+            for name, cover in (("styled", styled), ("plain", plain))}  # fmt: skip
+    assert (mean["styled"] - mean["plain"]).abs().max() > 0.02
+    ground = scene.background.sh[0, 0] * 0.28209479 + 0.5
+    seen = look.lighting_scene.background.sh[0, 0] * 0.28209479 + 0.5
+    torch.testing.assert_close(seen, mapped(ground, maps.splats[0]), rtol=0, atol=1e-5)
+    assert torch.equal(styled.ground.gaussians.means, plain.ground.gaussians.means)
+    drawn = rasterize([p for p in parts if p.is_overlay], camera_of(scene))
+    view = render_buffers(scene, camera_of(scene), plan)
+    covered = view.raster.overlay > 0.995
+    assert covered.sum() > 500
+    torch.testing.assert_close(view.rgb[covered], drawn.rgb[covered], rtol=0, atol=0.02)
+
+
+def test_covers_of_two_styles_are_kept_beside_each_other(scene):
+    other = Style(preset="dusk", strength=0.5)
+    for style in (STYLE, other):
+        known_maps(scene, style)
+    placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).placed["snow"].data
+    first = snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene)
+    second = snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene)
+    assert first is not second
+    assert snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene) is first
+    assert snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene) is second
+
+
+def test_water_mirrors_the_styled_sky(scene):
+    unchanged = torch.eye(3, 4)[None]
+    maps = StyleMaps(
+        unchanged, torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]]), gentle(3)
+    )
+    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
+    deep = {"flood": Flood(level_m=0.5, reference="absolute", waves=STILL, reflection="sky",
+                           turbidity_ntu=1000)}  # fmt: skip
+    clean, styled = (
+        render_view(scene, camera_of(scene), recipe_of(s, classes=False, **deep))
+        for s in (None, STYLE)
+    )
+    far = (clean.masks["water"] == 255) & (np.arange(90)[:, None] < 55)
+    assert far.sum() > 100
+    redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
+    assert redder[0] > 5 and redder[2] < -5
+
+
+def with_directions(scene: Scene, spread: float) -> Scene:
+    """The scene with a background of degree 1 whose colours change with the direction."""
+    first = scene.background.sh
+    rng = torch.Generator().manual_seed(7)
+    more = spread * (torch.rand(len(first), 3, 3, generator=rng) - 0.5)
+    background = dataclasses.replace(scene.background, sh=torch.cat([first, more], 1))
+    return dataclasses.replace(scene, background=background)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1, coverage=0.3)}])
+def test_folded_maps_draw_the_same_where_no_colour_is_clamped(scene, weather, backend):
+    scene = with_directions(scene, 0.1)
+    folding = Style(preset="dusk", evaluated="sh")
+    for style in (STYLE, folding):
+        known_maps(scene, style)
+    by_color, by_sh = (
+        buffers_of(scene, recipe_of(style, **weather), backend) for style in (STYLE, folding)
+    )
+    # 1e-5: sums of 4 terms in float32, folded or not, blended.
+    torch.testing.assert_close(by_sh.rgb, by_color.rgb, rtol=0, atol=1e-5)
+    ground = by_sh.parts[0]
+    assert ground.color_maps is None and by_color.parts[0].color_maps is not None
+    again = buffers_of(scene, recipe_of(folding, **weather), backend)
+    assert again.parts[0].gaussians.sh is ground.gaussians.sh  # once for all frames
+    assert torch.equal(ground.gaussians.means, scene.background.means)
+    assert not torch.equal(ground.gaussians.sh, scene.background.sh)
+    assert by_sh.parts[1].color_maps is not None  # of an actor
+
+
+def test_folded_maps_know_the_splats_that_paint_sky(scene):
+    levels = torch.zeros(len(scene.background), dtype=torch.int16)
+    levels[::3] = 5
+    maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
+    by_color, by_sh = (
+        SceneStyle(maps, scene.sky, scene, levels, folds=folds).on(
+            scene.parts_for(camera_of(scene))
+        )
+        for folds in (False, True)
+    )
+    images = [rasterize(parts, camera_of(scene)).rgb for parts in (by_color, by_sh)]
+    torch.testing.assert_close(*images, rtol=0, atol=1e-5)
+
+
+def test_a_view_drawn_on_the_gpu_gets_sh_that_are_folded_there(scene, monkeypatch):
+    parts = scene.parts_for(camera_of(scene))
+    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
+    expected = look.on(parts, backend="cpu")[0].gaussians.sh
+    with pretended_gpu(monkeypatch):
+        folded = look.on(parts, backend="cuda")[0].gaussians
+        assert folded.sh.device == gpu.gpu_device() and folded.means is parts[0].gaussians.means
+        torch.testing.assert_close(folded.sh.cpu(), expected, rtol=0, atol=1e-6)
+        assert look.on(parts, backend="cuda")[0].gaussians.sh is folded.sh  # once for all frames
+
+
+def test_a_background_of_other_splats_is_mapped_by_colour(scene):
+    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
+    some = scene.background.select(torch.arange(10))
+    [part] = look.on([PosedGaussians(some)])
+    assert part.color_maps is not None and part.gaussians is some
+
+
+def test_a_preset_darkens_the_day(scene):
+    bright = dataclasses.replace(scene)
+    clean = render_view(bright, camera_of(bright), recipe_of(None)).rgb.mean()
+    night = render_view(bright, camera_of(bright), recipe_of(Style(preset="night"))).rgb.mean()
+    assert night < 0.75 * clean
+
+
+def test_a_plan_says_what_a_style_takes(scene):
+    plan = make_plan(recipe_of(Style(preset="dusk", strength=0.5, per_region=True)), scene)
+    [step] = [s for s in plan.steps if s.name == "style on the scene"]
+    assert step.runs and "dusk" in step.why and "0.5" in step.why and "region" in step.why
+    bare = make_plan(recipe_of(None), scene)
+    assert plan.buffers == bare.buffers  # no pass of its own
+
+
+def test_samples_take_their_maps_along_to_other_processes(scene, monkeypatch):
+    live = SceneDataset(scene, recipe_of())
+    expected = live[0]["image"]
+    found = style_maps(scene, STYLE)
+    copy = pickle.dumps(live)
+    monkeypatch.setattr(scene_maps, "_find_maps", lambda *_: pytest.fail("looked for again"))
+    other = pickle.loads(copy)
+    assert other.scene is not scene
+    assert torch.equal(style_maps(other.scene, STYLE).splats, found.splats)
+    assert torch.equal(other[0]["image"], expected)

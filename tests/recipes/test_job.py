@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from recipes.errors import RecipeError
 from recipes.job import MAX_BYTES, Job, load_job, load_job_recipes, parse_job, seed_for_scene
+from recipes.schema import parse_frames
 
 WHOLE = """\
 name: winter
@@ -148,3 +149,46 @@ def test_scenes_have_seeds_of_their_own() -> None:
     seeds = {seed_for_scene(seed, name) for seed in range(50) for name in "abcd"}
     assert len(seeds) == 200 and all(0 <= seed < 2**63 for seed in seeds)
     assert seed_for_scene(5, "street") == seed_for_scene(5, "street")
+
+
+TEN = range(10)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("all", None),
+        (" all ", None),
+        ("4", (4,)),
+        ("5,0,9", (5, 0, 9)),
+        ("0:6:2", (0, 2, 4)),
+        ("::4", (0, 4, 8)),
+        ("7:", (7, 8, 9)),
+        (":2, 1:3", (0, 1, 2)),
+        ("8:12", (8, 9, 10, 11)),
+        ("12", (12,)),
+    ],
+)
+def test_patterns(text: str, wanted: tuple[int, ...] | None) -> None:
+    assert parse_frames(text).select(TEN) == wanted
+
+
+@pytest.mark.parametrize("text", ["", " ", ",", "1,", "-1", "a", "1:2:0", "3:3", "5:2", "1:2:3:4",
+                                  "1.5", "0x2", "1 2", "::-1", "all,1"])  # fmt: skip
+def test_what_is_no_pattern(text: str) -> None:
+    with pytest.raises(ValueError, match="is not understood; write all, 4, 0,5,9"):
+        parse_frames(text)
+
+
+def test_ranges_that_are_clipped_and_numbers_that_are_not() -> None:
+    pattern = parse_frames("0:100:30,64")
+    assert pattern.select([0, 30, 31, 33]) == (0, 30, 60, 90, 64)
+    assert pattern.select([0, 30, 31, 33], clip=True) == (0, 30, 64)
+    assert parse_frames("0:5").select([], clip=True) == ()
+
+
+@given(st.sets(st.integers(0, 40)), st.integers(0, 40), st.integers(1, 40), st.integers(1, 7))
+def test_a_range_is_pythons(numbers: set[int], start: int, length: int, step: int) -> None:
+    stop = start + length
+    found = parse_frames(f"{start}:{stop}:{step}").select(sorted(numbers), clip=True)
+    assert found == tuple(n for n in range(start, stop, step) if n in numbers)

@@ -1,0 +1,620 @@
+"""Weathered sweeps: what stays to the bit, codes, jobs; echoes of smog, snow and water."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from augment.cameras import Camera
+from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water, water_reflectance
+from augment.effects.flood.waves import make_waves
+from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar.beam import LidarModel, origins_of
+from augment.effects.lidar.sweep import weathered_sweep
+from augment.effects.smog import scatter_before, soft_echo, soft_response, wavelength_factor
+from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.effect import snow_layers_of
+from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
+from augment.effects.snow.snow import PlacedSnow, placement_settings
+from augment.errors import OutputError
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import lidar_bytes, read_lidar
+from augment.labels import LidarSweep
+from augment.memo import memo_of
+from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.scene import Scene
+from augment.views import WeatheredView, render_view
+from recipes.flood import Flood, Waves
+from recipes.schema import Recipe, Smog, Weather
+from recipes.smog import KOSCHMIEDER
+from recipes.snow import Snow
+from tests.lidar_sweeps import (
+    SENSOR_M,
+    WORLD_ORIGIN_M,
+    SensorLabels,
+    beams,
+    ground_points,
+    ranges_of,
+    recipe,
+    some_points,
+    street,
+    sweep_of,
+)
+from tests.snow_beds import cells_on_grid
+from tests.snow_scenes import box_car
+from tests.streets import LABELLED_STREET, open_street
+
+ADDED = {"source_index", "weather_code"}
+
+
+@pytest.mark.parametrize(
+    "weather",
+    [
+        {},
+        {"smog": Smog(extinction_per_m=0.0)},
+        {"snow": Snow(depth_m=0.0)},
+        {"snow": Snow(depth_m=0.3, coverage=0.0)},
+        {"flood": Flood(level_m=-50.0, reference="absolute")},
+    ],
+)
+def test_no_weather_is_the_source_to_the_bit(weather: dict) -> None:
+    sweep = sweep_of(
+        some_points(100),
+        intensity=np.linspace(0, 1, 100),
+        ring=np.arange(100, dtype=np.uint8),
+        note=np.array(["a", "b"] * 50, object),
+    )
+    out = weathered_sweep(street(), recipe(**weather), 0, sweep)
+    assert list(out.columns) == [*sweep.columns, "source_index", "weather_code"]
+    assert not out.columns["weather_code"].any()
+    plain = LidarSweep({k: v for k, v in out.columns.items() if k not in ADDED})
+    assert lidar_bytes(plain) == lidar_bytes(sweep)
+
+
+def test_every_row_keeps_its_place() -> None:
+    points = some_points(500)
+    sweep = sweep_of(points, ring=np.arange(500, dtype=np.uint16))
+    out = weathered_sweep(street(), recipe(smog=60, flood=0.1), 0, sweep)
+    assert out.columns["source_index"].dtype == np.int32
+    assert out.columns["weather_code"].dtype == np.uint8
+    np.testing.assert_array_equal(out.columns["source_index"], np.arange(500))
+    np.testing.assert_array_equal(out.columns["ring"], sweep.columns["ring"])
+    assert {k: v.dtype for k, v in sweep.columns.items()} == {
+        k: v.dtype for k, v in out.columns.items() if k not in ADDED
+    }
+    code = out.columns["weather_code"]
+    same = (out.points_m == sweep.points_m).all(1)
+    assert not same[np.isin(code, [SCATTERED, LOST, MOVED])].any()
+    assert same[~np.isin(code, [SCATTERED, LOST, MOVED])].all()
+    kept = drop_lost(out)
+    assert len(kept) == (code != LOST).sum() < 500
+    assert np.isfinite(kept.points_m).all()
+    np.testing.assert_array_equal(kept.columns["ring"], kept.columns["source_index"])
+    assert drop_lost(sweep) is sweep
+
+
+def test_returns_that_are_none_and_sweeps_without_intensity() -> None:
+    points = some_points(60)
+    points[::7] = np.nan
+    points[3] = np.inf
+    points[5] = [0.0, 0.0, 1.8]  # at the sensor itself
+    bad = ~np.isfinite(points).all(1)
+    bad[5] = True
+    sweep = sweep_of(points, intensity=None)
+    out = weathered_sweep(street(), recipe(smog=Smog(visibility_m=40, scale_height_m=50)), 0, sweep)
+    assert "intensity" not in out.columns
+    assert (out.columns["weather_code"][bad] == UNCHANGED).all()
+    np.testing.assert_array_equal(out.points_m[bad], sweep.points_m[bad])
+    assert (out.columns["weather_code"] == SCATTERED).any()
+    with_gap = np.where(bad, np.nan, 0.4)
+    shown = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(points, with_gap))
+    np.testing.assert_array_equal(np.isnan(shown.columns["intensity"]), bad)
+    empty = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(np.zeros((0, 3))))
+    assert len(empty) == 0 and set(empty.columns) >= ADDED
+
+
+def test_coordinates_of_whole_numbers() -> None:
+    columns = {name: np.arange(30, dtype=np.int32) * 3 for name in "xyz"}
+    scene = street(labels=SensorLabels((0.0, 0.0, 0.0)))
+    out = weathered_sweep(scene, recipe(smog=10), 0, LidarSweep(columns))
+    assert out.columns["weather_code"].any()
+    assert {out.columns[name].dtype for name in "xyz"} == {np.dtype(np.float64)}
+
+
+def test_the_same_in_every_process_and_order() -> None:
+    sweep, seeded = sweep_of(some_points(300), 0.2), recipe(smog=40, seed=7)
+    first = weathered_sweep(street(), seeded, 0, sweep)
+    weathered_sweep(street(), recipe(smog=500), 1, sweep)
+    again = weathered_sweep(street(), seeded, 0, sweep)
+    assert lidar_bytes(first) == lidar_bytes(again)
+    for other in (recipe(smog=40, seed=8), seeded):
+        changed = weathered_sweep(street(), other, 1 if other is seeded else 0, sweep)
+        assert lidar_bytes(changed) != lidar_bytes(first)
+    assert first.columns["x"][:2] == pytest.approx(again.columns["x"][:2], nan_ok=True)
+
+
+def test_weather_twice_is_refused() -> None:
+    out = weathered_sweep(street(), recipe(smog=100), 0, sweep_of(some_points(5)))
+    with pytest.raises(ValueError, match="'weather_code' already"):
+        weathered_sweep(street(), recipe(smog=100), 0, out)
+
+
+def test_origins_by_default_and_wrong_ones() -> None:
+    sweep = sweep_of(some_points(4))
+    unknown = street(labels=SensorLabels(None))
+    expected = WORLD_ORIGIN_M + np.array([0.0, 0.0, 1.8])
+    np.testing.assert_allclose(origins_of(unknown, 0, sweep), np.tile(expected, (4, 1)))
+
+    class Wrong(SensorLabels):
+        def lidar_origins(self, frame_index, sweep):
+            return np.zeros((1, 3))
+
+    with pytest.raises(ValueError, match=r"must be \[4, 3\].*got \[1, 3\]"):
+        origins_of(street(labels=Wrong(None)), 0, sweep)
+
+
+def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarSweep) -> np.ndarray:
+    """How far in front of or behind the depth image the returns on its snow pixels are, metres."""
+    pose = camera.camera_from_world.numpy()
+    offsets = sweep.points_m - np.asarray(scene.world_origin_m)
+    x, y, z = (offsets @ pose[:3, :3].T + pose[:3, 3]).T
+    ahead = z > 0.5
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    seen = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    at = row[seen].astype(int), column[seen].astype(int)
+    shown, is_snow = view.depth_m[at], view.masks["snow"][at] == 255
+    return np.abs(z[seen] - shown)[is_snow & (shown > 0)]
+
+
+@pytest.mark.long
+def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
+    scene = open_street(LABELLED_STREET)
+    deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
+    gaps: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    source = scene.lidar(1)
+    sweep = drop_lost(weathered_sweep(scene, deep, 1, source))
+    for name in ("front", "left"):
+        camera = scene.frame(1).cameras[name].scaled(4.0)  # pixels that are small on the road
+        view = render_view(scene, camera, deep)
+        for is_weathered, returns in ((True, sweep), (False, source)):
+            gaps[is_weathered].append(_depth_gaps(scene, camera, view, returns))
+    after, before = (np.concatenate(gaps[kind]) for kind in (True, False))
+    assert deep.lidar == "weather" and len(after) > 300
+    # Beams are flat: a centimetre of height is several of depth. Now 0.06 m, and 0.64 m.
+    assert np.median(after) < 0.1 < 0.5 < np.median(before)
+
+
+@dataclass(frozen=True)
+class _Misfit(FakeLabels):
+    """Labels whose origins do not fit frame 1."""
+
+    def lidar_origins(self, frame_index, sweep):
+        return np.zeros((len(sweep) - (frame_index == 1), 3))
+
+
+def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None:
+    scene = dataclasses.replace(open_fake("fake:street"), labels=_Misfit())
+    wet = make_recipe("wet", flood=Flood(level_m=40, reference="absolute"), depth="none")
+    strict = wet.model_copy(update={"output": wet.output.model_copy(update={"lidar": "weather"})})
+
+    def outcome(recipe: Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
+        job = RenderJob("fake:street", [recipe], out, cameras=["front"], **options)
+        done = run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
+        rows = read_manifest(out).to_pylist()
+        return done.failed, {row["frame"]: (row["lidar"], row["lidar_note"]) for row in rows}
+
+    failed, shown = outcome(wet, tmp_path / "out")
+    assert failed == 0 and shown[0] == shown[2] == ("weather", shown[0][1])
+    assert shown[3] == (None, None)  # there is no sweep
+    kind, note = shown[1]
+    assert kind == "clean" and "not in depth or sweeps" in note
+    assert re.search(r"no weather on this sweep: ValueError: lidar_origins of _Misfit", note)
+    paths = [tmp_path / f"out/street/wet-000/lidar/{n:06d}.parquet" for n in range(3)]
+    sweeps = [read_lidar(path) for path in paths]
+    assert [set(sweep.columns) >= ADDED for sweep in sweeps] == [True, False, True]
+    assert lidar_bytes(sweeps[1]) == lidar_bytes(scene.lidar(1))
+    # Sweeps that another run has left say what they are; a damaged one is written anew.
+    before = [path.read_bytes() for path in paths]
+    for image in (tmp_path / "out/street/wet-000/images/front").iterdir():
+        image.unlink()
+    paths[2].write_bytes(before[2][:100])
+    assert outcome(wet, tmp_path / "out") == (0, shown)
+    assert [path.read_bytes() for path in paths] == before
+    failed, shown = outcome(strict, tmp_path / "strict")
+    assert failed == 1 and shown[1] == (None, None) and shown[0][0] == "weather"
+    with pytest.raises(OutputError, match="recipe hash there"):
+        outcome(strict, tmp_path / "out")
+
+
+MODEL = LidarModel()
+
+
+@pytest.mark.parametrize(
+    ("visibility_km", "expected"),
+    [(0.05, 1.0), (0.5, 1.0), (1.0, 0.779), (6.0, 0.523), (20.0, 0.523), (60.0, 0.451)],
+)
+def test_kims_factor(visibility_km: float, expected: float) -> None:
+    """The table's values by hand: (0.905 / 0.55)^-q, q = 0, 0, 0.5, 1.3, 1.3, 1.6."""
+    factor = wavelength_factor(KOSCHMIEDER / (1000 * visibility_km))
+    assert factor == pytest.approx(expected, abs=1e-3)
+    assert wavelength_factor(0.0) == 1.0
+
+
+def test_extinction_rises_with_the_smogs_density_at_905_nm_too() -> None:
+    sigma = np.geomspace(1e-6, 10, 4000)
+    thinned = np.array([s * wavelength_factor(float(s)) for s in sigma])
+    assert (np.diff(thinned) > 0).all()
+
+
+def test_intensities_fall_by_two_ways() -> None:
+    points = some_points()
+    sweep = sweep_of(points, intensity=0.5)
+    out = weathered_sweep(street(), recipe(smog=Smog(extinction_per_m=0.01)), 0, sweep)
+    code = out.columns["weather_code"]
+    seen = code == ATTENUATED
+    assert seen.all(), "nothing is near the noise yet"
+    expected = 0.5 * np.exp(-2 * 0.01 * ranges_of(sweep))
+    np.testing.assert_allclose(out.columns["intensity"][seen], expected[seen], rtol=1e-5)
+    assert (out.points_m[seen] == sweep.points_m[seen]).all()
+
+
+@pytest.mark.parametrize("alpha", [0.002, 0.06, 0.5])
+def test_the_soft_echo_is_the_integral(alpha: float) -> None:
+    w = MODEL.pulse_m
+    beta = 0.046 * alpha / math.log(20)
+
+    def echo(reported: float) -> float:
+        def integrand(r: float) -> float:
+            x = reported + w - r
+            overlap = min(max((r - 0.9) / 0.1, 0.0), 1.0)
+            return (
+                beta
+                * math.sin(math.pi * x / (2 * w)) ** 2
+                * math.exp(-2 * alpha * r)
+                * overlap
+                / r**2
+            )
+
+        low, high = max(reported - w, 0.9), reported + w
+        return quad(integrand, low, high, points=[min(max(1.0, low), high)], epsabs=0, limit=200)[0]
+
+    at = np.array([0.95, 1.3, 1.8, 2.5, 4.0, 8.0])
+    exact = np.array([echo(float(r)) for r in at])
+    # The midpoint rule steps 2 cm through an overlap that rises within 10.
+    np.testing.assert_allclose(soft_response(alpha, at, MODEL), exact, rtol=5e-3)
+    fine = np.arange(0.9, 6, 0.01)
+    peak = fine[np.argmax([echo(float(r)) for r in fine])]
+    table = soft_echo(alpha, MODEL)
+    assert table.ranges_m[table.signal.argmax()] == pytest.approx(peak, abs=0.04)
+
+
+def test_dense_fog_shows_itself_and_hides_what_is_far() -> None:
+    sweep = sweep_of(some_points(2000), intensity=0.2)
+    out = weathered_sweep(street(), recipe(smog=40), 0, sweep)
+    code, before, after = out.columns["weather_code"], ranges_of(sweep), ranges_of(out)
+    assert (code[before > 60] != ATTENUATED).all()
+    assert (code[before < 8] == ATTENUATED).all()
+    scattered = code == SCATTERED
+    assert scattered.mean() > 0.2
+    assert (after[scattered] < before[scattered]).all() and (after[scattered] > 0.89).all()
+    assert np.median(after[scattered]) < 6
+    assert (out.columns["intensity"][scattered] < 0.05).all()
+    lost = code == LOST
+    assert np.isnan(out.points_m[lost]).all() and (out.columns["intensity"][lost] == 0).all()
+
+
+def test_denser_smog_leaves_less() -> None:
+    sweep = sweep_of(some_points(1500), intensity=np.linspace(0, 1, 1500))
+    scene = street()
+    kept, bright, unchanged = [], [], []
+    for visibility_m in (5000, 1000, 300, 100, 50, 20, 5):
+        out = weathered_sweep(scene, recipe(smog=visibility_m), 0, sweep)
+        code = out.columns["weather_code"]
+        kept.append(code == ATTENUATED)
+        unchanged.append(code == UNCHANGED)
+        bright.append(np.where(kept[-1], out.columns["intensity"], 0))
+    for thin, dense in itertools.pairwise(unchanged):
+        assert not (dense & ~thin).any()
+    for (thin, dense), (lit, dim) in zip(
+        itertools.pairwise(kept), itertools.pairwise(bright), strict=True
+    ):
+        assert not (dense & ~thin & ~unchanged[0]).any()
+        assert (dim[dense & thin] <= lit[dense & thin]).all()
+
+
+def test_whole_numbers_stay_whole() -> None:
+    points = some_points(300)
+    sweep = sweep_of(
+        points, intensity=None, intensity_8=np.zeros(300), i=np.full(300, 40, np.uint8)
+    )
+    out = weathered_sweep(street(), recipe(smog=2000), 0, sweep)
+    assert out.columns["i"].dtype == np.uint8
+    code = out.columns["weather_code"]
+    assert ((code == UNCHANGED) == (out.columns["i"] == 40)).all() and (code == UNCHANGED).any()
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    st.floats(1e-9, 100.0),
+    st.one_of(st.none(), st.floats(0.1, 1e5)),
+    st.floats(-1e4, 1e4),
+    st.integers(0, 2**31),
+)
+def test_extremes_of_smog(sigma: float, height: float | None, base: float, seed: int) -> None:
+    medium = Fog(sigma, (1.0, 1.0, 1.0), height, base)
+    rng = np.random.default_rng(seed)
+    ends = np.array([0.0, 1e-3, 0.9, 0.91, 5.0, 200.0, 1e6])
+    eyes = np.full(7, 1.8)
+    tau = optical_depth_of_arrays(medium, ends, eyes, eyes - 0.01 * ends)
+    assert (tau >= 0).all()
+    found = scatter_before(medium, eyes, ends, MODEL, rng)
+    assert np.isfinite(found.signal).all() and (found.signal >= 0).all()
+    assert (found.ranges_m <= ends).all() and (found.signal[:3] == 0).all()
+
+
+SNOW = Snow(depth_m=0.1)
+FLAT = cells_on_grid(np.zeros((200, 60)), 0.1, corner_m=(0.0, -3.0))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A street whose support is known: no test here draws it from above."""
+    car = box_car(start=(4.0, 3.0), moved_m=3.0)
+    opened = street(actors=(car,))
+    roof = cells_on_grid(np.full((40, 18), 0.75), 0.1, corner_m=(-2.0, -0.9))
+    support = SnowSupport(ground=FLAT, actors={"car": roof})
+    memo_of(opened).put(("snow support", placement_settings(SNOW)), support)
+    return opened
+
+
+def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:
+    """Where beams to points end on a layer of snow, [N, 3]."""
+    layer = layer_of(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
+    snow = LidarSnow(layer, {}, 0.8)
+    origins, directions, ends = beams(points)
+    hits = meet_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
+    assert (hits <= ends).all()
+    return origins + hits[:, None] * directions
+
+
+def test_level_snow_is_met_at_its_top() -> None:
+    points = ground_points(np.linspace(1, 19, 300))
+    found = meets(FLAT, 0.1, points)
+    np.testing.assert_allclose(found[:, 2], 0.1, atol=1e-6)  # cells are float32
+    expected = SENSOR_M[0] + (points[:, 0] - SENSOR_M[0]) * (1.7 / 1.8)
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-5)
+
+
+def test_beams_over_and_beside_the_layer_go_on() -> None:
+    over = np.array([[19.0, 0.0, 0.11], [15.0, 2.0, 3.0], [0.0, 0.0, 9.0], [-5.0, 0.0, 0.0]])
+    np.testing.assert_allclose(meets(FLAT, 0.1, over), over, atol=1e-12)
+
+
+def test_a_bank_is_met_at_its_side() -> None:
+    depths = np.where(FLAT.centers_m[:, 0].numpy() > 5, 0.5, 0.0)
+    found = meets(FLAT, depths, np.array([[5.2, 0.0, 0.3], [4.9, 0.0, 0.0], [19.0, 0.0, 1.9]]))
+    np.testing.assert_allclose(found[0, 0], 5.0, atol=1e-4)
+    np.testing.assert_allclose(found[1:], [[4.9, 0.0, 0.0], [19.0, 0.0, 1.9]], atol=1e-12)
+
+
+def test_what_lies_under_a_roof_stays() -> None:
+    roof = cells_on_grid(np.full((40, 40), 3.0), 0.1, corner_m=(4.0, -2.0))
+    under = np.array([[6.0, 0.0, 0.0], [6.0, 0.0, 2.0], [7.9, 1.0, 2.5]])
+    np.testing.assert_allclose(meets(roof, 0.2, under), under, atol=1e-12)
+    rising = np.array([[6.0, 0.0, 8.0], [8.5, 0.5, 5.0]])  # through the roof, from below
+    np.testing.assert_allclose(meets(roof, 0.2, rising), rising, atol=1e-12)
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(st.integers(0, 10**6), st.floats(0.0, 3.0), st.floats(1.0, 4.0))
+def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float, deeper: float):
+    """Against the definition, along each beam; and deeper snow never lets a beam go farther."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform(0, 0.2, (30, 20))
+    ground[rng.random((30, 20)) < 0.1] = np.nan
+    cells = cells_on_grid(ground, 0.5, corner_m=(0.5, -5.0))
+    depths = (depth * rng.random(len(cells)) * (rng.random(len(cells)) < 0.8)).astype(np.float32)
+    points = np.column_stack(
+        [rng.uniform(1, 16, 12), rng.uniform(-5, 5, 12), rng.uniform(0, 3, 12)]
+    )
+    layer = layer_of(cells, depths, grid_m=0.5)
+    if layer is None:
+        return
+    origins, directions, ends = beams(points)
+    shallow = meet_layers(
+        LidarSnow(layer, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
+    )
+    steps = np.arange(0.3, 20, 5e-3)
+    at = origins[:, None] + steps[:, None] * directions[:, None]
+    index = np.floor((at[..., :2] - layer.corner) / layer.cell_m).astype(int)
+    rows, columns = layer.base.shape
+    inside = ((index >= 0) & (index < [columns, rows])).all(-1)
+    row, column = np.clip(index[..., 1], 0, rows - 1), np.clip(index[..., 0], 0, columns - 1)
+    low, high = layer.base[row, column] - GROUND_SLACK_M, layer.top[row, column]
+    within = inside & (at[..., 2] >= low) & (at[..., 2] <= high) & (steps < ends[:, None])
+    first = np.where(within.any(1), steps[within.argmax(1)], ends)
+    entered = directions[:, 2] < 0  # a step from below may be taken for one from a side
+    # A beam may clip a corner by less than a step, which the search does not see.
+    assert (shallow[entered] <= first[entered] + 1e-6).all()
+    assert (np.abs(shallow - first)[entered] < 1e-2).mean() > 0.8
+    deep = layer_of(cells, deeper * depths, grid_m=0.5)
+    hits = meet_layers(
+        LidarSnow(deep, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
+    )
+    assert (hits <= shallow + 1e-6).all()
+
+
+def test_the_layer_is_that_of_the_images(scene) -> None:
+    placed = PlacedSnow(SNOW, seed=0)
+    top = snow_in(scene, placed).ground.top
+    means = snow_layers_of(scene, placed).ground.gaussians.means.numpy()
+    covered = np.isfinite(top)
+    # A splat's middle lies a centimetre inside the layer whose surface it shows.
+    assert np.median(top[covered]) == pytest.approx(np.median(means[:, 2]), abs=0.02)
+    layer = snow_in(scene, placed).ground
+    index = np.floor((means[:, :2] - layer.corner) / layer.cell_m).astype(int)
+    near = top[np.clip(index[:, 1], 0, top.shape[0] - 1), np.clip(index[:, 0], 0, top.shape[1] - 1)]
+    # Drifts are centimetres high and metres long: with another seed they would not agree.
+    rises = np.corrcoef(near[np.isfinite(near)], means[np.isfinite(near), 2])[0, 1]
+    assert rises > 0.9
+
+
+def test_a_sweep_in_the_snow(scene) -> None:
+    points = ground_points(np.linspace(1, 19, 200))
+    points[:, 1] = np.linspace(-2.5, 2.5, 200)
+    sweep = sweep_of(points, intensity=0.1)
+    out = weathered_sweep(scene, recipe(snow=SNOW), 0, sweep)
+    code = out.columns["weather_code"]
+    assert (code == MOVED).mean() > 0.9
+    moved = code == MOVED
+    assert (ranges_of(out)[moved] < ranges_of(sweep)[moved]).all()
+    before = sweep.points_m[moved] - WORLD_ORIGIN_M - SENSOR_M
+    after = out.points_m[moved] - WORLD_ORIGIN_M - SENSOR_M
+    assert np.linalg.norm(np.cross(before, after), axis=1).max() < 1e-6
+    # Level snow at a slant of theta gives back 0.79 cos(theta).
+    slant = -before[:, 2] / np.linalg.norm(before, axis=1)
+    np.testing.assert_allclose(
+        out.columns["intensity"][moved], 0.93 * 0.85 * np.maximum(slant, 0.02), rtol=1e-5
+    )
+
+
+def test_snow_rides_on_a_car_as_its_returns_say_when(scene) -> None:
+    """At 0 s the car stands at x = 4, 0.1 s later at 7: its returns are of 0.1 s."""
+    points = np.array([[8.5, 3.0, 1.575], [8.4, 3.2, 1.575], [8.3, 2.8, 1.575]])
+    late = sweep_of(points, timestamp_ns=np.full(3, 100_000_000))
+    out = weathered_sweep(scene, recipe(snow=SNOW), 0, late)
+    assert (out.columns["weather_code"] == MOVED).all()
+    assert (out.points_m[:, 2] - WORLD_ORIGIN_M[2] > 1.53).all()
+    gone = sweep_of(points, timestamp_ns=np.zeros(3, np.int64))
+    still = weathered_sweep(scene, recipe(snow=SNOW), 0, gone)
+    assert (still.columns["weather_code"] == UNCHANGED).all()
+
+
+def test_no_snow_where_none_lies() -> None:
+    assert layer_of(FLAT, np.zeros(len(FLAT), np.float32)) is None
+    empty = dataclasses.replace(
+        FLAT, **{f.name: getattr(FLAT, f.name)[:0] for f in dataclasses.fields(FLAT)}
+    )
+    assert layer_of(empty, np.zeros(0, np.float32)) is None
+    assert torch.equal(empty.centers_m, torch.zeros(0, 3))
+
+
+CLEAR = Flood(level_m=0.02, reference="absolute", turbidity_ntu=0)
+
+
+def medium(level_m: float = 0.02, extinction: float = 0.34, index: float = 1.333) -> FloodMedium:
+    return FloodMedium(
+        level_z_m=level_m,
+        extinction_per_m=(extinction, 0.06, 0.01),
+        rgb=(0.4, 0.4, 0.3),
+        waves=make_waves(Waves(preset="still"), seed=0, depth_m=1.0),
+        refraction_index=index,
+    )
+
+
+def test_a_shallow_bed_by_hand() -> None:
+    """Straight down through 2 cm: 1 - F = 0.98, exp(-2 7.5 0.02), and 2 cm of water as 2.7."""
+    found = meet_water(medium(), *beams(np.array([[0.0, 0.0, 0.0]])), np.array([0.3]))
+    transmitted = 1 - ((1.333 - 1) / (1.333 + 1)) ** 2
+    assert found.kept[0] == pytest.approx(transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M))
+    assert found.range_m[0] == pytest.approx(1.78 + 1.333 * 0.02)
+    assert found.surface_m[0] == pytest.approx(1.78) and found.is_bed[0]
+
+
+def test_a_slanted_beam_bends() -> None:
+    """45 degrees: asin(sin 45 / n) below, so 2 cm take 2 cm / cos of that."""
+    found = meet_water(medium(), *beams(np.array([[1.8, 0.0, 0.0]])), np.array([0.3]))
+    below = math.asin(math.sin(math.pi / 4) / 1.333)
+    expected = 1.78 * math.sqrt(2) + 1.333 * 0.02 / math.cos(below)
+    assert found.range_m[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_without_refraction_and_depth_nothing_changes() -> None:
+    origins, directions, ends = beams(ground_points(np.linspace(1, 20, 30)))
+    found = meet_water(medium(1e-12, index=1.0), origins, directions, ends, np.full(30, 0.3))
+    np.testing.assert_allclose(found.range_m, ends[found.rows], rtol=1e-12)
+    np.testing.assert_allclose(found.kept, 1.0, atol=1e-8)
+
+
+def test_a_clear_flood_shows_its_bed_near_the_car_and_nothing_farther() -> None:
+    distances = np.linspace(1, 60, 200)
+    sweep = sweep_of(ground_points(distances), intensity=0.2)
+    out = weathered_sweep(street(), recipe(flood=CLEAR), 0, sweep)
+    code = out.columns["weather_code"]
+    assert code[0] == MOVED and code[-1] == LOST
+    assert SCATTERED not in code and UNCHANGED not in code
+    moved = code != LOST
+    assert (np.diff(moved.astype(int)) <= 0).all(), "once lost, farther is lost, too"
+    assert (out.columns["intensity"][moved] < 0.2).all()
+    # Slower light makes it seem deeper straight below, bent beams less deep at a slant.
+    rises = out.points_m[moved][:, 2] - sweep.points_m[moved][:, 2]
+    slanted = distances[moved] > 3
+    assert rises[0] < 0 and slanted.any() and (rises[slanted] > 0).all()
+
+
+def test_deep_clear_water_swallows_what_is_not_right_below() -> None:
+    sweep = sweep_of(ground_points(np.linspace(4, 60, 50)), intensity=0.9)
+    deep = Flood(level_m=0.5, reference="absolute", turbidity_ntu=0)
+    out = weathered_sweep(street(), recipe(flood=deep), 0, sweep)
+    assert (out.columns["weather_code"] == LOST).all()
+
+
+def test_mud_shows_its_surface_near_by() -> None:
+    sweep = sweep_of(ground_points(np.linspace(1, 90, 100)), intensity=0.2)
+    muddy = Flood(level_m=0.4, reference="absolute", turbidity_ntu=200)
+    out = weathered_sweep(street(), recipe(flood=muddy), 0, sweep)
+    code = out.columns["weather_code"]
+    assert code[0] == SCATTERED and code[-1] == LOST
+    np.testing.assert_allclose(out.points_m[code == SCATTERED][:, 2], 41.5 + 0.4, atol=1e-6)
+    assert water_reflectance(medium(extinction=0.34)) == 0
+    assert 0.05 < water_reflectance(medium(extinction=100.0)) < 0.33
+
+
+def test_what_stands_out_of_the_water_stays() -> None:
+    points = some_points(400)
+    sweep = sweep_of(points, intensity=0.2)
+    out = weathered_sweep(street(), recipe(flood=0.05), 0, sweep)
+    dry = points[:, 2] > 0.05
+    assert ((out.columns["weather_code"] == UNCHANGED) == dry).all()
+
+
+def test_a_drowned_sensor_sees_nothing() -> None:
+    sweep = sweep_of(some_points(50), intensity=0.2)
+    out = weathered_sweep(street(), recipe(flood=2.0), 0, sweep)
+    assert (out.columns["weather_code"] == LOST).all()
+
+
+def test_more_water_never_leaves_more() -> None:
+    sweep = sweep_of(some_points(800), intensity=0.3)
+    scene = street()
+    before = np.ones(800, bool)
+    for level_m in (0.001, 0.01, 0.1, 0.5, 1.5, 1.79, 1.81, 5.0):
+        out = weathered_sweep(scene, recipe(flood=level_m), 0, sweep)
+        unchanged = out.columns["weather_code"] == UNCHANGED
+        assert not (unchanged & ~before).any()
+        before = unchanged
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.floats(-50, 1.79), st.floats(0, 1e6), st.floats(1, 3), st.floats(0.0, 1.0))
+def test_extremes_of_water(level: float, extinction: float, index: float, rho: float) -> None:
+    points = np.vstack([some_points(20), [[1e-9, 0, -100], [1e5, 0, 1.7999], [1, 0, 1.8]]])
+    found = meet_water(medium(level, extinction, index), *beams(points), np.full(23, rho))
+    for values in (found.surface_m, found.range_m, found.kept, found.reflectance):
+        assert np.isfinite(values).all() and (values >= 0).all()
+    assert (found.kept <= 1 + 1e-12).all() and (found.reflectance < 0.33).all()
+    assert (found.range_m >= found.surface_m).all()

@@ -1,0 +1,454 @@
+"""Spherical harmonics, skies, rotations, cameras and random numbers."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import (
+    invert_rigid,
+    multiply_quats,
+    quat_from_rotmat,
+    rigid,
+    rotmat_from_quat,
+    slerp,
+    transform_points,
+)
+from augment.render.sh import SH_C0, evaluate_sh, rotate_sh, sh_basis
+from augment.rng import rng_for
+from augment.sky import (
+    CubemapSky,
+    LatLongSky,
+    cubemap_coordinates,
+    directions_of_cubemap,
+    with_border,
+)
+from tests.scenes import camera_ahead
+
+
+def _directions(count, seed=0):
+    rng = np.random.default_rng(seed)
+    vectors = torch.from_numpy(rng.normal(size=(count, 3)))
+    return torch.nn.functional.normalize(vectors, dim=-1)
+
+
+def _rotation(seed):
+    return rotmat_from_quat(torch.from_numpy(np.random.default_rng(seed).normal(size=4)))
+
+
+def _coefficients(count, degree, seed=1):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(rng.normal(size=(count, (degree + 1) ** 2, 3)))
+
+
+def test_basis_is_orthonormal_over_the_sphere():
+    # Gauss-Legendre in z and equal steps in azimuth integrate polynomials of degree 6 exactly.
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    azimuth = np.arange(16) * (2 * math.pi / 16)
+    z, phi = np.meshgrid(nodes, azimuth, indexing="ij")
+    radius = np.sqrt(1 - z * z)
+    points = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], -1)
+    basis = sh_basis(torch.from_numpy(points), 3).numpy()
+    area = weights[:, None] * (2 * math.pi / 16)
+    gram = np.einsum("ij,ijk,ijl->kl", np.broadcast_to(area, z.shape), basis, basis)
+    np.testing.assert_allclose(gram, np.eye(16), atol=1e-13)
+
+
+def test_signs_and_order_of_the_trained_convention():
+    x, y, z = torch.eye(3, dtype=torch.float64)
+    c1 = 0.4886025119029199
+    torch.testing.assert_close(sh_basis(x, 1)[1:], torch.tensor([0.0, 0.0, -c1]).double())
+    torch.testing.assert_close(sh_basis(y, 1)[1:], torch.tensor([-c1, 0.0, 0.0]).double())
+    torch.testing.assert_close(sh_basis(z, 1)[1:], torch.tensor([0.0, c1, 0.0]).double())
+    diagonal = torch.full((3,), 1 / math.sqrt(3), dtype=torch.float64)
+    signs = torch.sign(sh_basis(diagonal, 3)[[4, 5, 7, 9, 10, 11, 12, 13, 15]])
+    assert signs.tolist() == [1, -1, -1, -1, 1, -1, -1, -1, 1]
+
+
+def test_constant_band():
+    sh = torch.tensor([[[0.5, -1.0, 2.0]]])
+    torch.testing.assert_close(evaluate_sh(sh, torch.tensor([[0.0, 0.0, 1.0]])), sh[:, 0] * SH_C0)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 2, 3])
+def test_max_degree_leaves_higher_bands_out(cut):
+    sh, directions = _coefficients(5, 3), _directions(5)
+    kept = sh[:, : (cut + 1) ** 2]
+    assert torch.equal(evaluate_sh(sh, directions, cut), evaluate_sh(kept, directions))
+
+
+def test_max_degree_above_what_is_held_changes_nothing():
+    sh, directions = _coefficients(5, 1), _directions(5)
+    assert torch.equal(evaluate_sh(sh, directions, 3), evaluate_sh(sh, directions))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rotating_equals_looking_from_the_inversely_rotated_direction(degree):
+    sh, directions, rotation = _coefficients(7, degree), _directions(7), _rotation(2)
+    turned = evaluate_sh(rotate_sh(sh, rotation), directions)
+    expected = evaluate_sh(sh, directions @ rotation)  # rows R^T d
+    torch.testing.assert_close(turned, expected, rtol=0, atol=1e-12)  # float64 rounding
+
+
+def test_rotations_compose():
+    sh, first, second = _coefficients(4, 3), _rotation(3), _rotation(4)
+    stepwise = rotate_sh(rotate_sh(sh, first), second)
+    torch.testing.assert_close(stepwise, rotate_sh(sh, second @ first), rtol=0, atol=1e-12)
+
+
+def test_rotation_keeps_the_energy_of_each_band_and_the_dtype():
+    sh = _coefficients(4, 3).float()
+    turned = rotate_sh(sh, _rotation(5))
+    assert turned.dtype == torch.float32
+    for band in range(4):
+        of_band = slice(band * band, (band + 1) ** 2)
+        before, after = sh[:, of_band].norm(), turned[:, of_band].norm()
+        torch.testing.assert_close(after, before, rtol=1e-6, atol=0)  # float32 rounding
+
+
+def test_no_gaussians():
+    empty = torch.zeros(0, 16, 3)
+    assert evaluate_sh(empty, torch.zeros(0, 3)).shape == (0, 3)
+    assert rotate_sh(empty, torch.eye(3)).shape == (0, 16, 3)
+
+
+def test_gradients():
+    sh = _coefficients(3, 3).requires_grad_()
+    directions = _directions(3).requires_grad_()
+    assert torch.autograd.gradcheck(evaluate_sh, (sh, directions))
+
+
+def test_unknown_degree_is_refused():
+    with pytest.raises(ValueError, match="degree must be 0 to 3; got 4"):
+        sh_basis(torch.zeros(1, 3), 4)
+
+
+def smooth(directions: torch.Tensor) -> torch.Tensor:
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    return 0.5 + 0.4 * unit * unit.roll(1, -1)
+
+
+def random_directions() -> torch.Tensor:
+    return torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)) * 5
+
+
+def test_texel_directions_land_on_their_own_texel():
+    size = 8
+    face, s, t = cubemap_coordinates(directions_of_cubemap(size))
+    ticks = (torch.arange(size) + 0.5) / size * 2 - 1
+    assert torch.equal(face, torch.arange(6)[:, None, None].expand(6, size, size))
+    assert torch.allclose(s, ticks.expand(6, size, size), atol=1e-6)  # float32 rounding
+    assert torch.allclose(t, ticks[:, None].expand(6, size, size), atol=1e-6)
+
+
+def test_opengl_faces():
+    """The cube map table: on the +x face s runs along -z and t along -y, and so on."""
+    cases = {
+        (1.0, 0.2, 0.3): (0, -0.3, -0.2),
+        (-1.0, 0.2, 0.3): (1, 0.3, -0.2),
+        (0.2, 1.0, 0.3): (2, 0.2, 0.3),
+        (0.2, -1.0, 0.3): (3, 0.2, -0.3),
+        (0.2, 0.3, 1.0): (4, 0.2, -0.3),
+        (0.2, 0.3, -1.0): (5, -0.2, -0.3),
+    }
+    for direction, (face, s, t) in cases.items():
+        got = cubemap_coordinates(torch.tensor(direction))
+        assert int(got[0]) == face
+        assert torch.allclose(torch.stack(got[1:]), torch.tensor([s, t]))
+
+
+def test_a_cubemap_reproduces_a_smooth_function():
+    sky = CubemapSky(smooth(directions_of_cubemap(64)))
+    directions = random_directions()
+    # Bilinear error is about (texel angle)^2 / 8 times the curvature, also across face edges.
+    assert (sky.sample(directions) - smooth(directions)).abs().max() < 0.004
+
+
+def test_a_cubemap_has_no_seams():
+    """Steps across every edge are as small as steps inside faces."""
+    size = 32
+    sky = CubemapSky(smooth(directions_of_cubemap(size)))
+    along = torch.linspace(-1, 1, 401, dtype=torch.float64)
+    near = torch.full_like(along, 1e-6)
+    for first in range(3):
+        for second in range(first + 1, 3):
+            for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                sides = []
+                for way in (-1, 1):
+                    d = torch.zeros(401, 3, dtype=torch.float64)
+                    d[:, first], d[:, second] = (
+                        signs[0] * (1 - way * near),
+                        signs[1] * (1 + way * near),
+                    )
+                    d[:, 3 - first - second] = along
+                    sides.append(sky.sample(d))
+                assert (sides[0] - sides[1]).abs().max() < 2 / 255
+                assert (sides[0] - smooth(d)).abs().max() < 0.01
+
+
+def test_a_corner_is_the_mean_of_its_three_texels():
+    faces = torch.rand(6, 4, 4, 3, generator=torch.Generator().manual_seed(1))
+    bordered = with_border(faces)
+    # Face +x holds s along -z and t along -y: its upper left corner looks to (1, 1, 1), as the
+    # upper right of +z and the lower right of +y do.
+    meet = (faces[0, 0, 0] + faces[4, 0, 3] + faces[2, 3, 3]) / 3
+    assert torch.allclose(bordered[0, 0, 0], meet)
+    assert torch.allclose(CubemapSky(faces).sample(torch.ones(3)), meet, atol=0.2)
+
+
+def test_the_border_follows_faces_that_change():
+    sky = CubemapSky(torch.zeros(6, 4, 4, 3))
+    assert float(sky.sample(torch.ones(3)).max()) == 0
+    sky.faces.fill_(0.5)
+    assert torch.allclose(sky.sample(torch.ones(3)), torch.full((3,), 0.5))
+
+
+def test_a_latlong_image_reproduces_a_smooth_function():
+    height, width = 128, 256
+    elevation = (0.5 - (torch.arange(height) + 0.5) / height) * torch.pi
+    azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * 2 * torch.pi
+    e, a = torch.meshgrid(elevation, azimuth, indexing="ij")
+    directions = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], -1)
+    sky = LatLongSky(smooth(directions))
+    asked = random_directions()
+    assert (sky.sample(asked) - smooth(asked)).abs().max() < 0.02
+
+
+def test_a_latlong_image_has_no_seam_behind():
+    sky = LatLongSky(torch.rand(4, 8, 3))
+    either_side = torch.tensor([[-1.0, 1e-6, 0.0], [-1.0, -1e-6, 0.0]])
+    left, right = sky.sample(either_side)
+    assert torch.allclose(left, right, atol=1e-4)
+
+
+# float64 arithmetic of a few dozen operations: 1e-12 leaves four digits of slack.
+EXACT = 1e-12
+
+
+def random_quats(count: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(quats, dim=-1)
+
+
+def test_rotation_matrices_are_proper_and_round_trip():
+    quats = random_quats(100)
+    rotations = rotmat_from_quat(3.0 * quats)  # length does not matter
+    identity = torch.eye(3, dtype=torch.float64).expand(100, 3, 3)
+    assert torch.allclose(rotations @ rotations.transpose(1, 2), identity, atol=EXACT)
+    assert torch.allclose(torch.det(rotations), torch.ones(100, dtype=torch.float64), atol=EXACT)
+    back = quat_from_rotmat(rotations)
+    sign = torch.sign((back * quats).sum(-1, keepdim=True))
+    assert torch.allclose(back, sign * quats, atol=EXACT)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_half_turns_round_trip(axis):
+    """The trace formula divides by zero at these rotations."""
+    quat = torch.zeros(4, dtype=torch.float64)
+    quat[axis + 1] = 1
+    rotation = rotmat_from_quat(quat)
+    assert torch.allclose(rotmat_from_quat(quat_from_rotmat(rotation)), rotation, atol=EXACT)
+
+
+def test_quarter_turns_compose():
+    quarter = torch.tensor([math.sqrt(0.5), 0, 0, math.sqrt(0.5)], dtype=torch.float64)
+    half = multiply_quats(quarter, quarter)
+    x = torch.tensor([1.0, 0, 0], dtype=torch.float64)
+    assert torch.allclose(rotmat_from_quat(quarter) @ x, x.roll(1), atol=EXACT)  # x -> y
+    assert torch.allclose(rotmat_from_quat(half) @ x, -x, atol=EXACT)
+
+
+def test_product_of_quaternions_is_product_of_matrices():
+    a, b = random_quats(50), random_quats(50).flip(0)
+    expected = rotmat_from_quat(a) @ rotmat_from_quat(b)
+    assert torch.allclose(rotmat_from_quat(multiply_quats(a, b)), expected, atol=EXACT)
+
+
+def test_slerp_moves_at_constant_speed_the_shorter_way():
+    a = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    angle = 1.2
+    b = torch.tensor([math.cos(angle / 2), 0, 0, math.sin(angle / 2)], dtype=torch.float64)
+    for fraction in (0.0, 0.25, 0.5, 1.0):
+        at = slerp(a, -b, torch.tensor(fraction, dtype=torch.float64))  # -b is the same rotation
+        expected = [math.cos(angle * fraction / 2), 0, 0, math.sin(angle * fraction / 2)]
+        assert torch.allclose(at, torch.tensor(expected, dtype=torch.float64), atol=EXACT)
+
+
+def test_slerp_of_equal_rotations_has_no_nan():
+    q = random_quats(1)[0]
+    assert torch.allclose(slerp(q, q, torch.tensor(0.3, dtype=torch.float64)), q, atol=EXACT)
+
+
+def test_inverse_of_rigid_transform():
+    transform = rigid(rotmat_from_quat(random_quats(1)[0]), torch.tensor([1.0, -2, 3]).double())
+    points = torch.randn(10, 3, dtype=torch.float64)
+    back = transform_points(invert_rigid(transform), transform_points(transform, points))
+    assert torch.allclose(back, points, atol=EXACT)
+
+
+def camera(**changes) -> Camera:
+    rotation = rotmat_from_quat(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
+    base = Camera(
+        name="front",
+        width=97,
+        height=61,
+        fx=80.0,
+        fy=83.0,
+        cx=47.3,
+        cy=31.9,
+        camera_from_world=rigid(rotation, torch.tensor([0.4, -1.0, 2.0]).double()),
+    )
+    return dataclasses.replace(base, **changes)
+
+
+def test_ray_through_a_pixel_projects_back_to_its_centre():
+    cam = camera()
+    points = cam.centre + 7.5 * cam.ray_directions(torch.float64)  # depth 7.5 at every pixel
+    in_camera = points @ cam.camera_from_world[:3, :3].T + cam.camera_from_world[:3, 3]
+    assert torch.allclose(in_camera[..., 2], torch.full((61, 97), 7.5, dtype=torch.float64))
+    pixels = in_camera @ cam.K.T / 7.5
+    assert pixels[0, 0, :2].tolist() == pytest.approx([0.5, 0.5])
+    assert pixels[60, 96, :2].tolist() == pytest.approx([96.5, 60.5])
+
+
+def test_ray_lengths_are_the_norms_of_the_directions():
+    cam = camera()
+    norms = cam.ray_directions(torch.float64).norm(dim=-1)
+    assert torch.allclose(cam.ray_lengths(torch.float64), norms)
+
+
+def test_scaling_keeps_the_field_of_view():
+    cam = camera(width=1920, height=1080, fx=1970.0, fy=1970.0, cx=970.0, cy=483.3)
+    half = cam.scaled(0.5)
+    assert (half.width, half.height) == (960, 540)
+    assert half.fx == 985.0 and half.cx == 485.0
+    assert cam.scaled(1.0) is cam
+    odd = cam.scaled(0.3333)  # sides round, and the intrinsics follow each side's true ratio
+    assert odd.fx / odd.width == pytest.approx(cam.fx / cam.width)
+    assert odd.cy / odd.height == pytest.approx(cam.cy / cam.height)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 0}, "width and height must be >= 1 px; got 0x61"),
+        ({"fx": -80.0}, "fx must be finite and > 0"),
+        ({"fy": math.nan}, "fy must be finite"),
+        ({"cx": math.inf}, "cx must be finite"),
+        ({"camera_from_world": 2 * torch.eye(4, dtype=torch.float64)}, "rigid"),
+        ({"camera_from_world": torch.diag(torch.tensor([1.0, 1, -1, 1]).double())}, "rigid"),
+        ({"camera_from_world": torch.full((4, 4), math.nan).double()}, "rigid"),
+    ],
+)
+def test_impossible_cameras_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        camera(**changes)
+
+
+def test_a_resized_view_spans_the_same_angles():
+    camera = camera_ahead(33, 21)
+    square = camera.resized(12, 12)
+    assert (square.width, square.height) == (12, 12)
+    for before, after in (
+        (camera.cx / camera.fx, square.cx / square.fx),
+        ((camera.width - camera.cx) / camera.fx, (12 - square.cx) / square.fx),
+        (camera.cy / camera.fy, square.cy / square.fy),
+        ((camera.height - camera.cy) / camera.fy, (12 - square.cy) / square.fy),
+    ):
+        assert after == pytest.approx(before, rel=1e-12)
+
+
+KEY = {"seed": 7, "scene": "street", "effect": "snow.flakes", "frame": 3, "camera": "front"}
+
+
+def first(**changes: object) -> float:
+    return float(rng_for(**{**KEY, **changes}).random())
+
+
+def test_the_first_numbers_are_pinned() -> None:
+    """Written data depends on them: they are the same in every version, on every platform."""
+    assert rng_for(seed=0, scene="s", effect="e").random(3).tolist() == [
+        0.45683649455347763,
+        0.4501256850477985,
+        0.4131717658034758,
+    ]
+    assert rng_for(**KEY).random(3).tolist() == [
+        0.7187658359476665,
+        0.8643062832301446,
+        0.119411030876862,
+    ]
+    assert rng_for(**KEY).integers(0, 1000, 5).tolist() == [877, 718, 200, 864, 397]
+
+
+def test_the_same_key_starts_anew() -> None:
+    one, two = rng_for(**KEY), rng_for(**KEY)
+    one.random(100)
+    assert first() == float(two.random())
+
+
+def test_every_part_of_the_key_counts() -> None:
+    others = [
+        {},
+        {"seed": 8},
+        {"scene": "streets"},
+        {"effect": "snow.size"},
+        {"frame": 4},
+        {"frame": None},
+        {"camera": "rear"},
+        {"camera": None},
+        {"frame": None, "camera": None},
+        {"camera": "None"},
+        {"scene": 'street", 3, "front'},  # what a key joined with commas would confuse
+        {"scene": ""},
+    ]
+    assert len({first(**other) for other in others}) == len(others)
+
+
+def test_numpy_integers_are_the_same_key() -> None:
+    assert first(seed=np.int64(7), frame=np.int32(3)) == first()
+
+
+def test_neighbouring_keys_are_independent() -> None:
+    frames = np.array([[first(seed=s, frame=f) for f in range(40)] for s in range(25)])
+    flat = np.sort(frames.ravel())
+    steps = np.arange(1, flat.size + 1) / flat.size
+    distance = max((steps - flat).max(), (flat - steps + 1 / flat.size).max())
+    assert distance < 1.95 / math.sqrt(flat.size)  # Kolmogorov: one fair sample in a thousand
+    pairs = np.corrcoef(frames[:, :-1].ravel(), frames[:, 1:].ravel())[0, 1]
+    assert abs(pairs) < 4 / math.sqrt(25 * 39)  # a correlation's four standard deviations
+
+
+def test_the_global_state_is_not_touched() -> None:
+    before = np.random.get_state(legacy=False)["state"]["key"].tobytes()  # noqa: NPY002
+    rng_for(**KEY).random(10)
+    assert np.random.get_state(legacy=False)["state"]["key"].tobytes() == before  # noqa: NPY002
+
+
+def test_positional_arguments_are_refused() -> None:
+    with pytest.raises(TypeError):
+        rng_for(1, "street", "snow")  # type: ignore
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": -1}, "seed and frame must be >= 0; got seed=-1, frame=3"),
+        ({"frame": -2}, "seed and frame must be >= 0; got seed=7, frame=-2"),
+        ({"effect": ""}, "effect must name what is drawn"),
+    ],
+)
+def test_wrong_keys(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rng_for(**{**KEY, **changes})
+
+
+def test_order_of_use_does_not_matter() -> None:
+    keys = list(itertools.product(range(3), ("front", "rear")))
+    forwards = {key: first(frame=key[0], camera=key[1]) for key in keys}
+    backwards = {key: first(frame=key[0], camera=key[1]) for key in reversed(keys)}
+    assert forwards == backwards
