@@ -59,7 +59,7 @@ _INVISIBLE = re.compile(
 )
 _DIGITS = re.compile(r"\d+")
 # Of a million rows they take some hundred megabytes, over and over.
-_UNUSED = ["timestamp_ns", "instance_path", "calibration_path", "recipe_hash", "style_method"]
+_UNUSED = ["timestamp_ns", "instance_path", "recipe_hash", "style_method"]
 _UNUSED += ["render_scale", "settings"]
 # Of a variant's folder; what else lies there, such as its recipe, is small.
 OTHER, STATE = "other", "state of jobs"
@@ -130,9 +130,9 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
 
 def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     """The page's text, and how many files could not be read. html: where it will lie."""
-    table = read_finished(store)
+    table = read_finished(store, _UNUSED)
     cameras = cameras_on_car(store, table)
-    table = add_variant_key(table.drop_columns(_UNUSED))
+    table = add_variant_key(table.drop_columns("calibration_path"))
     beside, own = _beside(store, html)
     listing = store.list("")
     files = ReportFiles(store, listing)

@@ -139,10 +139,12 @@ def read_manifest(out_dir: Path) -> pa.Table:
     return parse_manifest(data, str(path))
 
 
-def parse_manifest(data: bytes, where: str) -> pa.Table:
-    """The table in a manifest's bytes, with the columns that an older version lacks."""
-    table = _with_later_columns(read_table(data, where))
-    _check_types(table, where)
+def parse_manifest(data: bytes, where: str, without: Collection[str] = ()) -> pa.Table:
+    """The table in a manifest's bytes, with the columns that an older version lacks. without: not
+    these columns, to save memory.
+    """
+    table = _with_later_columns(read_table(data, where, without=without), without)
+    _check_types(table, where, without)
     for name in weather_columns(table):
         if table[name].null_count:  # what some programs make of NaN
             filled = pc.fill_null(table[name], math.nan)
@@ -151,8 +153,8 @@ def parse_manifest(data: bytes, where: str) -> pa.Table:
     return table
 
 
-def _check_types(table: pa.Table, where: str) -> None:
-    requested = _kinds(weather_columns(table))
+def _check_types(table: pa.Table, where: str, without: Collection[str]) -> None:
+    requested = {n: kind for n, kind in _kinds(weather_columns(table)).items() if n not in without}
     advice = "It was written by another program or version: write to another output folder"
     missing = sorted(requested.keys() - set(table.column_names))
     if missing:
@@ -275,7 +277,8 @@ def concat_rows(tables: Sequence[pa.Table]) -> pa.Table:
         for name in set(weather) - set(table.column_names):
             absent = pa.array([_absent(name)] * table.num_rows, pa.float64())
             table = table.append_column(name, absent)
-        whole.append(table.select([*_kinds(weather)]))
+        there = set(table.column_names)
+        whole.append(table.select([name for name in _kinds(weather) if name in there]))
     return pa.concat_tables(whole)
 
 
@@ -288,10 +291,10 @@ def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
     return mask
 
 
-def _with_later_columns(table: pa.Table) -> pa.Table:
+def _with_later_columns(table: pa.Table, without: Collection[str]) -> pa.Table:
     leading = leading_columns()
     for name, meaning in later_columns().items():
-        if name not in table.column_names:
+        if name not in table.column_names and name not in without:
             column = pa.array([meaning] * table.num_rows, leading[name])
             place = [n for n in leading if n in table.column_names or n == name].index(name)
             table = table.add_column(place, name, column)
@@ -373,11 +376,12 @@ def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
     return part
 
 
-def read_finished(store: Store) -> pa.Table:
-    """The rows of all finished images and of those that failed, sorted by `manifest.KEY`. Raises
-    OutputError: nothing is finished yet, or a file is damaged.
+def read_finished(store: Store, without: Collection[str] = ()) -> pa.Table:
+    """The rows of all finished images and of those that failed, sorted by `manifest.KEY`. without:
+    not these columns, to save memory. Raises OutputError: nothing is finished yet, or a file is
+    damaged.
     """
-    table = _merged(store)[0]
+    table = _merged(store, without)[0]
     if table is None:
         raise OutputError(
             f"{store.uri} holds neither {MANIFEST} nor finished blocks: it is no output folder, or "
@@ -408,17 +412,19 @@ def parts_to_merge(store: Store) -> int:
     return sum(part.name not in listed for part in list_parts(store).values())
 
 
-def _merged(store: Store) -> tuple[pa.Table | None, bytes | None, list[Part]]:
+def _merged(
+    store: Store, without: Collection[str] = ()
+) -> tuple[pa.Table | None, bytes | None, list[Part]]:
     """The rows of the manifest and of the parts, the manifest's bytes as they are, and the parts. A
     part may be replaced between being listed and being read: then all is looked at again.
     """
     for attempt in range(_MAX_RACES):
         parts = sorted(list_parts(store).values(), key=lambda part: part.name)
-        table, data = _manifest(store)
+        table, data = _manifest(store, without)
         listed = _listed(table)
         try:
             read = [
-                parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
+                parse_manifest(store.read(part.path), f"{store.uri}/{part.path}", without)
                 for part in parts
                 if part.name not in listed
             ]
@@ -433,12 +439,12 @@ def _merged(store: Store) -> tuple[pa.Table | None, bytes | None, list[Part]]:
     raise AssertionError
 
 
-def _manifest(store: Store) -> tuple[pa.Table | None, bytes | None]:
+def _manifest(store: Store, without: Collection[str] = ()) -> tuple[pa.Table | None, bytes | None]:
     try:
         data = store.read(MANIFEST)
     except StoredFileMissing:
         return None, None
-    return parse_manifest(data, f"{store.uri}/{MANIFEST}"), data
+    return parse_manifest(data, f"{store.uri}/{MANIFEST}", without), data
 
 
 def _listed(table: pa.Table | None) -> Collection[str]:

@@ -11,7 +11,7 @@ import base64
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,15 +124,20 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def read_table(source: Path | bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
+def read_table(
+    source: Path | bytes,
+    where: str,
+    columns: Sequence[str] | None = None,
+    without: Collection[str] = (),
+) -> pa.Table:
     """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
-    where: the file, for errors. columns: only those of these that it has.
+    where: the file, for errors. columns: only those of these that it has. without: none of these.
     """
     with _opened(source, where) as file:
         there = Counter(file.schema_arrow.names)
         if repeated := [name for name, count in there.items() if count > 1]:
             raise OutputError(f"{where} has several columns {repeated[0]!r}; leave one")
-        wanted = None if columns is None else [name for name in columns if name in there]
+        wanted = [n for n in columns or there if n in there and n not in without]
         # One thread: this runs in DataLoader workers, which bring their own parallelism.
         table = file.read(wanted, use_threads=False)
         table.validate(full=True)  # Arrow does not look at texts as it reads

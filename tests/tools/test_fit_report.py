@@ -141,9 +141,7 @@ def test_missing_surfaces_are_a_share_and_not_an_error():
     assert 0 < score.numbers["no_surface"] < 1
     assert score.numbers["no_surface"] == pytest.approx(1 - surface.mean())
     assert score.numbers["depth_pixels"] == surface.sum()
-    assert score.numbers["depth_median_m"] == pytest.approx(
-        0.1, abs=1e-6
-    )
+    assert score.numbers["depth_median_m"] == pytest.approx(0.1, abs=1e-6)
 
 
 def test_recorded_exposure_is_part_of_the_picture():
