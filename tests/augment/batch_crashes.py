@@ -24,8 +24,8 @@ from fork_server import keep_in_forks, start_fork_server
 
 from augment.effects.snow import support as beds
 from augment.jobs.atomic import TEMPORARY_SUFFIX
-from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.job_state import ProgressLog
+from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.flood import Flood
 from recipes.snow import Snow

@@ -45,10 +45,10 @@ from tqdm import tqdm
 import augment.jobs.generate as drive
 import augment.jobs.pools as pools
 from augment.errors import OutputError
-from augment.jobs.pools import Finished, ProcessPool
 from augment.jobs.block_worker import IndexTask
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.jobs.manifest import read_finished
+from augment.jobs.pools import Finished, ProcessPool
 from augment.jobs.store import open_store
 from augment.jobs.tables import lidar_bytes
 

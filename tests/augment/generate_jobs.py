@@ -21,9 +21,9 @@ from augment.cameras import Camera
 from augment.errors import OutputError
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.generate import GenerateJob
+from augment.jobs.job_state import ProgressLog
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.manifest import read_finished
-from augment.jobs.job_state import ProgressLog
 from augment.jobs.store import open_store
 from augment.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
