@@ -176,6 +176,7 @@ def test_a_standing_car_tells_nothing():
     assert find_ego_mask([], []).shape == (0, 0)
 
 
+@pytest.mark.long
 def test_frames_are_taken_where_the_car_moved():
     cameras, _ = drive_pictures(car_rows=None, frames=100, step_m=0.2)
     chosen = moving_frames(cameras)

@@ -38,6 +38,7 @@ def test_only_the_back_camera_sees_the_own_car(scene):
     assert views.problems == ()
 
 
+@pytest.mark.long
 def test_its_calibration_is_right_and_a_turned_camera_is_noticed(scene):
     few = dataclasses.replace(scene, frames=scene.frames[::2])
     cameras = ["front_camera", "right_camera", "left_camera"]

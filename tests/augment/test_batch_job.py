@@ -300,6 +300,7 @@ def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
     assert (state / "lock").read_bytes() == b""
 
 
+@pytest.mark.long
 def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
     """As after the parent was killed: the folder is free once the last worker has gone."""
     monkeypatch.setattr("augment.jobs.processes.ORPHANS_S", 0.1)

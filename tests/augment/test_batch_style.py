@@ -76,7 +76,7 @@ def reds(out: Path) -> dict[str, set[int]]:
         assert image is not None
         return int(image[0, 1, 2])
 
-    folders = (out / "street").iterdir()
+    folders = (out / "street").glob("*-*")
     return {folder.name: set(map(red, folder.glob("images/*/*.png"))) for folder in folders}
 
 

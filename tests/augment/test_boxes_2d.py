@@ -365,7 +365,7 @@ def test_targets_of_what_is_seen(whole: Path) -> None:
         ):
             torchvision_sample(older, **asked)
     unchecked = torchvision_sample.__wrapped__  # as in production, where nothing checks types
-    with pytest.raises(ValueError, match="bounds must be 'amodal' or 'modal'; got 'tight'"):
+    with pytest.raises(ValueError, match="bounds must be one of amodal, modal; got 'tight'"):
         unchecked(sample, bounds="tight")
 
 

@@ -84,6 +84,7 @@ def test_names_are_safe(store, name):
         try_claim(store, name)
 
 
+@pytest.mark.long
 def test_threads_and_processes_contend(remote, tmp_path):
     """Three at a time on this machine, and three through the server."""
     local = open_store(tmp_path / "out")

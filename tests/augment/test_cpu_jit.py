@@ -73,6 +73,7 @@ def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch):
     assert hits(kernel(double)) == 1
 
 
+@pytest.mark.long
 def test_importing_compiles_nothing():
     code = (
         "import numba.core.event as e\n"
@@ -212,6 +213,7 @@ def test_workers_forked_after_the_parent_rendered():
     run(FORKED_WORKERS)
 
 
+@pytest.mark.long
 def test_without_tbb_callers_take_turns():
     """numba's own layer ends the process when two threads launch kernels at once."""
     assert "install the package 'tbb'" in run(ONE_CALLER).stderr

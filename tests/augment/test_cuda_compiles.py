@@ -55,6 +55,7 @@ def test_launches_are_told_apart_by_what_is_compiled_for_them():
     assert not unaligned["source"]["aligned"] and unaligned["num_warps"] == 2
 
 
+@pytest.mark.long
 @interpreted
 def test_what_is_wrong_with_a_kernel_is_seen():
     with recorded_launches() as broken, pytest.raises(Exception, match="arange"):

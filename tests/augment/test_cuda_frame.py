@@ -246,6 +246,7 @@ def test_a_view_is_that_of_the_cpu(scene, away, name):
     assert expected.rgb.std() > 5  # there is something to see
 
 
+@pytest.mark.long
 def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
     """The host asks the GPU for one number a raster pass, and for finished images."""
     asked = []

@@ -148,6 +148,7 @@ def test_without_ceilings_nothing_else_is_measured_and_unknown_sections_are_refu
         measure(GpuCase(), sections=("y",), timing=once())
 
 
+@pytest.mark.long
 def test_views_are_no_launches_and_interpreted_kernels_hide_their_own_operations():
     with gpu.TorchOps() as ops:
         rows = torch.ones(6).reshape(2, 3)[1]  # one operation and two views of it
