@@ -326,7 +326,7 @@ def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> No
 
 
 def _from_json(data: bytes, where: str) -> StoredPlan:
-    with reading_back(where, "Delete it and start the job again"):
+    with reading_back(where, "Start the job again, which writes it anew"):
         return _STORED_PLAN.validate_json(data, strict=True)
 
 

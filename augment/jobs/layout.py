@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
+from pydantic import ValidationError
+
 from augment import effects
 from augment.errors import OutputError
 from augment.jobs.box_tables import BOXES_2D
@@ -123,6 +125,9 @@ def reading_back(where: str, advice: str) -> Iterator[None]:
         ValueError,
     ) as e:
         problem = f"{e} is missing" if isinstance(e, KeyError) else " ".join(str(e).split())
+        if isinstance(e, ValidationError):  # of all that differs, the first
+            first = e.errors(include_url=False)[0]
+            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise OutputError(f"{where} is damaged: {problem}. {advice}") from e
 
 

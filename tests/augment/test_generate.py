@@ -253,7 +253,7 @@ DAMAGES = [b"", b"{", b"[]", b"null", b'{"format":2}', b"\xff", b"[" * 100_000,
 @pytest.mark.usefixtures("unchecked")
 def test_a_damaged_plan_is_told_and_written_again(tmp_path: Path, data: bytes) -> None:
     write_atomic(tmp_path / ".climategs" / "jobs" / "job.json", data)
-    with pytest.raises(OutputError, match=r"job\.json is damaged: .*Delete it"):
+    with pytest.raises(OutputError, match=r"job\.json is damaged: .*Start the job again"):
         read_status(open_store(tmp_path))
     job = make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))
     assert run(job).written == 2
