@@ -48,6 +48,7 @@ from augment.jobs.layout import (
 )
 from augment.jobs.manifest import (
     OK,
+    PARTS,
     Identity,
     Pictured,
     image_row,
@@ -344,6 +345,7 @@ class JobState:
             variant.write_files(boxes, variant.identity.trajectory)
         if variants:
             self._replace_rows([r for v in variants for r in v.rows.values()], variants)
+            self._drop_sweeps()
         for variant in variants:
             variant.progress_log.remove()
 
@@ -373,6 +375,23 @@ class JobState:
         for variant in variants:
             variant.progress_log.remove()
         _remove_tree(trash)
+
+    def _drop_sweeps(self) -> None:
+        """Delete the scene's sweeps that no image has any more, unless other jobs are under way,
+        whose images the manifest does not have yet.
+        """
+        mine = {variant.folder for variant in self.variants}
+        if (self.out_dir / PARTS).is_dir() or not mine.issuperset(logged_variants(self.out_dir)):
+            return
+        assert self._table is not None, "the manifest has just been written"
+        named = set(self._table["lidar_path"].to_pylist())
+        folder = self.out_dir / folder_name(self.index.name) / SWEEPS
+        with refusals_of(folder):
+            for path in folder.glob("*.parquet"):
+                if path.relative_to(self.out_dir).as_posix() not in named:
+                    path.unlink()
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
     def _replace_rows(self, rows: list[dict[str, Any]], variants: Sequence[VariantState]) -> None:
         """Exchange rows of the manifest as it is now: other jobs may have merged theirs."""
