@@ -608,10 +608,18 @@ class WritePump:
         future.add_done_callback(run)
 
     def close(self) -> None:
-        """Wait for all tasks. Raises what one of them raised."""
-        self._pool.shutdown(wait=True)
-        if self._error is not None:
-            raise self._error
+        """Wait for all tasks, also where an interrupt comes meanwhile, which is raised afterwards.
+        Raises what one of them raised.
+        """
+        interrupt: BaseException | None = None
+        while True:
+            try:
+                self._pool.shutdown(wait=True)
+                break
+            except KeyboardInterrupt as error:
+                interrupt = error
+        if (error := self._error or interrupt) is not None:
+            raise error
 
     def _done(self, future: Future) -> None:
         self._error = self._error or future.exception()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import threading
 import time
 from dataclasses import dataclass, field
@@ -206,6 +207,21 @@ def test_what_fails_after_a_task_stops_the_pump() -> None:
         pump.submit(lambda: 4)
     with pytest.raises(OutputError, match="the disk is full"):
         pump.close()
+
+
+def test_an_interrupt_waits_for_what_is_being_written() -> None:
+    pump, written = WritePump(), []
+
+    def write() -> None:
+        time.sleep(0.2)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.2)
+        written.append(True)
+
+    pump.submit(write)
+    with pytest.raises(KeyboardInterrupt):
+        pump.close()
+    assert written
 
 
 @pytest.mark.long
