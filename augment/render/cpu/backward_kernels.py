@@ -25,7 +25,6 @@ from numba import prange
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.blend import (
-    Images,
     Work,
     alpha_of,
     is_closed,
@@ -133,7 +132,6 @@ def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
     state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
     values, places = work.values, work.places
     records, ids = splats.records, splats.tile_splat_ids
-    images = Images(shares, shares, d_depth, None, None, None, None)
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
         if first < last:
@@ -144,7 +142,7 @@ def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), U(count), corner, images, staged)
+        stage(records, ids, U(at), U(count), corner, staged)
         for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):

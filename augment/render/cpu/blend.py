@@ -4,7 +4,8 @@ Batch by batch of a tile's list, strip by strip, the items (geometry.list_items)
 turn. Strips shrink to the rows in which a pixel still lets light through, and a tile ends where
 none does.
 
-Images that are not asked for are None, which the compiler turns into no code at all.
+The kernel is compiled twice: for colour and alpha alone (`wanted` is None), and for everything,
+where the bits of `wanted` say which images there are.
 """
 
 from __future__ import annotations
@@ -278,8 +279,15 @@ STATE = MODELESS_STATE + MODE_PLANES * PIXELS
 CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 
 
+# Bits of `wanted`: the images, in the order of BUFFERS; then whether splats have cuts, some splat
+# of the batch at hand is cut, and colour depends on splats' lights.
+RGB, ALPHA, EXPECTED, MEDIAN, IDS, MODES, OVERLAY, CLIP, CUT, LIT_RGB = (1 << i for i in range(10))
+SURFACES = EXPECTED | MODES  # images of depths that a cut bends
+ORDERED = MEDIAN | IDS | MODES  # images that most pixels need no more splats for early on
+
+
 class Images(NamedTuple):
-    """Flat images to write, in the order of BUFFERS; None where one is not asked for."""
+    """Flat images to write, in the order of BUFFERS; empty where one is not asked for."""
 
     rgb: Any
     alpha: Any
@@ -291,8 +299,8 @@ class Images(NamedTuple):
 
 
 class TileSplats(NamedTuple):
-    """What tiles blend. records, cuts, lights: flat, of each slot (see layout, geometry); cuts and
-    lights may be None. tile_splat_ids, tile_offsets: every tile's list of slots.
+    """What tiles blend. records, cuts, lights: flat, of each slot (see layout, geometry).
+    tile_splat_ids, tile_offsets: every tile's list of slots.
     """
 
     records: Any
@@ -328,51 +336,53 @@ class Work(NamedTuple):
 
 
 @kernel
-def blend_tiles(splats, tiles, states, is_last, frame, images):
+def blend_tiles(splats, tiles, states, is_last, frame, images, wanted):
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
     tiles: uint8 [tiles], CLOSED, OPEN or FRESH, updated. states: float32 [tiles * used part of
-    STATE], where open tiles wait for the next slice. images: all but alpha may be None.
+    STATE], where open tiles wait for the next slice. wanted: bits, or None for RGB and alpha.
     """
     for group in prange((tiles.size + GROUP - 1) // GROUP):
-        size = frame.size
-        columns = (size[0] + TILE_W - 1) // TILE_W
-        used = states.size // tiles.size
-        work = Work(
-            np.empty(STATE, np.float32),
-            np.empty(RECORD * BATCH, np.float32),
-            np.empty(2 * BATCH, np.int32),
-            np.empty(2 * ITEMS, np.float32),
-            np.empty(2 * ITEMS, np.int32),
-            np.empty(2 * STRIPS, np.int64),
-            np.empty(LINES, np.float32),
-            np.empty(ITEMS, np.float32),
-            np.empty(ITEMS, np.float32),
-            np.empty(LIT, np.float32),
-        )
-        state = work.state
-        for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
-            first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
-            if tiles[tile] == CLOSED or (first == last and not is_last):
-                continue
-            left, top = tile % columns * TILE_W, tile // columns * TILE_H
-            if tiles[tile] == FRESH:
-                _clear(state, used, size[0] - left, size[1] - top)
-            else:
-                _copy(states, U(tile * used), state, U(0), U(used))
-            corner = (np.float32(left), np.float32(top))
-            is_open = _blend_list(splats, first, last, corner, frame.limits, images, work)
-            if is_open and not is_last:
-                _copy(state, U(0), states, U(tile * used), U(used))
-                tiles[tile] = OPEN
-            else:
-                if images.mode is not None:
-                    close_clusters(state, P_MODE)
-                _write_pixels(
-                    state, left, top, size, images.rgb, images.alpha, images.expected,
-                    images.median, images.ids, images.mode, images.overlay,
-                )  # fmt: skip
-                tiles[tile] = CLOSED
+        _blend_group(np.int64(group), splats, tiles, states, is_last, frame, images, wanted)
+
+
+@inner()
+def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
+    size = frame.size
+    columns = (size[0] + TILE_W - 1) // TILE_W
+    used = states.size // tiles.size
+    work = Work(
+        np.empty(STATE, np.float32),
+        np.empty(RECORD * BATCH, np.float32),
+        np.empty(2 * BATCH, np.int32),
+        np.empty(2 * ITEMS, np.float32),
+        np.empty(2 * ITEMS, np.int32),
+        np.empty(2 * STRIPS, np.int64),
+        np.empty(LINES, np.float32),
+        np.empty(ITEMS, np.float32),
+        np.empty(ITEMS, np.float32),
+        np.empty(LIT, np.float32),
+    )
+    state = work.state
+    for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
+        first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
+        if tiles[tile] == CLOSED or (first == last and not is_last):
+            continue
+        left, top = tile % columns * TILE_W, tile // columns * TILE_H
+        if tiles[tile] == FRESH:
+            _clear(state, used, size[0] - left, size[1] - top)
+        else:
+            _copy(states, U(tile * used), state, U(0), U(used))
+        corner = (np.float32(left), np.float32(top))
+        is_open = _blend_list(splats, first, last, corner, frame.limits, wanted, work)
+        if is_open and not is_last:
+            _copy(state, U(0), states, U(tile * used), U(used))
+            tiles[tile] = OPEN
+        else:
+            if wanted is not None and wanted & MODES:
+                close_clusters(state, P_MODE)
+            _write_pixels(state, left, top, size, images, wanted)
+            tiles[tile] = CLOSED
 
 
 @inner()
@@ -398,7 +408,7 @@ def _clear(state, used, width, height):
 
 
 @inner()
-def _blend_list(splats, first, last, corner, limits, images, work):
+def _blend_list(splats, first, last, corner, limits, wanted, work):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
     records, ids = splats.records, splats.tile_splat_ids
@@ -411,11 +421,14 @@ def _blend_list(splats, first, last, corner, limits, images, work):
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), U(count), corner, images, staged)
-        if images.rgb is not None:
-            stage_lights(splats.lights, ids, U(at), U(count), work.lit)
-        has_surfaces = images.expected is not None or images.mode is not None
-        any_cut = stage_cuts(splats.cuts, ids, U(at), U(count), staged, has_surfaces, work.lines)
+        stage(records, ids, U(at), U(count), corner, staged)
+        any_cut = False
+        if wanted is not None:
+            if wanted & LIT_RGB:
+                stage_lights(splats.lights, ids, U(at), U(count), work.lit)
+            if wanted & CLIP:
+                bent = wanted & SURFACES != 0
+                any_cut = stage_cuts(splats.cuts, ids, U(at), U(count), staged, bent, work.lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -423,26 +436,22 @@ def _blend_list(splats, first, last, corner, limits, images, work):
             items = list_items(staged, U(count), strip, spans, work.values, work.places)
             if items == U(0):
                 continue
-            if splats.cuts is not None and has_surfaces:
-                list_lines(work.lines, SURFACE, U(count), strip, spans, work.surfaces)
-            if splats.cuts is not None and any_cut:
-                list_lines(work.lines, SHARE, U(count), strip, spans, work.edges)
-                _blend_items(work, items, limits, images, splats.cuts, splats.lights, work.edges)
-            elif (
-                images.median is not None or images.ids is not None or images.mode is not None
-            ) and _can_change(state, strip, rows, images.median, images.ids, images.mode):
-                _blend_items(work, items, limits, images, splats.cuts, splats.lights, None)
-            else:
-                fewer = Images(
-                    images.rgb, images.alpha, images.expected, None, None, None, images.overlay
-                )
-                _blend_items(work, items, limits, fewer, splats.cuts, splats.lights, None)
+            now = wanted
+            if wanted is not None:
+                if wanted & CLIP and wanted & SURFACES:
+                    list_lines(work.lines, SURFACE, U(count), strip, spans, work.surfaces)
+                if any_cut:
+                    list_lines(work.lines, SHARE, U(count), strip, spans, work.edges)
+                    now = wanted | CUT
+                elif wanted & ORDERED and not _can_change(state, strip, rows, wanted):
+                    now = wanted & ~ORDERED
+            _blend_items(work, items, limits, now)
             shrink(state, strip, rows)
     return not is_closed(rows)
 
 
 @inner()
-def _can_change(state, strip, rows, median, ids, mode):
+def _can_change(state, strip, rows, wanted):
     """Whether a pixel of the strip may still find its median depth or a heavier splat or cluster.
 
     It finds none once its transmittance has fallen below one half and the best weight so far,
@@ -452,11 +461,11 @@ def _can_change(state, strip, rows, median, ids, mode):
     for row in range(rows[2 * strip], rows[2 * strip + 1]):
         at = U(strip * STRIP + row * LANES)
         transmittance = v8.load(state, at)
-        if median is not None:
+        if wanted & MEDIAN:
             most = v8.maximum(most, transmittance - v8.splat(np.float32(0.5)))
-        if ids is not None:
+        if wanted & IDS:
             most = v8.maximum(most, transmittance - v8.load(state, at + P_BEST))
-        if mode is not None:
+        if wanted & MODES:
             most = v8.maximum(most, can_grow(state, at + P_MODE, transmittance))
     return v8.any_not_negative(most)
 
@@ -482,14 +491,10 @@ def shrink(state, strip, rows):
 
 
 @inner()
-def _blend_items(work, items, limits, images, cuts, lights, edges):
-    """Blend all items in turn. The next one's alpha is begun before this one is blended.
-
-    edges: None where no splat is cut.
-    """
+def _blend_items(work, items, limits, wanted):
+    """Blend all items in turn. The next one's alpha is begun before this one is blended."""
     state, staged, values, places = work.state, work.staged, work.values, work.places
-    rgb, expected, median, ids = images.rgb, images.expected, images.median, images.ids
-    mode, overlay, lines, lit = images.mode, images.overlay, work.lines, work.lit
+    lines, lit = work.lines, work.lit
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     least, end = v8.splat(limits[2]), v8.splat(limits[7])
     zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
@@ -497,13 +502,13 @@ def _blend_items(work, items, limits, images, cuts, lights, edges):
     places[items] = 0  # one item is read beyond the last
     splat = U(places[0])
     alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
-    if edges is not None:
-        alpha = alpha * kept_share(lines, edges, splat, U(0))
+    if wanted is not None and wanted & CUT:
+        alpha = alpha * kept_share(lines, work.edges, splat, U(0))
     for item in range(items):
         following = U(places[item + U(1)])
         next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
-        if edges is not None:
-            next_alpha = next_alpha * kept_share(lines, edges, following, item + U(1))
+        if wanted is not None and wanted & CUT:
+            next_alpha = next_alpha * kept_share(lines, work.edges, following, item + U(1))
         at = U(places[item + U(ITEMS)])
         transmittance = v8.load(state, at)
         weight = alpha * transmittance
@@ -511,38 +516,39 @@ def _blend_items(work, items, limits, images, cuts, lights, edges):
         kept = v8.greater(after, least)
         weight = v8.select(kept, weight, zero)
         v8.store(state, at, remaining_transmittance(transmittance, after, kept, end))
-        if rgb is not None:
+        if wanted is None or wanted & RGB:
             _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(L.BLUE) * n + splat])
-        if rgb is not None and lights is not None and is_lit(lit, splat):
-            share = weight * light_share(lit, staged, values, splat, item, at, limits)
-            _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
-            _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
-            _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
-        if overlay is not None:
-            _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
-        if expected is not None or mode is not None:
-            centre = staged[U(L.DEPTH) * n + splat]
-            depth = v8.splat(centre)
-            if cuts is not None:
-                depth = surface_depth(lines, work.surfaces, splat, item, centre, limits[3])
-            if expected is not None:
-                sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
-                v8.store(state, at + P_DEPTH, sums)
-            if mode is not None:
-                add_sample(state, at + P_MODE, depth, weight, limits[4])
-        if median is not None:
-            crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
-            depth = v8.splat(staged[U(L.DEPTH) * n + splat])
-            before = v8.load(state, at + P_MEDIAN)
-            v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
-        if ids is not None:
-            best = v8.load(state, at + P_BEST)
-            heavier = v8.greater(weight, best)
-            v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
-            number = v8.splat(staged[U(L.SPLAT_ID) * n + splat])
-            v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
+        if wanted is not None:
+            if wanted & LIT_RGB and is_lit(lit, splat):
+                share = weight * light_share(lit, staged, values, splat, item, at, limits)
+                _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
+                _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
+                _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
+            if wanted & OVERLAY:
+                _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
+            if wanted & SURFACES:
+                centre = staged[U(L.DEPTH) * n + splat]
+                depth = v8.splat(centre)
+                if wanted & CLIP:
+                    depth = surface_depth(lines, work.surfaces, splat, item, centre, limits[3])
+                if wanted & EXPECTED:
+                    sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
+                    v8.store(state, at + P_DEPTH, sums)
+                if wanted & MODES:
+                    add_sample(state, at + P_MODE, depth, weight, limits[4])
+            if wanted & MEDIAN:
+                crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
+                depth = v8.splat(staged[U(L.DEPTH) * n + splat])
+                before = v8.load(state, at + P_MEDIAN)
+                v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
+            if wanted & IDS:
+                best = v8.load(state, at + P_BEST)
+                heavier = v8.greater(weight, best)
+                v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
+                number = v8.splat(staged[U(L.SPLAT_ID) * n + splat])
+                v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
         alpha, splat = next_alpha, following
 
 
@@ -568,8 +574,8 @@ def _add(state, at, weight, value):
 
 
 @inner()
-def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, overlay):
-    """Pixels of a finished tile to the images, which are flat."""
+def _write_pixels(state, left, top, size, images, wanted):
+    """Pixels of a finished tile to the images."""
     for y in range(U(min(TILE_H, size[1] - top))):
         for strip in range(U(STRIPS)):
             at = strip * U(STRIP) + y * U(LANES)
@@ -577,20 +583,24 @@ def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mod
             pixel = U((top + np.int64(y)) * size[0] + column)
             for lane in range(U(max(min(LANES, size[0] - column), 0))):
                 opacity = np.float32(1) - abs(state[at + lane])
-                alpha[pixel + lane] = opacity
-                if rgb is not None:
+                images.alpha[pixel + lane] = opacity
+                if wanted is None or wanted & RGB:
                     first = U(3) * (pixel + lane)
-                    rgb[first] = state[at + lane + P_RED]
-                    rgb[first + U(1)] = state[at + lane + P_GREEN]
-                    rgb[first + U(2)] = state[at + lane + P_BLUE]
-                if expected is not None:
-                    weighted = state[at + lane + P_DEPTH]
-                    expected[pixel + lane] = weighted / max(opacity, np.float32(DEPTH_EPS))
-                if median is not None:
-                    median[pixel + lane] = state[at + lane + P_MEDIAN]
-                if ids is not None:
-                    ids[pixel + lane] = np.float32(state[at + lane + P_ID]).view(np.int32)
-                if mode is not None:
-                    mode[pixel + lane] = state[at + lane + P_MODE + MODE]
-                if overlay is not None:
-                    overlay[pixel + lane] = state[at + lane + P_OVERLAY]
+                    images.rgb[first] = state[at + lane + P_RED]
+                    images.rgb[first + U(1)] = state[at + lane + P_GREEN]
+                    images.rgb[first + U(2)] = state[at + lane + P_BLUE]
+                if wanted is not None:
+                    if wanted & EXPECTED:
+                        weighted = state[at + lane + P_DEPTH]
+                        images.expected[pixel + lane] = weighted / max(
+                            opacity, np.float32(DEPTH_EPS)
+                        )
+                    if wanted & MEDIAN:
+                        images.median[pixel + lane] = state[at + lane + P_MEDIAN]
+                    if wanted & IDS:
+                        number = np.float32(state[at + lane + P_ID]).view(np.int32)
+                        images.ids[pixel + lane] = number
+                    if wanted & MODES:
+                        images.mode[pixel + lane] = state[at + lane + P_MODE + MODE]
+                    if wanted & OVERLAY:
+                        images.overlay[pixel + lane] = state[at + lane + P_OVERLAY]

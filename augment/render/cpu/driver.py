@@ -180,6 +180,7 @@ _RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
 _SLICE_COVER = 10.0
 _SLICE_GROWTH = 1.4
 _MIN_SLICE = 20_000  # fewer splats cost less than another slice does
+_DTYPES = {SPLAT_IDS: np.int32}  # of images; others are float32
 _MAX_PAIRS = 1 << 24  # (splat, tile) pairs listed at once: 64 MB
 
 
@@ -243,9 +244,8 @@ class StageTimer:
 def image_arrays(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
     size = (camera.height, camera.width)
     shapes = {RGB: (*size, 3)}
-    dtypes = {SPLAT_IDS: np.int32}
     return {
-        name: np.empty(shapes.get(name, size), dtypes.get(name, np.float32)) for name in buffers
+        name: np.empty(shapes.get(name, size), _DTYPES.get(name, np.float32)) for name in buffers
     }
 
 
@@ -283,26 +283,23 @@ def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
 def project(
     inputs: Inputs, depths: np.ndarray, bins: tuple[int, int], tiles: Tiles, scratch: Scratch
 ) -> project_kernels.Splats:
-    """The slice's splats; cuts and lights None where nothing asks for them."""
+    """The slice's splats; cuts and lights are empty where nothing asks for them."""
     blocks = len(inputs.blocks)
-    is_cut = bool(inputs.modes[layout.M_CLIP])
-    cuts = scratch.array("cuts", (geometry.CUT * (inputs.slots if is_cut else 1),), np.float32)
-    is_lit = bool(inputs.modes[layout.M_LIGHT])
-    lights = (geometry.SHADING_LINES * (inputs.slots if is_lit else 1),)
-    lights = scratch.array("lights", lights, np.float32)
+    cuts = geometry.CUT * inputs.slots if inputs.modes[layout.M_CLIP] else 0
+    lights = geometry.SHADING_LINES * inputs.slots if inputs.modes[layout.M_LIGHT] else 0
     splats = project_kernels.Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
         scratch.array("keys", (inputs.slots,), np.uint32),
         scratch.array("found", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
-        cuts,
-        lights,
+        scratch.array("cuts", (cuts,), np.float32),
+        scratch.array("lights", (lights,), np.float32),
     )
     project_kernels.project_slice(
         inputs.read, depths.view(np.uint32), np.array(bins, np.int64), tiles.open_sums(), splats
     )
-    return splats._replace(cuts=cuts if is_cut else None, lights=lights if is_lit else None)
+    return splats
 
 
 def sort(
@@ -351,8 +348,10 @@ class Tiles:
         self.frame = blend_kernels.Frame(size, limits)
         # Alpha is always written, so that kernels come in fewer variants.
         spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
-        flat = {name: image.reshape(-1) for name, image in (spare | images).items()}
-        self._images = blend_kernels.Images(*(flat.get(name) for name in BUFFERS))
+        none = {name: np.empty(0, _DTYPES.get(name, np.float32)) for name in BUFFERS}
+        flat = {name: image.reshape(-1) for name, image in (none | spare | images).items()}
+        self._images = blend_kernels.Images(*(flat[name] for name in BUFFERS))
+        self._wanted = sum(1 << BUFFERS.index(name) for name in {ALPHA, *images})
         used = _state_size(images)
         self._scratch = scratch
         self._states = scratch.array("states", (count * used,), np.float32)
@@ -364,8 +363,7 @@ class Tiles:
         drawn = any_in_squares(pixel_mask, layout.TILE_W)
         self.open[~drawn.reshape(-1)] = blend_kernels.CLOSED
         for image in self._images:
-            if image is not None:
-                image.fill(0)
+            image.fill(0)
 
     def open_sums(self) -> np.ndarray:
         """int32 [rows + 1, columns + 1]: open tiles above and to the left."""
@@ -404,13 +402,16 @@ class Tiles:
         is_last: bool,
     ) -> blend_kernels.TileSplats:
         """Blend every open tile's list; is_last closes them all. Returns what was blended."""
-        lights = splats.lights if self._images.rgb is not None else None
         listed = blend_kernels.TileSplats(
-            splats.records, splats.cuts, lights, tile_splat_ids, tile_offsets
+            splats.records, splats.cuts, splats.lights, tile_splat_ids, tile_offsets
         )
+        wanted = self._wanted
+        wanted |= blend_kernels.CLIP if splats.cuts.size else 0
+        wanted |= blend_kernels.LIT_RGB if splats.lights.size and wanted & blend_kernels.RGB else 0
         blend_kernels.blend_tiles(
-            listed, self.open, self._states, is_last, self.frame, self._images
-        )
+            listed, self.open, self._states, is_last, self.frame, self._images,
+            None if wanted == blend_kernels.RGB | blend_kernels.ALPHA else wanted,
+        )  # fmt: skip
         return listed
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -22,27 +22,15 @@ ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the sur
 
 
 @inner()
-def stage(records, tile_splat_ids, at, count, corner, images, staged):
-    """Records of a batch, turned to one row a field, relative to the tile's corner. images: those
-    that are not None say which fields.
-    """
+def stage(records, tile_splat_ids, at, count, corner, staged):
+    """Records of a batch, turned to one row a field, relative to the tile's corner."""
     n, (left, top) = U(BATCH), corner
     for k in range(count):
         record = U(tile_splat_ids[at + k]) * U(RECORD)
-        staged[U(L.MEAN_X) * n + k] = records[record + U(L.MEAN_X)] - left
-        staged[U(L.MEAN_Y) * n + k] = records[record + U(L.MEAN_Y)] - top
-        for field in range(U(L.LEAN_X), U(L.BLUNT_Y + 1)):
+        for field in range(U(RECORD)):
             staged[field * n + k] = records[record + field]
-        if images.expected is not None or images.median is not None or images.mode is not None:
-            staged[U(L.DEPTH) * n + k] = records[record + U(L.DEPTH)]
-        if images.ids is not None:
-            staged[U(L.SPLAT_ID) * n + k] = records[record + U(L.SPLAT_ID)]
-        if images.overlay is not None:
-            staged[U(L.IS_OVERLAY) * n + k] = records[record + U(L.IS_OVERLAY)]
-        if images.rgb is not None:
-            staged[U(L.RED) * n + k] = records[record + U(L.RED)]
-            staged[U(L.GREEN) * n + k] = records[record + U(L.GREEN)]
-            staged[U(L.BLUE) * n + k] = records[record + U(L.BLUE)]
+        staged[U(L.MEAN_X) * n + k] -= left
+        staged[U(L.MEAN_Y) * n + k] -= top
 
 
 @inner()
@@ -328,12 +316,10 @@ def _depth_slope(x, y, z):
 def stage_cuts(cuts, tile_splat_ids, at, count, staged, has_surfaces, lines):
     """Cuts of a batch, turned to one row a number, about the tile's corner. staged: list_items'.
 
-    cuts: None without a clip. has_surfaces: whether the lines of the surfaces are wanted. Returns
-    whether any splat is cut: the others lie wholly on the kept side.
+    has_surfaces: whether the lines of the surfaces are wanted. Returns whether any splat is cut:
+    the others lie wholly on the kept side.
     """
     n, any_cut = U(BATCH), False
-    if cuts is None:
-        return any_cut
     for k in range(count):
         cut = U(tile_splat_ids[at + k]) * U(CUT)
         x, y = staged[U(L.MEAN_X) * n + k], staged[U(L.MEAN_Y) * n + k]
@@ -431,9 +417,7 @@ def light_eight(m, towards, view):
 
 @inner()
 def stage_lights(lights, tile_splat_ids, at, count, lit):
-    """Lines of a batch, turned to one row a number; nothing where lights is None."""
-    if lights is None:
-        return
+    """Lines of a batch, turned to one row a number."""
     n = U(BATCH)
     for k in range(count):
         first, most = U(tile_splat_ids[at + k]) * U(SHADING_LINES), np.float32(0)
