@@ -247,27 +247,6 @@ def test_many_updates_follow_plain_adam():
         assert np.median(moved) > 1e-3, name  # far more than the tolerances above
 
 
-def test_the_first_step_is_the_step_size_whatever_the_gradient():
-    """Bias correction: m / sqrt(v) is the sign at first. Means move by pixels, so by z / fx."""
-    splats = some_splats()
-    before = copied(splats)
-    update = random_update(splats, 0, present=BOTH[:1])
-    apply_update(splats, update)
-    at = update.touched[0]
-    g = update.gradients[0]
-    pixel_m = before["means"][at, :1] / update.camera.fx  # z is x for a camera at the origin
-    moved = splats.means[at] - before["means"][at]
-    # float32 rounds means of up to 10 m to 5e-7 m
-    expected = -np.sign(g[:, G_MEAN : G_MEAN + 3]) * FASTER.means * pixel_m
-    np.testing.assert_allclose(moved, expected, rtol=1e-5, atol=2e-6)
-    grown = np.log(splats.scales[at].astype(np.float64) / before["scales"][at])
-    expected = -np.sign(g[:, G_SCALE : G_SCALE + 3]) * FASTER.scales
-    np.testing.assert_allclose(grown, expected, rtol=1e-5)  # exp2 and roots in float32
-    changed = splats.sh[at, 0] - before["sh"][at, 0]
-    expected = -np.sign(g[:, G_COLOR : G_COLOR + 3]) * FASTER.sh_dc
-    np.testing.assert_allclose(changed, expected, rtol=1e-4)  # values up to 2 round to 1e-7
-
-
 def test_what_is_not_touched_or_not_learnt_yet_keeps_its_bits():
     splats = some_splats()
     for seed in range(3):
@@ -304,19 +283,6 @@ def test_a_gradient_that_is_not_finite_leaves_its_splat_as_it_was():
         assert np.array_equal(array, expected), name
 
 
-def test_quaternions_stay_unit_and_turn_along_the_sphere():
-    splats = some_splats()
-    for seed in range(30):
-        update = random_update(splats, seed % 7)
-        for part, gradients in update.gradients.items():
-            quats = splats.quats[splats.starts[part] + update.touched[part]]
-            own = gradients[:, G_QUAT : G_QUAT + 4]
-            own -= (own * quats).sum(1, keepdims=True) * quats  # as the rasteriser's: tangential
-        apply_update(splats, update)
-    norms = np.linalg.norm(splats.quats.astype(np.float64), axis=1)
-    assert np.abs(norms - 1).max() < 3e-7  # normalised at every step, four products and a root
-
-
 def test_values_are_clamped():
     """Scales between a millimetre and the scene's extent, opacities short of 0 and 1."""
     splats = some_splats()
@@ -335,20 +301,6 @@ def test_values_are_clamped():
         assert np.isfinite(array).all()
 
 
-def test_opacities_of_zero_and_one_can_be_learnt_from():
-    """They have no logit: they count as the clamped value."""
-    for opacity, towards in ((0.0, -1.0), (1.0, 1.0)):
-        splats = some_splats()
-        splats.opacities[:] = opacity
-        update = random_update(splats, 0)
-        for gradients in update.gradients.values():
-            gradients[:, G_OPACITY] = towards
-        apply_update(splats, update)
-        assert np.isfinite(splats.opacities).all()
-        moved = splats.opacities[update.touched[0]]
-        assert (moved < 0.9995).all() if opacity else (moved > 1e-4).all()
-
-
 @pytest.mark.usefixtures("any_threads")
 def test_same_bits_for_any_number_of_threads():
     results = []
@@ -361,40 +313,6 @@ def test_same_bits_for_any_number_of_threads():
     for other in results[1:]:
         for name, array in other.arrays().items():
             assert np.array_equal(array, getattr(results[0], name)), name
-
-
-def test_a_splat_that_was_updated_very_often_counts_as_unbiased():
-    splats = some_splats()
-    splats.age[:] = 3 * kernels.CORRECTED
-    before = copied(splats)
-    update = random_update(splats, 0, present=BOTH[1:])
-    apply_update(splats, update)
-    at = splats.starts[1] + update.touched[1]
-    assert (splats.age[at] == 3 * kernels.CORRECTED + 1).all()
-    # 0.1 g / sqrt(0.001 g^2): no correction
-    grown = np.log(splats.scales[at].astype(np.float64) / before["scales"][at])
-    late = FASTER.late ** (update.step / STEPS)
-    expected = 0.1 / np.sqrt(0.001) * FASTER.scales * late
-    # Old moments of zero: what is left are float32 moments, root and exp2.
-    large = np.abs(update.gradients[1][:, G_SCALE : G_SCALE + 3]) > 1
-    np.testing.assert_allclose(np.abs(grown)[large], expected, rtol=1e-4)
-
-
-# ---- step sizes ------------------------------------------------------------------------------
-
-
-def test_step_sizes_fall_over_the_run():
-    camera, rates = camera_ahead(64, 48), FASTER
-    first, last = (splat_rates(rates, done, camera, EXTENT_M) for done in (0.0, 1.0))
-    assert (first[G_MEAN], last[G_MEAN]) == pytest.approx((rates.means, rates.means_end))
-    for column, rate in (
-        (G_QUAT, rates.quats),
-        (G_SCALE, rates.scales),
-        (G_OPACITY, -rates.opacities),
-        (kernels.R_SH_DC, rates.sh_dc),
-        (kernels.R_SH_REST, rates.sh_rest),
-    ):
-        assert (first[column], last[column]) == pytest.approx((rate, rate * rates.late))
 
 
 # ---- sky and colour maps ---------------------------------------------------------------------

@@ -115,13 +115,6 @@ def test_what_else_is_asked_for_does_not_change_the_colours(scene):
     assert np.array_equal(plain.rgb, full.rgb)
 
 
-def test_smog_changes_neither_depth_nor_classes(scene):
-    clean = view_of(scene, semantic=True)
-    foggy = view_of(scene, Smog(visibility_m=10), semantic=True)
-    assert np.array_equal(clean.depth_m, foggy.depth_m)
-    assert np.array_equal(clean.semantic, foggy.semantic)
-
-
 def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     """The pixels of a car in the smog are mixed with the airlight as its label says."""
     smog = Smog(extinction_per_m=0.1, color=AIRLIGHT)
@@ -136,16 +129,6 @@ def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     assert measured["transmittance"][0] == pytest.approx(t.mean(), abs=0.01)  # of 8-bit colours
     # Behind the wall that the camera sees.
     assert measured["transmittance"][1] == pytest.approx(np.exp(-0.1 * np.hypot(3, 20)), rel=0.01)
-
-
-def test_smog_is_named_wherever_there_is_some_and_measured_for_labels_alone(scene):
-    unlabelled = view_of(scene, Smog(visibility_m=30)).effects["smog"]
-    assert unlabelled.placed.data is not None and unlabelled.depth_m is None
-    labelled = dataclasses.replace(scene, labels=CarLabels())
-    nothing = view_of(labelled, Smog(extinction_per_m=0.0), depth="none")
-    nothing = nothing.effects["smog"]
-    assert nothing.placed.data is None and nothing.depth_m is None
-    assert not view_of(labelled).effects
 
 
 def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):

@@ -66,24 +66,6 @@ def test_where_nothing_is_clamped_a_map_is_one_on_the_coefficients(count):
     assert_images_close(seen, rasterize([PosedGaussians(folded(once, maps))], camera_ahead()).rgb)
 
 
-def test_a_map_sees_colours_as_they_are_shown():
-    # Below 0 a splat shows black, and black is what is mapped.
-    black = dataclasses.replace(random_gaussians(1, sh_degree=0), sh=torch.full((1, 1, 3), -9.0))
-    solid = dataclasses.replace(
-        black,
-        means=torch.tensor([[4.0, 0, 0]]),
-        scales=torch.full((1, 3), 2.0),
-        opacities=torch.ones(1),
-    )
-    lifted = torch.cat([torch.eye(3), torch.tensor([[0.2], [0.1], [-0.1]])], 1)[None]
-    for backend in ("cpu", "reference"):
-        seen = rasterize(
-            [PosedGaussians(solid, color_maps=lifted)], camera_ahead(), backend=backend
-        )
-        shown = (seen.rgb / seen.alpha[..., None])[10, 16]
-        torch.testing.assert_close(shown, torch.tensor([0.2, 0.1, 0.0]), rtol=0, atol=1e-5)
-
-
 def test_the_identity_changes_no_bit():
     gaussians = labelled(9)
     bare = rasterize([PosedGaussians(gaussians)], camera_ahead()).rgb

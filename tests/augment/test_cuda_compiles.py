@@ -44,6 +44,7 @@ def record_views(*names: str) -> list[Launch]:
     return [*counts]
 
 
+@pytest.mark.long
 @interpreted
 def test_launches_are_told_apart_by_what_is_compiled_for_them():
     counts = record_small_kernels()

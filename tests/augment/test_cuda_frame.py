@@ -29,8 +29,7 @@ from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
 from tests import snow_scenes
-from tests.augment import pretend_gpu
-from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.augment.pretend_gpu import pretended_gpu
 
 WIDTH, HEIGHT = 33, 21
 UNIFORM = Fog(0.03, (0.5, 0.6, 0.7))
@@ -110,13 +109,6 @@ def test_smog_on_buffers(away, medium):
     torch.testing.assert_close(got.cpu(), expected, atol=2e-6, rtol=0)
 
 
-def test_smog_without_density_is_the_identity_to_the_bit(away):
-    seen = images()
-    for height in (None, 20.0):
-        got = fog_raster(on_gpu(seen), camera(), Fog(0.0, (0.5, 0.6, 0.7), height))
-        assert torch.equal(got.cpu(), seen.rgb)
-
-
 def test_colour_maps(away):
     matrix = torch.tensor([[1.1, 0.05, 0, 0.02], [-0.1, 0.9, 0.1, 0], [0, 0.2, 1.2, -0.05]])
     rgb = images().rgb
@@ -180,7 +172,6 @@ def scene() -> Scene:
     )
 
 
-EVERYTHING = Recipe(output=Output(semantic=True, instance=True))
 SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
 LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
 RECIPES = {
@@ -244,27 +235,6 @@ def test_a_view_is_that_of_the_cpu(scene, away, name):
     expected = view_of(scene, RECIPES[name], "cpu")  # first, so that it places the snow
     check_same(view_of(scene, RECIPES[name], "cuda"), expected)
     assert expected.rgb.std() > 5  # there is something to see
-
-
-@pytest.mark.long
-def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
-    """The host asks the GPU for one number a raster pass, and for finished images."""
-    asked = []
-    run = pretend_gpu._run
-
-    def watched(func, args, kwargs):
-        out = run(func, args, kwargs)
-        if isinstance(args[0], AwayTensor) and not isinstance(out, AwayTensor | tuple | list):
-            asked.append(args[0].numel())
-        return out
-
-    monkeypatch.setattr(pretend_gpu, "_run", watched)
-    camera = scene.frames[0].cameras["ahead"]
-    begun = begin_view(scene, camera, scaled(EVERYTHING), backend="cuda")
-    pixels = 16 * 9  # of three colours, depth, class and instance
-    assert asked[:1] == [1] and sorted(asked[1:]) == [pixels, pixels, pixels, 3 * pixels]
-    assert begun.result() is begun.result() and len(asked) == 5
-    check_same(begun.result(), view_of(scene, EVERYTHING, "cpu"))
 
 
 @pytest.mark.long

@@ -127,6 +127,7 @@ def test_settings_and_every_degree_of_spherical_harmonics(degree, settings):
     assert_close(actual, drawn_splats(in_float64([part]), camera, settings), flips=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("weather", [ABOVE, "light"])
 def test_an_orthographic_camera(weather):
     camera = dataclasses.replace(camera_ahead(focal=6.0), is_orthographic=True)
@@ -139,6 +140,7 @@ def test_an_orthographic_camera(weather):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keep", [BELOW])
 def test_what_a_clip_cannot_reach_is_not_drawn(keep):
     camera, part = camera_ahead(), PosedGaussians(random_gaussians(100, seed=6))
@@ -149,8 +151,8 @@ def test_what_a_clip_cannot_reach_is_not_drawn(keep):
     assert 0 < int((actual.counts > 0).sum()) < int((whole.counts > 0).sum())
 
 
-@pytest.mark.parametrize("rows", ["classes", "rows", "one map"])
-def test_maps_by_class_by_row_or_one_for_all(rows):
+@pytest.mark.parametrize("rows", ["rows", pytest.param("classes", marks=pytest.mark.long)])
+def test_maps_by_class_or_by_row(rows):
     camera, gaussians = camera_ahead(), random_gaussians(70, seed=7)
     # Rows that are none mean the first map.
     numbers = torch.arange(70, dtype=torch.int16) % 9 - 2
@@ -158,8 +160,6 @@ def test_maps_by_class_by_row_or_one_for_all(rows):
     part = PosedGaussians(dataclasses.replace(gaussians, semantic=numbers), color_maps=maps)
     if rows == "rows":
         part = dataclasses.replace(part, color_rows=numbers.flip(0))
-    if rows == "one map":
-        part = dataclasses.replace(part, color_maps=maps[2:3])
     assert_close(splats_of([part], camera), drawn_splats(in_float64([part]), camera))
 
 
@@ -180,7 +180,7 @@ def street_of_parts() -> list[PosedGaussians]:
     ]
 
 
-@pytest.mark.parametrize("weather", ["layered", ABOVE])
+@pytest.mark.parametrize("weather", ["layered", pytest.param(ABOVE, marks=pytest.mark.long)])
 def test_many_parts_in_one_launch(weather):
     camera, parts = camera_ahead(), street_of_parts()
     clip, smog = (HeightClip(0.1, ABOVE) if weather == ABOVE else None), SMOGS.get(weather)

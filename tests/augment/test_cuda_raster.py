@@ -165,7 +165,9 @@ def random_splats(count: int, columns: int, rows: int, seed: int = 0) -> CudaSpl
     )
 
 
-@pytest.mark.parametrize(("count", "columns", "rows"), [(300, 5, 3), (3, 200, 170), (0, 3, 2)])
+@pytest.mark.parametrize(
+    ("count", "columns", "rows"), [(300, 5, 3), pytest.param(3, 200, 170, marks=LONG), (0, 3, 2)]
+)
 def test_lists_hold_every_pair_once_in_order_of_depth(count, columns, rows):
     """34 000 tiles do not fit into 16 bits."""
     splats = random_splats(count, columns, rows)
@@ -191,10 +193,10 @@ def test_tiles_without_a_wanted_pixel_own_nothing():
 # ---- blending ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [(33, 21), (1, 1)], ids=lambda s: f"{s[0]}x{s[1]}")
+@pytest.mark.parametrize("size", [(17, 9), (1, 1)], ids=lambda s: f"{s[0]}x{s[1]}")
 def test_blending_random_splats(size):
     camera = camera_ahead(*size, 0.9 * max(size))
-    parts = [PosedGaussians(random_gaussians(60, seed=sum(size), size=0.4))]
+    parts = [PosedGaussians(random_gaussians(30, seed=sum(size), size=0.4))]
     expected = rasterize_reference(in_float64(parts), camera, ALL, DEFAULT, None)
     assert_agrees(blend_alone(in_float64(parts), camera), expected)
 
@@ -236,7 +238,7 @@ def blended():
     return parts, camera, blend_alone(parts, camera)
 
 
-@pytest.mark.parametrize("buffer", [RGB, MODE_DEPTH, SPLAT_IDS])
+@pytest.mark.parametrize("buffer", [RGB, SPLAT_IDS])
 def test_bits_do_not_depend_on_the_buffers_asked_for(blended, buffer):
     parts, camera, whole = blended
     alone = blend_alone(parts, camera, frozenset({buffer}))
@@ -375,9 +377,9 @@ def test_equal_depths_keep_the_order_of_indices():
 
 
 def test_wanted_pixels_have_the_bits_of_the_whole_image():
-    parts, camera = random_gaussians(50, size=0.3), camera_ahead(35, 19, 30.0)
-    wanted = torch.zeros(19, 35, dtype=torch.bool)
-    wanted[17, 30:34] = True
+    parts, camera = random_gaussians(20, size=0.3), camera_ahead(18, 18, 16.0)
+    wanted = torch.zeros(18, 18, dtype=torch.bool)
+    wanted[17, 16:] = True
     whole = render(parts, camera)
     partly = render(parts, camera, pixel_mask=wanted)
     for name in ALL:

@@ -135,39 +135,12 @@ def test_large_ones_are_split_side_by_side_along_their_longest_axis() -> None:
         assert not grown.age[first : first + 2].any()
 
 
-def test_splats_no_image_measured_are_split_by_their_size_in_the_world() -> None:
-    splats = splats_of(10, opacity=0.5)
-    splats.scales[:5] = 0.02 * EXTENT_M
-    splats.scales[5:] = 0.005 * EXTENT_M
-    splats.grads[:] = (1, 1, 0)
-    grown = round_of(splats, fraction=1.0)
-    split = (grown.scales != splats.scales[origins(grown, splats)]).any(1)
-    assert split.tolist() == [True] * 10 + [False] * 10
-
-
 def test_the_budget_goes_to_the_best() -> None:
     splats = pulled(splats_of(*PARTS), [40, 1, 33, 20, 9, 45], radius=0.002)
     rows, counts = np.unique(origins(round_of(splats, fraction=0.06), splats), return_counts=True)
     assert rows[counts == 2].tolist() == [9, 20, 45]  # 6 % of 50
     for limit, total in ((53, 53), (50, 50), (10, 50)):
         assert len(round_of(splats, fraction=0.5, max_splats=limit)) == total
-
-
-def test_what_no_view_saw_or_no_gradient_pulls_does_not_grow() -> None:
-    splats = splats_of(*PARTS)
-    splats.grads[3] = (1.0, 0, 0.2)  # not seen
-    splats.grads[4] = (1e-4, 1, 0.2)  # below the floor
-    splats.grads[5] = (1e-3, 100, 0.2)  # below it on average
-    splats.grads[6] = (np.nan, 1, 0.2)
-    splats.grads[7] = (np.inf, 1, 0.2)
-    assert same(round_of(splats, fraction=1.0), splats)
-
-
-def test_no_parent_gets_children_that_the_next_round_would_remove() -> None:
-    splats = splats_of(10, opacity=0.03)  # children: 0.0151
-    splats.grads[:] = (1, 1, 0.002)
-    assert len(round_of(splats, fraction=1.0, prune_opacity=0.02)) == 10
-    assert len(round_of(splats, fraction=1.0, prune_opacity=0.015)) == 20
 
 
 # --- removal ---

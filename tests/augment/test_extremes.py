@@ -22,7 +22,7 @@ from augment.effects.snow.support import support_of
 from augment.errors import SceneError
 from augment.plan import make_plan
 from augment.rng import rng_for
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Scene, Track
 from augment.semantics import SemanticClass
 from augment.views import WeatheredView, render_buffers, render_view
 from recipes.errors import RecipeError
@@ -107,39 +107,6 @@ def test_images_of_one_row_or_column(size: tuple[int, int], effects: tuple[str, 
     rendered(scene, camera, weather(style={"preset": "dusk"}, **chosen))
 
 
-@pytest.mark.parametrize("opacity", [0.0, 1 / 255, 1.0])
-def test_one_gaussian(opacity: float):
-    """Of opacity 0 it is the sky that shows; at 1/255 and above, the Gaussian."""
-    one = dataclasses.replace(
-        one_gaussian(opacity=opacity), semantic=torch.ones(1, dtype=torch.int16)
-    )
-    place = Place(one, 1, on_street=False)
-    view = rendered(place.scene(), camera_at((0.0, 0.0, 0.0)), weather())
-    assert view.depth_m is not None
-    assert bool(view.depth_m.any()) == (opacity == 1.0)
-    assert np.unique(view.rgb).size == (1 if opacity == 0 else np.unique(view.rgb).size)
-
-
-@pytest.mark.long
-def test_two_million_gaussians():
-    """In every effect at once; most of them far smaller than a pixel."""
-    count = 2_000_000
-    rng = np.random.default_rng(0)
-    means = rng.uniform((0.5, -4, 0), (40, 4, 6), (count, 3)).astype(np.float32)
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1
-    many = Gaussians(
-        means=torch.from_numpy(means),
-        quats=torch.from_numpy(quats),
-        scales=torch.from_numpy(10 ** rng.uniform(-8, -1, (count, 3)).astype(np.float32)),
-        opacities=torch.from_numpy(rng.uniform(0, 1, count).astype(np.float32)),
-        sh=torch.from_numpy(rng.normal(0, 1, (count, 1, 3)).astype(np.float32)),
-        semantic=torch.ones(count, dtype=torch.int16),
-    )
-    scene = Place(many, 3, on_street=True).scene()
-    rendered(scene, camera_at((0.0, 0.0, 1.2), size=(48, 27)), weather(**EVERYTHING))
-
-
 def test_nothing_at_all_is_refused():
     with pytest.raises(SceneError, match="holds no Gaussians"):
         Place(nothing(), 0, on_street=False).scene()
@@ -193,6 +160,7 @@ def assert_never_grows(less: torch.Tensor, more: torch.Tensor) -> None:
     assert worst <= room, f"denser smog adds {worst} of contrast; rounding may add {room}"
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -210,6 +178,7 @@ def test_denser_smog_never_adds_contrast_to_a_black_airlight(
         assert_never_grows(less, more)
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -226,6 +195,7 @@ def test_denser_smog_on_buffers_never_adds_contrast_to_any_airlight(
         assert_never_grows(less, more)
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -264,6 +234,7 @@ def surface(cells: SnowCells, snow: Snow, seed: int) -> np.ndarray:
     return surface_heights(cells, depths.heights)
 
 
+@pytest.mark.long
 @drawing(20)
 @given(
     st.sampled_from((0.0, 0.003, 0.1, 3.0)) | st.none(),
@@ -291,6 +262,7 @@ def test_deeper_snow_never_lowers_the_surface(
         assert sunk <= 1e-6 * (1 + float(np.abs(low).max())), f"deeper snow sank by {sunk} m"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
 def test_deeper_snow_comes_nearer_to_a_camera_above_it(shading: str):
     """Depth along the rays of a frame, within what the discs of neighbouring cells blur."""
@@ -529,16 +501,3 @@ def test_waves_without_height_are_still_water(tier: str):
     assert views[0].masks["water"].any()
     for view in views[1:]:
         assert_same_bits(view, views[0])
-
-
-def test_a_style_and_snow_without_strength_keep_a_recorded_exposure():
-    """What comes last, a camera's colour map, is not touched by effects that do nothing."""
-    import dataclasses
-
-    scene = Place(nothing(), sky=3, on_street=True).scene()
-    exposure = torch.tensor([[0.9, 0.1, 0.0, 0.02], [0, 1.1, 0, -0.3], [0, 0, 0.5, 0.4]])
-    scene = dataclasses.replace(scene, color_maps={"extreme": exposure})
-    camera = camera_at((0.0, 0.0, 1.2))
-    zero = {"snow": {"depth_m": 0.0}, "style": {"preset": "dusk", "strength": 0.0}}
-    view = render_view(scene, camera, with_effects(Recipe(), zero))
-    assert_same_bits(view, render_view(scene, camera, Recipe()))

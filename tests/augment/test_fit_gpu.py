@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("triton")
 
-from augment.errors import BackendUnavailable, ClimateGSError
+from augment.errors import BackendUnavailable
 from augment.reconstruct.config import FitConfig, Growth, Tuning
 from augment.reconstruct.trainer import Trainer
 from augment.render.cpu import backward_kernels as columns
@@ -16,7 +16,6 @@ from augment.render.layout import BLOCK
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.augment.test_trainer import QUICK, assert_same_state, quick, record, run, start, truth
-from tools.options import FitOptions
 
 if not gpu.is_interpreted():
     pytest.skip("the stand-in computes on the CPU", allow_module_level=True)
@@ -115,11 +114,3 @@ def test_without_gsplat_a_fit_does_not_begin(recorded, monkeypatch):
         trainer_on("cuda", recorded)
     with pytest.raises(ValueError, match="device must be one of cpu, cuda; got 'tpu'"):
         trainer_on("tpu", recorded)
-
-
-def test_the_device_decides_the_result_where_it_is_not_the_cpu(tmp_path):
-    own = {"scene": "procedural:street?seed=3", "out": tmp_path}
-    here, there = (FitOptions(**own, device=device) for device in ("cpu", "cuda"))
-    assert there.settings() == here.settings() | {"device": "cuda"}
-    with pytest.raises(ClimateGSError, match="--device must be 'cpu' or 'cuda'; got tpu"):
-        FitOptions(**own, device="tpu")

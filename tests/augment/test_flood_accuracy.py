@@ -10,12 +10,11 @@ import torch
 
 from adapters.base import open_scene
 from adapters.procedural import open_truth
-from augment.render.sh import evaluate_sh
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import ConstantSky
 from tests.scenes import camera_ahead, random_gaussians
 from tools.bench import flood
-from tools.bench.flood import analytic_error, mirror_gaussians, tier_error, water_masks
+from tools.bench.flood import analytic_error, tier_error, water_masks
 
 QUERY = {"seed": "3", "frames": "2", "gaussians": "120000"}
 URI = "procedural:street?" + "&".join(f"{k}={v}" for k, v in QUERY.items())
@@ -68,32 +67,6 @@ def test_screen_space_is_close_to_mirrored(street, frame, name, waves):
 
 
 # ---- mirrored splats --------------------------------------------------------------------------
-
-
-def test_mirrored_gaussians_are_mirror_images():
-    gaussians = random_gaussians(50, dtype=torch.float64)
-    mirrored = mirror_gaussians(gaussians)
-    flip = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
-    torch.testing.assert_close(mirrored.means, gaussians.means * flip)
-    expected = flip[:, None] * covariances(gaussians) * flip
-    torch.testing.assert_close(covariances(mirrored), expected)
-    rng = torch.Generator().manual_seed(1)
-    seen_along = torch.randn(50, 3, generator=rng, dtype=torch.float64)
-    seen_along /= seen_along.norm(dim=1, keepdim=True)
-    torch.testing.assert_close(
-        evaluate_sh(mirrored.sh, seen_along), evaluate_sh(gaussians.sh, seen_along * flip)
-    )
-
-
-def covariances(gaussians):
-    w, x, y, z = gaussians.quats.unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    axes = torch.stack([torch.stack(row, -1) for row in rows], -2) * gaussians.scales[:, None, :]
-    return axes @ axes.mT
 
 
 @pytest.mark.long

@@ -139,14 +139,6 @@ def test_a_view_from_under_the_water_stays_on_the_gpu(monkeypatch):
         same_picture(flooded("cuda", view, water, LAYERED, deferred=False), here, 0.01)
 
 
-def test_water_that_something_hides_is_not_shaded(monkeypatch):
-    wall = discs(grid([0.5], np.arange(-1.5, 1.6, 0.2), np.arange(-1.0, 1, 0.2)), 0, 0.4)
-    with pretended_gpu(monkeypatch):
-        drawn_elsewhere(monkeypatch)
-        water = medium("mirrored")
-        assert flooded("cuda", camera(), water, None, deferred=False, hidden_by=wall).is_hidden
-
-
 @pytest.mark.long
 def test_a_small_flooded_view_from_its_splats_on(monkeypatch):
     view, water = camera(17, 11, roll=0.0), medium("sky", "still")

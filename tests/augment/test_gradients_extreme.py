@@ -41,6 +41,7 @@ from tests.augment.examples import drawing
 from tests.augment.hard_scenes import KINDS, SMOGS, hard_gaussians, in_float64, wide_camera
 from tests.augment.loss_definition import reference_loss
 
+pytestmark = pytest.mark.long
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 kinds, seeds = st.sampled_from(KINDS), st.integers(0, 2**31)
 fovs = st.sampled_from((1, 10, 60, 120, 170))

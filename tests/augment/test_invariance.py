@@ -29,7 +29,7 @@ from tests.augment.hard_scenes import (
     untied,
     wide_camera,
 )
-from tests.scenes import one_gaussian, slight_pose, stack
+from tests.scenes import slight_pose
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
 ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, OVERLAY})
@@ -88,23 +88,6 @@ def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_d
         assert torch.equal(second[name], image), name
 
 
-def test_of_equal_depths_the_first_is_in_front():
-    camera = wide_camera(60.0)
-    red = one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.9, scale=1.0)
-    blue = one_gaussian(rgb=(0.0, 0.0, 1.0), opacity=0.9, scale=1.0)
-    middle = (10, 16)
-    for weather in ("clear", "uniform"):
-        ahead, behind = (
-            render([PosedGaussians(stack(*pair))], camera, weather).rgb[middle]
-            for pair in ((red, blue), (blue, red))
-        )
-        assert ahead[0] > behind[0] and ahead[2] < behind[2]
-        torch.testing.assert_close(ahead, behind.flip(0) if weather == "clear" else ahead)
-        # The same over parts: those given first stand in front.
-        parts = [PosedGaussians(blue), PosedGaussians(red)]
-        assert torch.equal(render(parts, camera, weather).rgb[middle], behind)
-
-
 @drawing(8)
 @given(st.sampled_from(KINDS), weathers, seeds, st.booleans(), st.integers(0, 3000))
 def test_a_part_split_in_two_has_the_same_bits(kind, weather, seed, is_posed, cut):
@@ -127,6 +110,7 @@ def _sliced(gaussians: Gaussians, rows: slice) -> Gaussians:
     return gaussians.select(torch.arange(len(gaussians))[rows])
 
 
+@pytest.mark.long
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core: nothing to compare")
 @drawing(4)
 @given(st.sampled_from(KINDS), weathers, seeds)
@@ -200,6 +184,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
     assert_same_picture(moved_back, {n: image[here] for n, image in first.items()}, 40)
 
 
+@pytest.mark.long
 @drawing(8)
 @given(st.sampled_from(KINDS), weathers, seeds, st.integers(1, 40), st.integers(1, 30))
 def test_a_larger_image_holds_the_smaller_one_to_the_bit(kind, weather, seed, wider, higher):

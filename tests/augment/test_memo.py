@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.memo import SceneMemo, memo_of, size_of
+from augment.memo import SceneMemo, memo_of
 
 
 class Owner:
@@ -52,29 +52,11 @@ def test_a_value_beyond_the_limit_drives_out_no_other_and_none_drives_it_out():
     assert made == ["large", "small", "empty"]
 
 
-def test_what_a_key_holds_goes_with_its_value():
-    memo, owner = SceneMemo(max_bytes=1), Owner()
-    memo.get(("of", owner), lambda: np.zeros(10))
-    gone = weakref.ref(owner)
-    del owner
-    for number in range(2):
-        memo.get((number,), lambda: np.zeros(20))
-    gc.collect()
-    assert gone() is None
-
-
 def test_a_value_that_could_not_be_made_is_asked_for_again():
     memo = SceneMemo()
     with pytest.raises(ZeroDivisionError):
         memo.get(("key",), lambda: 1 // 0)
     assert memo.get(("key",), lambda: 1) == 1
-
-
-def test_none_is_a_value():
-    memo, made = SceneMemo(), []
-    for _ in range(2):
-        assert memo.get(("nothing",), lambda: made.append(1)) is None
-    assert made == [1]
 
 
 def test_threads_wait_for_the_one_that_makes_a_value():
@@ -122,13 +104,3 @@ def test_a_memo_goes_with_its_owner():
     del owner
     gc.collect()
     assert gone() is None
-
-
-def test_sizes_count_arrays_wherever_they_lie():
-    @dataclass
-    class Record:
-        array: np.ndarray
-        more: dict[str, torch.Tensor]
-
-    value = (Record(np.zeros(10, np.float64), {"a": torch.zeros(5)}), [torch.zeros(3)], "text")
-    assert size_of(value) == 80 + 20 + 12

@@ -134,7 +134,7 @@ seeds = st.integers(0, 2**31)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@drawing(7)
+@drawing(2)
 @given(cameras, st.sampled_from(WEATHERS), seeds)
 def test_kernels_match_the_definition(kind, camera, weather, seed):
     gaussians = hard_gaussians(kind, camera, 60, seed=seed)
@@ -142,6 +142,7 @@ def test_kernels_match_the_definition(kind, camera, weather, seed):
     assert_within(compare(gaussians, camera, weather, seed), bounds, weather)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(8192, 1), (1, 513)])
 def test_long_images(size):
     """In light per pixel, which asks for fewest buffers: the definition takes tile after tile.
@@ -166,16 +167,14 @@ def in_float32(gaussians):
     return dataclasses.replace(gaussians, **{n: getattr(gaussians, n).float() for n in names})
 
 
-@pytest.mark.parametrize("distance_m", [1e4, 1e5, 1e6])
-@pytest.mark.parametrize("weather", ["layered", "above"])
+@pytest.mark.parametrize(("distance_m", "weather"), [(1e4, "layered"), (1e6, "above")])
 def test_rendering_loses_nothing_far_from_the_origin(distance_m, weather):
     gaussians, camera = far_scene(distance_m, seed=7)
     assert_within(compare(in_float32(gaussians), camera, weather, 0), BOUNDS, weather)
 
 
 @pytest.mark.parametrize(
-    ("distance_m", "lost_m", "off"),
-    [(1e4, 4.9e-4, 5e-4), (1e5, 3.91e-3, 5e-3), (1e6, 0.0313, 0.04)],
+    ("distance_m", "lost_m", "off"), [(1e4, 4.9e-4, 5e-4), (1e6, 0.0313, 0.04)]
 )
 def test_float32_coordinates_lose_centimetres_far_from_the_origin(distance_m, lost_m, off):
     """Which is why adapters move a drive to its own origin. lost_m: half of float32's step. off:

@@ -84,17 +84,6 @@ def test_knots_are_linear_in_time_and_hold_outside():
     assert (knots.values == before).all()
 
 
-def test_a_step_moves_the_knots_around_a_time_and_no_other():
-    knots = Knots([np.array([0, 10, 20])], 1)
-    knots.update(0, 4, np.array([3.0]), np.array([0.1]), pull=0.0)
-    # Adam's first step is the rate, whatever the gradient's size
-    assert knots.values[:, 0] == pytest.approx([-0.1, -0.1, 0.0])
-    knots.values[:] = 1.0
-    for _ in range(50):
-        knots.update(0, 20, np.zeros(1), np.array([0.1]), pull=1.0)
-    assert abs(knots.values[2, 0]) < 0.5 and (knots.values[:2] == 1).all()
-
-
 def test_forces_are_the_slopes_of_the_loss():
     """Against central differences of the loss, in float32, of a part and of the camera."""
     splats = Splats.of([ahead(200, 5), ahead(150, 6)], 0)

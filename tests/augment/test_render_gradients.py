@@ -1,11 +1,8 @@
 """Gradients of the reference rasteriser."""
 
-import dataclasses
-
 import pytest
 import torch
 
-from augment.render import reference
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog
@@ -69,21 +66,3 @@ def test_gradients_stay_finite_at_every_cut_off(dtype):
         assert tensor.grad is not None
         assert bool(torch.isfinite(tensor.grad).all()), name
         assert float(tensor.grad.abs().max()) > 0, name
-
-
-def test_recomputing_tiles_gives_the_gradients_of_keeping_them(monkeypatch):
-    """Backward passes blend each tile again instead of keeping every splat at every pixel."""
-    camera, weights = (
-        camera_ahead(),
-        torch.rand(21, 33, 3, generator=torch.Generator().manual_seed(0)),
-    )
-    gradients = []
-    for kept in (False, True):
-        if kept:
-            monkeypatch.setattr(reference, "checkpoint", lambda tile, *args, **_: tile(*args))
-        gaussians = random_gaussians()
-        sh = gaussians.sh.clone().requires_grad_()
-        (render(dataclasses.replace(gaussians, sh=sh), camera).rgb * weights).sum().backward()
-        gradients.append(sh.grad)
-    assert float(gradients[0].abs().max()) > 0
-    assert torch.equal(*gradients)

@@ -181,18 +181,6 @@ def test_empty_scenes_repeated_tracks_and_missing_frames_are_errors():
         scene().frame(7)
 
 
-def test_colour_maps_are_checked_and_none_where_they_change_nothing(unchecked):
-    with pytest.raises(ValueError, match=r"'front' must be float32 \[3, 4\]; got .*\[3, 3\]"):
-        dataclasses.replace(scene(), color_maps={"front": torch.eye(3)})
-    with pytest.raises(ValueError, match="'front' must be finite"):
-        dataclasses.replace(scene(), color_maps={"front": torch.full((3, 4), torch.nan)})
-    maps = {"front": torch.eye(3, 4) * 0.5, "rear": torch.eye(3, 4)}
-    s = dataclasses.replace(scene(), color_maps=maps)
-    front, rear, left = (named(name) for name in ("front", "rear", "left"))
-    assert s.color_map(front) is maps["front"]
-    assert s.color_map(rear) is None and s.color_map(left) is None
-
-
 def test_a_colour_map_of_an_image_goes_before_that_of_its_camera():
     own, common = torch.eye(3, 4) * 0.5, torch.eye(3, 4) * 0.7
     s = dataclasses.replace(
@@ -219,12 +207,6 @@ def test_an_actors_colours_follow_its_waves():
     assert torch.equal(part.gaussians.sh[:, 1:], actor.gaussians.sh[:, 1:])
     with pytest.raises(ValueError, match="row for each of its 3 Gaussians; got 2"):
         dataclasses.replace(actor, color_waves=waves(2))
-
-
-def test_colour_waves_are_held_beyond_their_times():
-    assert [waves().phase_at(t) for t in (0, 1_000, 1_500, 2_000, 9_000)] == [0, 0, 0.5, 1, 1]
-    with pytest.raises(ValueError, match="strictly increasing"):
-        dataclasses.replace(waves(), timestamps_ns=torch.tensor([2, 2]))
 
 
 def test_colours_in_the_world_stand_still_while_an_actor_turns():
@@ -266,16 +248,6 @@ def test_an_actor_is_absent_in_a_gap_of_its_track():
     assert torch.equal(gappy.pose_at(1_100), whole.world_from_actor[0])
     assert torch.equal(gappy.pose_at(1_900), whole.world_from_actor[1])
     assert dataclasses.replace(whole, max_gap_ns=1_000).pose_at(1_500) is not None
-
-
-def test_all_gaussians_are_changed_and_nothing_else():
-    whole = scene((Actor("a", "car", some(3), track(), (4.0, 2.0, 1.5)),), some(5))
-    background, own = whole.all_gaussians
-    assert background is whole.background and own is whole.actors[0].gaussians
-    half = whole.with_gaussians(lambda g: dataclasses.replace(g, opacities=g.opacities / 2))
-    for before, after in zip(whole.all_gaussians, half.all_gaussians, strict=True):
-        assert torch.equal(after.opacities, before.opacities / 2) and after.means is before.means
-    assert half.actors[0].track is whole.actors[0].track and half.sky is whole.sky
 
 
 def test_datasets_names_for_objects_have_classes():

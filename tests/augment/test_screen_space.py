@@ -12,6 +12,9 @@ from augment.geometry import rigid, rotmat_from_quat
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
 LEVEL_M = 0.3
 WALL_M = 12.0
+BACKENDS = pytest.mark.parametrize(
+    "backend", ["cpu", pytest.param("reference", marks=pytest.mark.long)]
+)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -107,22 +110,7 @@ def test_rays_meet_a_wall_where_geometry_says(backend, view):
     assert (found.weight[middle] == 1).all()
 
 
-def test_a_wall_is_as_smooth_between_the_traced_pixels():
-    camera = looking(8, 3)
-    front = see(camera, WALL)
-    found = trace_screen(front, camera, LEVEL_M, stride=4).distance
-    way, height = mirrored_way(camera, WALL_M)
-    at = projected(camera, way)
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    shown = ((at > 8) & (at < size - 8)).all(-1)
-    sure = water(camera, front) & shown & (height > 0.5) & (height < 2.5)
-    assert int(sure.sum()) > 100
-    # Interpolated is the ratio of way and way to the water, linear for a level camera; with 8
-    # degrees of pitch it bends by less than 1 % over four pixels of 1/60.
-    assert torch.allclose(found[sure].double(), way[sure], rtol=0.02, atol=0.02)
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@BACKENDS
 def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     camera = looking(height=101)
     car_top, wall_top = 0.6, 5.0  # low and high enough for rays between them to be in the image
@@ -148,7 +136,7 @@ def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     assert found.distance[sky].isinf().all() and (found.weight[sky] == 1).all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@BACKENDS
 def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     """A sign hangs before the sky: rays of water far behind it pass behind it."""
     camera = looking(0, height=151)
@@ -168,18 +156,7 @@ def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     assert found.distance[beside].isinf().all() and int((found.weight[beside] == 1).sum()) > 20
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_what_stands_above_the_image_is_not_known(backend):
-    camera = looking(30)  # the horizon lies above the image
-    front = see(camera, (WALL_M, -1e3, 1e3, 0.0, 1e3))
-    found = trace_screen(front, camera, LEVEL_M, backend=backend)
-    at = projected(camera, mirrored_way(camera, WALL_M)[0])
-    above = water(camera, front) & (at[..., 1] < -1)
-    assert int(above.sum()) > 100
-    assert (found.weight[above] == 0).all() and found.distance[above].isinf().all()
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@BACKENDS
 def test_rays_that_come_back_to_the_camera_are_not_known(backend):
     """Looking straight down, past the point under the camera."""
     for roll in (0, 30):
@@ -200,7 +177,7 @@ def test_nothing_stands_anywhere(backend, stride):
     assert (found.weight[:32] == 0).all()  # above the horizon there is no water
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@BACKENDS
 def test_pixels_without_water_have_no_reflection(backend):
     camera = looking(10)
     everything = dataclasses.replace(
@@ -258,9 +235,3 @@ def test_only_needed_pixels_are_traced(backend, stride):
     if stride == 1:
         assert torch.equal(part.distance[needed], whole.distance[needed])
         assert torch.equal(part.weight[needed], whole.weight[needed])
-
-
-def test_a_camera_that_is_no_window_is_named():
-    camera = looking()
-    with pytest.raises(ValueError, match="windows of one image"):
-        trace_screen(see(camera), camera.scaled(0.5), LEVEL_M)

@@ -87,14 +87,6 @@ def test_optical_depths_add_up_along_a_ray():
     assert parts == pytest.approx(tau(100.0, eye, far), rel=1e-12)
 
 
-def test_a_huge_scale_height_is_uniform_smog():
-    distance = torch.rand(100, dtype=torch.float64) * 200
-    z = torch.rand(100, dtype=torch.float64) * 20
-    uniform = optical_depth(Fog(0.02, GREY), distance, 1.6)
-    tall = optical_depth(Fog(0.02, GREY, scale_height_m=1e9), distance, 1.6, z)
-    assert torch.allclose(tall, uniform, rtol=1e-7)  # (z - z0) / H is 2e-8 at most
-
-
 def test_the_sky_is_the_limit_of_far_points():
     medium = layered()
     slope, distance = 0.3, 5_000.0  # 1500 m up: exp(-100) of the density is left
@@ -106,17 +98,6 @@ def test_the_sky_is_the_limit_of_far_points():
     )
     sky = sky_optical_depth(medium, torch.tensor(slope, dtype=torch.float64), 1.6)
     assert float(sky) == pytest.approx(float(point), rel=1e-12)
-
-
-def test_the_sky_behind_uniform_smog_or_below_the_horizon_is_airlight():
-    slopes = torch.linspace(-1, 1, 21)
-    uniform = Fog(1e-5, GREY)
-    assert torch.equal(
-        blend_airlight(torch.rand(21, 3), sky_optical_depth(uniform, slopes, 0.0), uniform),
-        torch.tensor(GREY).expand(21, 3),
-    )
-    tau = sky_optical_depth(layered(), slopes, 1.6)
-    assert torch.isinf(tau[slopes <= 0]).all() and torch.isfinite(tau[slopes > 0]).all()
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-30, 100.0])

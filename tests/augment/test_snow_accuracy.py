@@ -14,7 +14,6 @@ import torch
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import open_truth
-from augment.effects.snow.cells import FLUSH, SnowCells
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
@@ -149,32 +148,3 @@ def test_neighbouring_views_agree_on_the_snow(scene, shading):
         assert points > 5000
         assert agreeing >= 0.985
         assert color_rms < 9
-
-
-def cells_at(xy, z, size_m):
-    """Level cells at places [C, 2] and heights [C]."""
-    count = len(xy)
-    centers = np.concatenate([xy, np.asarray(z)[:, None]], 1)
-    return SnowCells(
-        centers_m=torch.from_numpy(centers).float(),
-        normals=torch.tensor([[0.0, 0, 1]]).repeat(count, 1),
-        sizes_m=torch.full((count,), size_m),
-        edge_m=torch.full((count,), size_m),
-        neighbours=torch.full((count, 4), FLUSH, dtype=torch.int32),
-        light=torch.ones(count),
-        tracks=torch.zeros(count),
-        banks=torch.zeros(count, 2),
-        semantic=torch.zeros(count, dtype=torch.int16),
-        buried=torch.zeros(0, dtype=torch.int32),
-        buried_by=torch.zeros(0, 5, dtype=torch.int32),
-    )
-
-
-def test_cells_that_are_the_truth_cover_it_and_those_that_are_not_do_not(points):
-    whole = cells_at(points.xy, points.z, 0.3)
-    assert (cells_over(whole, points) >= 0).all()
-    level = points.slope < 0.01
-    np.testing.assert_allclose(support_heights(whole, points)[level], points.z[level], atol=1e-5)
-    half = cells_over(cells_at(points.xy[::2], points.z[::2], 0.3), points)
-    assert (half[::2] == np.arange(len(half[::2]))).all() and (half[1::2] == -1).all()
-    assert (cells_over(cells_at(points.xy, points.z + 0.5, 0.3), points) == -1).all()

@@ -137,37 +137,6 @@ def test_grain_belongs_to_the_place():
     assert not torch.allclose(colors(one), colors(other), atol=2e-3)
 
 
-def test_the_light_that_is_added_per_pixel_has_the_same_grain():
-    snow, view = sheet(), camera()
-    slopes = torch.full((len(snow), 3), 0.2)
-    near = split_near(snow, slopes, view, SUN, GRAIN)
-    factor = colors(near.fine) / 0.7
-    assert torch.allclose(near.fine_slopes, 0.2 * factor, atol=1e-5)
-
-
-def test_grain_fades_out_with_the_distance_and_smooth_snow_has_none():
-    snow, view = sheet(1.0, 9.9, half_m=0.6), camera(f=1500.0, width=960, height=720)
-    near = split_near(snow, None, view, SUN, GRAIN)
-    off = (colors(near.fine)[:, 0] - 0.7).abs()
-    distance = (near.fine.means - view.centre.float()).norm(dim=1)
-    assert float(distance.max()) > 6
-    assert float(off[distance > 6].mean()) < 0.4 * float(off[distance < 4].mean())
-    smooth = split_near(snow, None, view, SUN, Grain(0.0, 0.4, 5)).fine
-    assert torch.allclose(colors(smooth), torch.tensor(0.7), atol=1e-6)
-
-
-def test_the_side_towards_the_sun_is_brighter_than_the_other():
-    """Where the noise falls towards the sun, snow faces it: reversed light reverses the relief."""
-    snow, view = sheet(), camera()
-    grain = Grain(0.5, 1.0, 5)
-    lit = colors(split_near(snow, None, view, SUN, grain).fine)[:, 0]
-    back = colors(split_near(snow, None, view, SUN * torch.tensor([-1.0, 1, 1]), grain).fine)[:, 0]
-    flat = colors(split_near(snow, None, view, SUN, Grain(0.5, 0.0, 5)).fine)[:, 0]
-    relief, reverse = (lit - flat).numpy(), (back - flat).numpy()
-    assert float(lit.std()) > 1.2 * float(flat.std())
-    assert np.abs(relief + reverse).max() < 1e-5
-
-
 # ---- Against definitions, and on a GPU -----------------------------------------------------------
 
 WRAP = 0.3

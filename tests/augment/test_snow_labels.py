@@ -19,9 +19,7 @@ from box_views import (
 )
 
 from augment.boxes import SIDES_M
-from augment.effects.flood.effect import hidden_pixels
 from augment.effects.snow.snow import snow_pixels
-from augment.labels import Boxes
 
 ALL = np.full((106, 160), 255, np.uint8)
 
@@ -44,19 +42,6 @@ def test_pixels_are_those_counted_one_by_one(thickness_m: float) -> None:
     assert sum(p > 0 for p in pixels) > 30 and sum(marked) > 0
     np.testing.assert_array_equal(got.pixels, pixels)
     np.testing.assert_array_equal(got.marked, marked)
-
-
-def test_boxes_without_snow_own_what_they_own_in_a_flood() -> None:
-    rng = np.random.default_rng(6)
-    camera, depth = make_camera(), rng.uniform(0, 25, (106, 160)).astype(np.float32)
-    boxes = make_boxes(*[
-        (rng.uniform((2, -8, 0), (25, 8, 2)), rng.uniform(0.4, 5, 3), rng.normal(size=4))
-        for _ in range(20)
-    ])  # fmt: skip
-    bare = snow_pixels(placed(boxes), camera, depth, ALL, 0.0)
-    flooded = hidden_pixels(placed(boxes), camera, depth, ALL)
-    assert bare.pixels.sum() > 0
-    np.testing.assert_array_equal(bare.pixels, flooded.pixels)
 
 
 @pytest.mark.parametrize("thickness_m", [0.02, 0.1, 0.3])
@@ -86,25 +71,6 @@ def test_the_snowy_part_is_that_of_the_cap(resolution: float) -> None:
     expected = 0.4 / (2.4 - 0.45)  # the lowest 45 cm stand in snow
     # Each edge is off by half a pixel, of the 20 that the face has at resolution 1.
     assert got.marked[0] / got.pixels[0] == pytest.approx(expected, abs=1 / 20 / resolution)
-
-
-def test_a_low_box_keeps_its_top_quarter_in_any_snow() -> None:
-    """A kerb stone, 40 cm high, in 10 m of snow: from 30 cm up what is seen still counts."""
-    boxes = make_boxes(((8, 0, 0.2), (4, 4, 0.4), UPRIGHT))
-    camera = make_camera(pitch=0.2)
-    for height_m, owned in {0.29: False, 0.31: True, 1.0: True}.items():
-        depth = plane_depth(camera, height_m)
-        got = snow_pixels(placed(boxes), camera, depth, ALL, 10.0)
-        assert (got.pixels[0] > 0) == owned, height_m
-
-
-def test_boxes_of_no_number_and_no_boxes() -> None:
-    camera, depth = make_camera(), np.full((106, 160), 5.0, np.float32)
-    boxes = make_boxes(((np.nan, 0, 0.5), CAR_M, UPRIGHT), ((5, 0, 1.6), CAR_M, UPRIGHT))
-    got = snow_pixels(placed(boxes), camera, depth, ALL, 0.1)
-    assert got.pixels[0] == got.marked[0] == 0 < got.pixels[1]
-    none = snow_pixels(placed(Boxes.empty()), camera, depth, ALL, 0.1)
-    assert none.pixels.shape == none.marked.shape == (0,)
 
 
 def raised(height_m: float, pitch: float) -> torch.Tensor:

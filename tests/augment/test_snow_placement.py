@@ -10,28 +10,23 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.snow import placement, surface_kernels
+from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
-    RINGS_M,
     WHEEL_SHARE,
-    CellNumbers,
     PlacementSettings,
     place_snow_support,
-    plan_tiles,
-    views_along,
 )
-from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, is_vehicle
-from augment.effects.snow.surface_kernels import LINK, OPEN
+from augment.effects.snow.surface import is_vehicle
+from augment.effects.snow.surface_kernels import OPEN
 from augment.errors import SceneError
-from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from tests.scenes import camera_ahead, one_gaussian, stack
-from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, stack_all, wall
+from tests.scenes import one_gaussian, stack
+from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
 
 COARSE = PlacementSettings(cell_m=0.1)
 GROUND = sheet((-6, 20), (-8, 8))
@@ -116,34 +111,6 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
 
 
-def test_cells_grow_with_the_distance_from_the_path(flat_ground) -> None:
-    cells = flat_ground[1].ground
-    x, y = cells.centers_m[:, 0].double(), cells.centers_m[:, 1].double()
-    path = torch.hypot((x - x.clamp(0, 1)).abs(), y)
-    for distance, size in zip(path.tolist(), cells.sizes_m.tolist(), strict=True):
-        ring = sum(distance >= limit + 3.2 * math.sqrt(2) for limit in RINGS_M)  # a tile's diagonal
-        ring_at_most = sum(distance >= limit for limit in RINGS_M)
-        assert 0.1 * 2 ** min(ring, 3) <= size * 1.001
-        assert size <= 0.1 * 2 ** min(ring_at_most, 3) * 1.001
-    assert len(cells.sizes_m.unique()) >= 2
-
-
-def test_only_what_a_camera_sees_has_cells(flat_ground) -> None:
-    scene, bed = flat_ground
-    camera, last = cameras_of(scene)
-    points = bed.ground.centers_m.double()
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for view in (camera, last):
-        ahead = points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3]
-        u = ahead[:, 0] / ahead[:, 2] * view.fx + view.cx
-        v = (ahead[:, 1] - 1.0) / ahead[:, 2] * view.fy + view.cy  # a metre of snow on it
-        near = 10 + 3 * 0.2 * view.fx / ahead[:, 2].clamp(min=0.2)  # grown by two cells
-        inside = (u > -near) & (u < view.width + near) & (v < view.height + near)
-        seen |= (ahead[:, 2] > 0) & inside
-    assert bool(seen.all())
-    assert float(points[:, 0].min()) > 0.5
-
-
 def test_bits_do_not_depend_on_threads(flat_ground) -> None:
     scene, bed = flat_ground
     limit_threads(1)
@@ -152,27 +119,6 @@ def test_bits_do_not_depend_on_threads(flat_ground) -> None:
     finally:
         limit_threads(None)
     assert_equal_cells(alone.ground, bed.ground)
-
-
-def test_squares_drawn_at_once_make_no_difference(monkeypatch) -> None:
-    platform = sheet((8, 10), (-2, 0), 0.6)
-    scene = drive(GROUND, platform, wall(8, (-2, 0), (0, 0.6)))
-    whole = place(scene).ground
-    monkeypatch.setattr(placement, "_SQUARE_CELLS", 64)
-    parts = place(scene).ground
-    assert len(whole) == len(parts)
-    orders = [np.lexsort(cells.centers_m[:, :2].numpy().T) for cells in (whole, parts)]
-    for name in ("centers_m", "normals", "sizes_m", "edge_m", "tracks", "banks", "light"):
-        a, b = (
-            getattr(cells, name)[order] for cells, order in zip((whole, parts), orders, strict=True)
-        )
-        # Splats are projected from another eye, so heights and colours differ by roundings.
-        np.testing.assert_allclose(a, b, atol=2e-3, err_msg=name)
-    codes = [
-        cells.neighbours[order].clamp(max=0)
-        for cells, order in zip((whole, parts), orders, strict=True)
-    ]
-    assert torch.equal(*codes)
 
 
 def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
@@ -229,28 +175,10 @@ def test_what_a_wall_hides_has_no_cells() -> None:
     assert not bool(within(cells, (11, 19), (-5, 5)).any())
 
 
-def test_a_single_gaussian_and_faint_ones() -> None:
-    place(drive(one_gaussian(mean=(6.0, 0.0, 0.0))))
-    faint = sheet((-6, 20), (-8, 8), opacity=0.01)
-    assert len(place(drive(faint)).ground) == 0
-    alone = place(drive(one_gaussian(mean=(6, 0, 0), scale=(0.5, 0.5, 0.01), opacity=0.99)))
-    assert len(alone.ground) > 10 and float(alone.ground.centers_m[:, 2].abs().max()) < 0.05
-
-
 def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
     scene = drive(GROUND)
     with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
         place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
-
-
-def test_far_from_the_origin_nothing_breaks() -> None:
-    shift = torch.tensor([1e6, -1e6, 50.0])
-    ground = dataclasses.replace(GROUND, means=GROUND.means + shift)
-    start = tuple(shift.tolist())
-    places = [(start[0] + x, start[1], start[2] + 1.5) for x in (0.0, 1.0)]
-    cells = place(drive(ground, places=places), PlacementSettings(cell_m=0.2)).ground
-    assert len(cells) > 100
-    np.testing.assert_allclose(cells.centers_m[:, 2], 50, atol=0.02)
 
 
 def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> None:
@@ -264,14 +192,7 @@ def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> N
             PlacementSettings(**{name: value})
 
 
-def test_a_faint_floater_does_not_lift_the_bed() -> None:
-    floater = one_gaussian(mean=(7.0, 0.0, 4.0), scale=(1.0, 1.0, 0.3), opacity=0.3)
-    cells = place(drive(GROUND, floater)).ground
-    chosen = within(cells, (6, 8), (-1, 1))
-    assert int(chosen.sum()) > 300
-    assert float(cells.centers_m[chosen, 2].abs().max()) < 0.02
-
-
+@pytest.mark.long
 def test_small_gaps_are_bridged_and_posts_stand_out() -> None:
     ground = sheet((-6, 20), (-8, 8))
     gap = (ground.means[:, :2] - torch.tensor([5.1, 0.1])).abs().amax(1) < 0.11
@@ -316,12 +237,6 @@ def test_holes_under_the_path_and_small_ones_are_closed(
         np.testing.assert_allclose(cells.light[inside], 1, atol=0.1)
 
 
-def test_a_hole_between_two_levels_stays_open() -> None:
-    levels = [sheet((-6, 6), (-8, 8)), sheet((6, 20), (-8, 8), 0.7)]
-    cells = place(drive(hole_at(stack_all(levels), 6.0, 0.0, 1.2))).ground
-    assert not bool(within(cells, (5.3, 6.7), (-0.7, 0.7)).any())
-
-
 @pytest.mark.parametrize(("height_m", "expected"), [(0.15, False), (0.6, True)])
 def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
     pavement = [sheet((-6, 20), (1.5, 8), height_m), side_wall(1.5, (-6, 20), (0, height_m))]
@@ -332,6 +247,7 @@ def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
     assert expected or area > 2.9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell_m", [0.05, 0.4])
 def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     x = torch.linspace(6, 9, 40)
@@ -341,20 +257,6 @@ def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     cells = place(drive(GROUND, wire, *board), PlacementSettings(cell_m=cell_m)).ground
     assert float(cells.centers_m[:, 2].max()) < 0.1
     assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
-
-
-def test_bins_carry_snow_and_blobs_before_walls_do_not() -> None:
-    bin_top = sheet((5, 5.5), (1.0, 1.5), 0.9)
-    sides = [side_wall(y, (5, 5.5), (0, 0.9)) for y in (1.0, 1.5)]
-    fronts = [wall(v, (1.0, 1.5), (0, 0.9)) for v in (5, 5.5)]
-    blob = one_gaussian(mean=(7.0, -1.0, 2.5), scale=(0.15, 0.25, 0.05), opacity=0.99)
-    scene = drive(
-        GROUND, bin_top, *sides, *fronts, blob, places=[(x, 0.0, 3.5) for x in (0.0, 1.0)]
-    )
-    cells = place(scene, PlacementSettings(cell_m=0.05)).ground
-    top = within(cells, (5, 5.5), (1.0, 1.5)) & (cells.centers_m[:, 2] > 0.8)
-    assert float((cells.sizes_m[top] ** 2).sum()) > 0.15
-    assert float(cells.centers_m[:, 2].max()) < 1.0
 
 
 def test_the_ground_is_buried_and_walls_are_not() -> None:
@@ -374,31 +276,6 @@ def test_the_ground_is_buried_and_walls_are_not() -> None:
     on_top = inner & (means[:, 2] > 0.5)
     assert bool(hidden[on_top].all())
     assert not bool(hidden[inner & (means[:, 2] < 0.05)].any())  # the ground below is deeper
-
-
-def test_what_reaches_beyond_the_cells_is_not_buried() -> None:
-    far = sheet((2, 12), (-0.2, 0.2), -0.01)
-    wide = dataclasses.replace(far, scales=far.scales * torch.tensor([1.0, 60.0, 1.0]))
-    cells = place(drive(sheet((2, 12), (-2, 2)), wide)).ground
-    assert len(cells.buried) > 0
-    assert int(cells.buried.max()) < len(sheet((2, 12), (-2, 2)))
-
-
-def test_cells_over_a_buried_gaussian_are_those_it_lies_under() -> None:
-    ground = sheet((-6, 20), (-8, 8))
-    turn = rotmat_from_quat(torch.tensor([[math.cos(0.3), 0.0, 0.0, math.sin(0.3)]]))
-    ground = dataclasses.replace(
-        ground,
-        scales=ground.scales * torch.tensor([3.0, 1.0, 1.0]),
-        quats=quat_from_rotmat(turn).expand(len(ground), 4).contiguous(),
-    )
-    cells = place(drive(ground)).ground
-    offsets = torch.tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]).float() * 1.5
-    axes = turn[0, :2, :2]  # columns: the long axis, then the short one
-    ends = (offsets * ground.scales[0, :2]) @ axes.T
-    points = ground.means[cells.buried.long(), None, :2] + ends
-    gap = (cells.centers_m[cells.buried_by.long(), :2] - points).abs().amax(-1)
-    assert bool((gap <= cells.sizes_m[cells.buried_by.long()] / 2 + 1e-4).all())
 
 
 def test_wheels_leave_tracks_beside_the_path() -> None:
@@ -456,17 +333,6 @@ def test_vehicles_carry_their_own_cells() -> None:
     assert bool(within(bed.ground, (4, 8), (2.5, 3.5)).any())  # it drives on: ground is ground
 
 
-def test_windscreens_of_those_that_drive_stay_clear() -> None:
-    slope = DRIVEN_MAX_SLOPE_DEG + 10
-    found = []
-    for moved_m in (5.0, 0.0):
-        car = box_car(moved_m=moved_m)
-        tilted = sheet((-2, -0.5), (-0.9, 0.9), 0.0, slope_deg=slope)
-        car = dataclasses.replace(car, gaussians=tilted)
-        found.append("car" in place(drive(GROUND, actors=[car])).actors)
-    assert found == [False, True]
-
-
 def test_parked_cars_keep_the_ground_below_them_bare() -> None:
     parked = box_car(start=(7.0, 0.0), moved_m=0.0, with_shadow=False)
     bed = place(drive(GROUND, actors=[parked]))
@@ -489,35 +355,6 @@ def test_which_actors_are_vehicles() -> None:
         assert is_vehicle(box_car(label=label, semantic=semantic)) is expected, label
     walker = drive(GROUND, actors=[box_car(label="Pedestrian")])
     assert place(walker, PlacementSettings(cell_m=0.2)).actors == {}
-
-
-def test_views_along_a_drive_are_spread_and_hold_both_ends() -> None:
-    cameras = [camera_ahead(position=(0.5 * i, 0, 1.5), timestamp_ns=i) for i in range(20)]
-    times = [camera.timestamp_ns for camera in views_along(cameras[::-1])]
-    assert times == [0, 4, 8, 12, 16, 19]
-    turning = [camera_ahead(yaw=0.1 * i, timestamp_ns=i) for i in range(5)]
-    assert [camera.timestamp_ns for camera in views_along(turning)] == [0, 2, 4]
-
-
-def test_numbers_of_cells_are_found_by_place() -> None:
-    plan = plan_tiles([camera_ahead(position=(3.0, 5.0, 1.5))], 0.1, (-1.0, 2.0))
-    numbers = CellNumbers(plan)
-    rng = np.random.default_rng(0)
-    expected, points = [], []
-    for level in range(4):
-        tiles = np.argwhere(plan.levels == level)
-        side = plan.cells_per_side(level)
-        picked = tiles[rng.integers(len(tiles), size=50)]
-        cells = np.unique(picked[:, ::-1] * side + rng.integers(side, size=(50, 2)), axis=0)
-        put = np.arange(len(cells), dtype=np.int32) + 1000 * level
-        numbers.put(level, cells[:, 0], cells[:, 1], put)
-        points.append(
-            plan.origin_m + (cells + rng.uniform(0.1, 0.9, cells.shape)) * plan.size_m(level)
-        )
-        expected.append(put)
-    assert numbers.at(np.concatenate(points)).tolist() == np.concatenate(expected).tolist()
-    outside = np.array([[1e9, 0.0], [-1e9, 5.0], [np.nan, 0.0], [3.0, 1e4]])
-    assert (numbers.at(outside) == -1).all()
 
 
 def test_medians_of_heights() -> None:
@@ -568,23 +405,6 @@ def test_edge_distances_are_those_to_the_nearest_edge() -> None:
     for i, j in np.argwhere(can_carry):
         nearest = min(math.hypot(i - a, j - b) for a, b in edges)
         assert out[i, j] == pytest.approx(nearest, abs=0.1)  # a sweep may miss the very nearest
-
-
-def test_steps_part_surfaces_but_not_their_low_sides() -> None:
-    height = np.zeros((5, 8), np.float32)
-    height[:, 4:] = 0.15
-    everywhere = np.ones(height.shape, bool)
-    sides = np.empty((*height.shape, 4), np.int8)
-    surface_kernels.compare_sides(height, height, everywhere, everywhere, 0.1, sides)
-    assert (sides[:, 4, LEFT] == OPEN).all()
-    assert (sides[:, 3, RIGHT] == surface_kernels.RISES).all()
-    out = np.empty(height.shape, np.float32)
-    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
-    np.testing.assert_allclose(out[:, 4:], np.tile([0.5, 1.5, 2.5, 3.5], (5, 1)))
-    assert (out[:, :4] == 40).all()
-    sides[:] = LINK
-    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
-    assert (out == 40).all()
 
 
 def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import json
 import logging
-import weakref
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,6 @@ from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
 from augment.errors import OutputError, SceneError
-from augment.memo import memo_of
 from augment.scene import Scene, Track
 from tests.snow_scenes import box_car, cameras_of, drive, sheet
 
@@ -119,13 +116,6 @@ def test_keys_tell_contents_apart(scene: Scene) -> None:
     assert all(len(key) == 40 and int(key, 16) >= 0 for key in keys.values())
 
 
-def test_directions_of_colour_do_not_change_a_key(scene: Scene) -> None:
-    wide = torch.cat([scene.background.sh, torch.ones(len(scene.background), 3, 3)], 1)
-    other = dataclasses.replace(scene, background=dataclasses.replace(scene.background, sh=wide))
-    cameras = cameras_of(scene)
-    assert support_key(other, cameras, SETTINGS) == support_key(scene, cameras, SETTINGS)
-
-
 def test_files_of_something_else_are_refused(support: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
     with pytest.raises(SceneError, match="no such file"):
@@ -205,16 +195,6 @@ def test_a_support_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, capl
     assert len(calls) == 2 and not caplog.text
     support_of(own, dataclasses.replace(SETTINGS, max_slope_deg=10.0))
     assert len(calls) == 3
-
-
-def test_what_is_remembered_is_what_is_given(scene: Scene, support: SnowSupport) -> None:
-    own = dataclasses.replace(scene)
-    memo_of(own).put(("snow support", SETTINGS), support)
-    assert support_of(own, SETTINGS) is support
-    gone = weakref.ref(own)
-    del own
-    gc.collect()
-    assert gone() is None  # memory of a scene ends with it
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(scene: Scene, tmp_path: Path) -> None:

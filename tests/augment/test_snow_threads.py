@@ -44,12 +44,3 @@ def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
     with pytest.raises(ZeroDivisionError):
         in_order(fails, range(1, 500))
     assert len(begun) < 499
-
-
-def test_work_within_work_begins_no_more_threads() -> None:
-    def inner(item: int) -> list[threading.Thread]:
-        own = threading.current_thread()
-        assert in_order(lambda _: threading.current_thread(), range(3)) == [own] * 3
-        return [own]
-
-    assert len(in_order(inner, range(4))) == 4

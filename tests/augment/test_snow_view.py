@@ -9,7 +9,6 @@ import torch
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
-from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, OVERLAY, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
@@ -125,17 +124,6 @@ def test_images_of_the_bare_surface_are_those_of_the_clean_scene(scene):
     assert np.quantile(off, 0.9) < 0.05  # expected depth for the labels, median in the image
 
 
-def test_what_else_is_asked_for_does_not_change_the_picture(scene):
-    poor = view_of(scene, snow(), semantic=False, depth="none", labels=False)
-    assert poor.depth_m is None and poor.semantic is None and poor.effects["snow"].depth_m is None
-    for asked in ({"instance": True}, {"semantic": False, "depth": "mode"}):
-        rich = view_of(scene, snow(), **asked)
-        assert np.array_equal(rich.rgb, poor.rgb) and np.array_equal(
-            rich.masks["snow"], poor.masks["snow"]
-        )
-        assert rich.depth_m is not None and rich.effects["snow"].depth_m is not None
-
-
 @pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
 def test_both_backends_show_the_same_snow(scene, shading):
     plan = make_plan(recipe_of(snow(shading=shading, cell_m=0.2)), scene)
@@ -147,15 +135,6 @@ def test_both_backends_show_the_same_snow(scene, shading):
     # The sums of some hundred splats in another order; a flip at a cut-off is 1/255 at most.
     assert float(difference.quantile(0.99)) < 1e-3 and float(difference.max()) < 2e-2
     assert float((fast.masks["snow"] != slow.masks["snow"]).float().mean()) < 1e-3
-
-
-def test_the_two_shadings_agree_on_how_bright_snow_is(scene):
-    """One is a detail of the other: means agree, pixels differ."""
-    splat = view_of(scene, snow()).rgb.astype(int)
-    pixel = view_of(scene, snow(shading="per_pixel")).rgb.astype(int)
-    lies = view_of(scene, snow()).masks["snow"] == 255
-    assert abs(splat[lies].mean() - pixel[lies].mean()) < 10
-    assert not np.array_equal(splat, pixel)
 
 
 @pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
@@ -188,26 +167,6 @@ def test_water_melts_the_snow_it_reaches_and_mirrors_the_rest(scene):
     covered = plain.semantic != SemanticClass.SKY  # beyond the sheets the water shows
     assert np.median(np.abs(dry.rgb.astype(int) - plain.rgb)[covered]) == 0
     assert (dry.masks["snow"] != plain.masks["snow"]).mean() < 0.005
-
-
-def test_the_plan_names_what_runs_and_what_does_not(scene):
-    def steps(recipe):
-        return {step.name: step.runs for step in make_plan(recipe, scene).steps}
-
-    plain = steps(recipe_of())
-    assert not any(runs for name, runs in plain.items() if name.startswith("snow"))
-    assert OVERLAY not in make_plan(recipe_of(), scene).buffers
-    white = steps(recipe_of(snow()))
-    assert white["snow: placement and layer"] and not white["snow: light per pixel"]
-    assert not white["bare surface"]
-    assert steps(recipe_of(snow(shading="per_pixel")))["snow: light per pixel"]
-    bare = make_plan(recipe_of(snow(), surface="scene", depth="mode"), scene)
-    assert {MODE_DEPTH, SPLAT_IDS} < bare.bare_buffers
-    assert not bare.buffers & {MODE_DEPTH, SPLAT_IDS}
-    unlabelled = dataclasses.replace(scene, labels=None)
-    poor = recipe_of(snow(), depth="none")
-    assert EXPECTED_DEPTH in make_plan(poor, scene).buffers  # what labels are measured from
-    assert EXPECTED_DEPTH not in make_plan(poor, unlabelled).buffers
 
 
 def test_scenes_without_metres_or_gravity_are_refused_before_anything_is_rendered(scene):

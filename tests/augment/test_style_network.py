@@ -13,7 +13,6 @@ from augment.effects.style.network import (
     apply_map,
     compose,
     gscm_map,
-    image_moments,
     load_imagenet_weights,
 )
 from augment.errors import StyleError
@@ -70,14 +69,6 @@ def test_plain_pictures_give_finite_maps_of_bounded_gain():
             assert torch.linalg.matrix_norm(found[:, :3], 2) < 0.6 / FLOOR_STD
 
 
-def test_a_map_of_maps():
-    first, second = torch.rand(2, 5, 3, 4).unbind(0)
-    colors = torch.rand(5, 2, 3, 3)
-    torch.testing.assert_close(
-        apply_map(compose(second, first), colors), apply_map(second, apply_map(first, colors))
-    )
-
-
 def test_bits_do_not_depend_on_threads_and_threads_come_back():
     net, content, style = trained(), pictures(3, seed=5), pictures(1, seed=6)
     before = torch.get_num_threads()
@@ -103,14 +94,6 @@ def test_every_weight_is_trained():
     maps.square().sum().backward()
     for name, value in net.named_parameters():
         assert value.grad is not None and value.grad.abs().sum() > 0, name
-
-
-def test_moments_maps_are_inverses_and_symmetric():
-    found = image_moments(pictures(3))
-    both = found.restore @ found.normalise
-    torch.testing.assert_close(both, torch.eye(4).expand(3, -1, -1), atol=1e-4, rtol=0)
-    matrix = found.normalise[:, :3, :3]
-    torch.testing.assert_close(matrix, matrix.transpose(1, 2), atol=1e-4, rtol=1e-4)
 
 
 def test_bad_arguments(monkeypatch):
@@ -198,8 +181,3 @@ def test_weights_of_another_network(b0, tmp_path):
             torch.save(content, path)
         with pytest.raises(StyleError, match=message):
             load_imagenet_weights(b0, path)
-
-
-def test_b0_maps(b0):
-    image, net = pictures(1), Gscm("b0")
-    torch.testing.assert_close(gscm_map(net, image, image), torch.eye(3, 4), atol=1e-4, rtol=0)

@@ -14,14 +14,13 @@ from augment.cameras import Camera, Frame
 from augment.geometry import rigid, rotmat_from_quat
 from augment.plan import make_plan
 from augment.reconstruct.config import FitConfig, Growth, LearningRates, Tuning
-from augment.reconstruct.trainer import Trainer, part_forces
+from augment.reconstruct.trainer import Trainer
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.composite import quantise
 from augment.render.cpu.backward import Tape
-from augment.render.layout import BLOCK
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates
+from augment.sky import CubemapSky, cubemap_coordinates
 from augment.views import render_buffers
 from recipes.schema import Output, Recipe
 from tests.augment.loss_definition import reference_picture
@@ -313,24 +312,6 @@ def test_a_saved_state_continues_to_the_same_bits_with_any_number_of_threads(rec
         assert np.array_equal(array, kept[name]), f"{name} is shared with a trainer"
 
 
-def test_the_scene_a_fit_starts_from_is_left_alone(recorded):
-    scene = start()
-    before = {name: getattr(scene.background, name).clone() for name in ARRAYS}
-    faces, poses = scene.sky.faces.clone(), scene.actors[0].track.world_from_actor.clone()
-    trainer = quick(scene, recorded)
-    run(trainer, 10)
-    for name in ARRAYS:
-        assert torch.equal(getattr(scene.background, name), before[name]), name
-    assert torch.equal(scene.sky.faces, faces)
-    assert torch.equal(scene.actors[0].track.world_from_actor, poses)
-    out = trainer.scene()
-    kept = out.background.means.clone(), out.sky.faces.clone(), out.color_maps["right"].clone()
-    run(trainer, 5)
-    assert torch.equal(out.background.means, kept[0])
-    assert torch.equal(out.sky.faces, kept[1])
-    assert torch.equal(out.color_maps["right"], kept[2])
-
-
 # ---- what it hands out -------------------------------------------------------------------------
 
 
@@ -446,35 +427,3 @@ def test_a_camera_that_sees_nothing(recorded):
     records = run(trainer, 8)
     assert not trainer.splats.age.any() and all(math.isfinite(r.loss) for r in records)
     assert not np.array_equal(trainer.sky_faces, np.full((6, 4, 4, 3), 0.5, np.float32))
-
-
-def test_a_sky_of_one_colour_becomes_a_cube_map(recorded):
-    trainer = quick(start(sky=ConstantSky(torch.tensor([0.2, 0.3, 0.4]))), recorded)
-    assert np.allclose(trainer.sky_faces, [0.2, 0.3, 0.4])
-    run(trainer, 2)
-    assert isinstance(trainer.scene().sky, CubemapSky)
-
-
-# ---- poses -------------------------------------------------------------------------------------
-
-
-def gradients_of(trainer: Trainer, key: ViewKey, weights: np.ndarray):
-    """Inputs of a view, and gradients of the weighted sum of its colours."""
-    tape = rendered(trainer, camera_of(trainer.scene(), key))
-    return tape.inputs, tape.backward(weights, np.zeros((HEIGHT, WIDTH), np.float32))
-
-
-def test_a_gradient_that_is_not_finite_pulls_at_nothing(recorded):
-    trainer = quick(truth(), recorded)
-    inputs, grads = gradients_of(
-        trainer, recorded.train[0], np.ones((HEIGHT, WIDTH, 3), np.float32)
-    )
-    blocks = inputs.blocks[:, 0].tolist()
-    first = blocks.index(1) * BLOCK
-    clean = part_forces(inputs, grads)
-    own = grads.rows[first, :3].astype(np.float64)
-    grads.rows[first, 1] = np.nan
-    broken = part_forces(inputs, grads)
-    np.testing.assert_allclose(broken.shift[1], clean.shift[1] - own, rtol=0, atol=1e-9)
-    assert np.isfinite(broken.turn).all()
-    assert np.array_equal(broken.shift[0], clean.shift[0])

@@ -13,13 +13,10 @@ from augment.effects.flood.water_plane import (
     Margins,
     Window,
     mirrored_camera,
-    mirrored_window,
     plane_depth,
     plane_window,
-    ray_z,
 )
 from augment.geometry import rigid, rotmat_from_quat
-from tests.scenes import camera_ahead
 
 
 def turned_camera(seed: int, width=31, height=19, position=(0.0, 0.0, 0.0)) -> Camera:
@@ -45,12 +42,6 @@ def test_the_window_is_the_least_that_holds_all_rays_that_meet_the_plane():
         assert plane_window(camera, level_z_m) == expected
 
 
-def test_a_ray_s_fall_is_its_direction_s_to_the_bit():
-    for seed in range(6):
-        camera = turned_camera(seed, position=(3.0, -2.0, 5.0))
-        assert torch.equal(ray_z(camera), camera.ray_directions(torch.float64)[..., 2])
-
-
 def test_depths_reach_the_plane():
     camera = turned_camera(1, position=(3.0, -2.0, 5.0))
     depth = plane_depth(camera, 2.0)
@@ -71,30 +62,6 @@ def test_a_pixel_of_the_mirrored_camera_looks_along_the_reflected_ray(seed):
     # Twice mirrored is where it was.
     back = mirrored_camera(mirrored, level)
     assert torch.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-12)
-
-
-def test_the_window_of_the_reflections():
-    camera = camera_ahead(33, 21)
-    window = Window(2, 12, 30, 21)
-    place = mirrored_window(window, camera)
-    assert place == Window(2, 0, 30, 9)
-    crop = place.of(mirrored_camera(camera, -1.0))
-    rays = window.of(camera).ray_directions(torch.float64)
-    expected = rays * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
-    assert torch.allclose(crop.ray_directions(torch.float64).flip(0), expected, atol=1e-12)
-
-
-def test_cut_and_paste():
-    image = torch.arange(20.0).reshape(4, 5)
-    window = Window(1, 2, 4, 4)
-    assert torch.equal(window.cut(image), image[2:4, 1:4])
-    into = torch.zeros(4, 5)
-    beyond = Window(-1, 3, 2, 6)
-    beyond.paste(into, torch.arange(1.0, 10.0).reshape(3, 3))
-    expected = torch.zeros(4, 5)
-    expected[3, :2] = torch.tensor([2.0, 3.0])
-    assert torch.equal(into, expected)
-    assert window.grown(Margins(1, 2, 3, 4)) == Window(0, 0, 7, 8)
 
 
 def test_masks_grow_at_least_by_their_margins():
