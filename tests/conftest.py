@@ -13,6 +13,7 @@ from pathlib import Path
 # Before torch is loaded. Processes that share the cores wait for each other's threads at the end of
 # every operation, ten times as long as these small ones take. (numba's threads are others.)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["CLIMATEGS_SCENE_CACHE_GB"] = "0"  # tests build what they look at
 
 import pytest
 import torch
@@ -74,8 +75,8 @@ LONG = {
     f"test_{name}.py"
     for name in (
         "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
-        "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
-        "render_backward", "snow_accuracy",
+        "flood_view", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
+        "render_backward", "snow_view",
     )
 }  # fmt: skip
 

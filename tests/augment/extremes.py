@@ -31,7 +31,7 @@ from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view
 from recipes.schema import Recipe
 from recipes.template import FieldSpec, Kind, SectionSpec, root
-from tests.augment.examples import examples
+from tests.augment.hard_scenes import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
 
 SOAKING = examples(0) > 0  # asked for by the environment: kernels may take their time to compile

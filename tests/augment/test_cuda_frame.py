@@ -1,4 +1,4 @@
-"""Passes over finished images on the GPU, and whole frames: the pictures of the other backends.
+"""Passes over images, whole frames and snow where all lies on a GPU, and what kernels compile into.
 
 Kernels are interpreted where there is no GPU, and a pretended one tells where a tensor lies on the
 wrong side.
@@ -7,17 +7,35 @@ wrong side.
 from __future__ import annotations
 
 import dataclasses
+import gc
+import os
+import subprocess
+import sys
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
 
+pytest.importorskip("triton")
+
 from augment.cameras import Camera
+from augment.effects.snow import placement
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
-from augment.render.buffers import RenderOutput
+from augment.render.buffers import (
+    AUTO,
+    CPU,
+    CUDA,
+    REFERENCE,
+    RenderOutput,
+    available_backends,
+    kernels_for,
+)
 from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
 from augment.render.fog import Fog, fog_raster
 from augment.render.rasterize import renormalise_alpha
@@ -29,7 +47,12 @@ from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
 from tests import snow_scenes
-from tests.augment.pretend_gpu import pretended_gpu
+from tests.augment import compiled_kernels as kernels
+from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
+from tests.augment.kernel_frames import RECIPES as KERNEL_RECIPES
+from tests.augment.kernel_frames import small_scene, views
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.snow_scenes import box_car, cameras_of, drive, sheet
 
 WIDTH, HEIGHT = 33, 21
 UNIFORM = Fog(0.03, (0.5, 0.6, 0.7))
@@ -94,7 +117,7 @@ def test_the_sky_behind_the_splats(away, name, smog):
         moved = on_gpu(seen)
         got = composite_sky(moved.rgb, moved.alpha, view, sky, fog=smog, backend="cuda")
         # Textures of noise, whose coordinates float32 rounds, and edges between faces: see
-        # test_composite.
+        # test_rasterize.
         difference = (got.cpu() - expected).abs().amax(-1)
         assert float(difference.quantile(0.99)) < 1e-4
         assert int((difference > 1e-3).sum()) <= 2
@@ -246,3 +269,188 @@ def test_two_views_under_way_do_not_mix(scene, away):
     for view, expected in zip(reversed(begun), reversed(alone), strict=True):
         check_same(view.result(), expected)
     assert not np.array_equal(alone[0].rgb, alone[1].rgb)
+
+
+@pytest.mark.long
+def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
+    small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
+    ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)
+    scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
+    cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
+    settings = PlacementSettings(cell_m=8.0)
+    monkeypatch.setattr(placement, "_SQUARE_CELLS", 16)  # several, which threads work on
+    expected = place_snow_support(scene, cameras, settings)
+    assert len(expected.ground) > 5
+    with pretended_gpu(monkeypatch):
+        found = place_snow_support(scene, cameras, settings, backend="cuda")
+    assert_alike(found.ground, expected.ground)
+
+
+@pytest.mark.gpu
+def test_a_larger_bed_with_a_vehicle_is_the_cpus():
+    car = box_car(start=(6.0, 0.0))
+    scene = drive(sheet((-6.0, 20.0), (-8.0, 8.0)), actors=[car])
+    expected = place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.1))
+    found = place_snow_support(
+        scene, cameras_of(scene), PlacementSettings(cell_m=0.1), backend="cuda"
+    )
+    assert found.actors.keys() == expected.actors.keys() == {"car"}
+    for a, b in ((found.ground, expected.ground), (found.actors["car"], expected.actors["car"])):
+        assert len(a) == pytest.approx(len(b), rel=1e-3)  # cells at a threshold
+        assert float((a.sizes_m**2).sum()) == pytest.approx(float((b.sizes_m**2).sum()), rel=1e-3)
+
+
+def assert_alike(found, expected) -> None:
+    """The same cells; heights and colours within what float32 sums differ by."""
+    for field in dataclasses.fields(expected):
+        a, b = getattr(found, field.name), getattr(expected, field.name)
+        assert not isinstance(a, AwayTensor)
+        if a.dtype.is_floating_point:
+            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+        else:
+            assert torch.equal(a, b), field.name
+
+
+def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch):
+    gc.collect()  # what other tests have left
+    with pretended_gpu(monkeypatch):
+        before = len(gpu._copies)
+        tensor = torch.arange(6.0)
+        copy = gpu.resident(tensor)
+        assert isinstance(copy, AwayTensor) and gpu.resident(tensor) is copy
+        tensor[0] = 9
+        assert float(gpu.resident(tensor)[0]) == 9
+        del tensor, copy
+        gc.collect()
+        assert len(gpu._copies) == before
+
+
+def test_the_pretended_gpu_refuses_what_a_real_one_would(monkeypatch):
+    with pretended_gpu(monkeypatch):
+        away, here = torch.ones(3).to(gpu.gpu_device()), torch.ones(3)
+        assert (away + 1).device == gpu.gpu_device() and float((away + away).sum()) == 6
+        with pytest.raises(RuntimeError, match="one lies on the CPU"):
+            away + here
+        with pytest.raises(RuntimeError):
+            away.numpy()
+        assert torch.equal(away.cpu(), here) and torch.equal(away.to("cpu"), here)
+        made = torch.tensor([1.0, 2.0], device=away.device)
+        assert isinstance(made, AwayTensor) and isinstance(torch.zeros_like(made), AwayTensor)
+        away[1] = 5
+        assert away.inner.tolist() == [1, 5, 1]
+        with pytest.raises(AssertionError, match="a kernel was given a tensor of cpu"):
+            gpu._kernel_argument(here)
+        with pytest.raises(AssertionError, match="not contiguous"):
+            gpu._kernel_argument(torch.ones(3, 2).to(gpu.gpu_device()).T)
+        with pytest.raises(AssertionError, match="a kernel was given"):
+            gpu._kernel_argument(np.int64(3))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_kernels_are_interpreted_and_auto_does_not_take_them():
+    assert gpu.is_interpreted() and gpu.gpu_device() == torch.device("cpu")
+    assert available_backends()[CUDA] is None and not gpu.has_gpu()
+
+
+def test_passes_take_kernels_for_plain_float32_only():
+    image = torch.ones(2, 2)
+    assert [kernels_for(name, image) for name in (REFERENCE, CPU, CUDA)] == [REFERENCE, CPU, CUDA]
+    assert kernels_for(CUDA, image.double()) == kernels_for(CUDA, image.clone().requires_grad_())
+    assert kernels_for(CUDA, image, None, image.double()) == REFERENCE
+    assert kernels_for(AUTO, image) == CPU and kernels_for(AUTO, image.to("meta")) == CUDA
+
+
+interpreted = pytest.mark.skipif(
+    not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"
+)
+
+
+def record_small_kernels() -> Counter[Launch]:
+    source, target = torch.ones(40), torch.zeros(40)
+    with recorded_launches() as counts:
+        for count in (1, 16, 39):
+            gpu.launch(kernels.scale, (3,), source, target, count, 2.5, BLOCK=16, num_warps=1)
+        assert target[:39].eq(1.25).all() and target[39] == 0  # they run all the same
+        gpu.launch(kernels.scale, (1,), source[1:], target, 3, 1.0, BLOCK=16, num_warps=2)
+        gpu.launch(kernels.add_wide, (1,), source, target, BLOCK=16, num_warps=1)
+        gpu.launch(kernels.scale, (0,), source, target, 0, 1.0, BLOCK=64)
+    return counts
+
+
+def record_views(*names: str) -> list[Launch]:
+    every = views()
+    with recorded_launches() as counts:
+        for name in names or every:
+            every[name]()
+    return [*counts]
+
+
+@pytest.mark.long
+@interpreted
+def test_launches_are_told_apart_by_what_is_compiled_for_them():
+    counts = record_small_kernels()
+    assert [(each.name, n) for each, n in counts.items()] == [
+        ("scale", 3), ("scale", 1), ("add_wide", 1)
+    ]  # fmt: skip
+    first, unaligned, _ = [each.arguments for each in counts]
+    assert first["source"] == {"tensor": "float32", "aligned": True} and first["BLOCK"] == 16
+    assert not unaligned["source"]["aligned"] and unaligned["num_warps"] == 2
+
+
+@pytest.mark.long
+@interpreted
+def test_what_is_wrong_with_a_kernel_is_seen():
+    with recorded_launches() as broken, pytest.raises(Exception, match="arange"):
+        gpu.launch(kernels.broken, (1,), torch.ones(40), BLOCK=16)
+    with recorded_launches() as crowded:
+        many = torch.ones(2048)
+        gpu.launch(kernels.crowd, (1,), many, many, BLOCK=2048, num_warps=1, maxnreg=32)
+    compiled = compile_launches([*(record_small_kernels() | broken | crowded)])
+    good = [each for each in compiled if each.kernel.endswith(":scale")]
+    assert len(good) == 2 and not complaints(good) and all(each.registers for each in good)
+    found = {each.kernel.partition(":")[2]: complaints([each]) for each in compiled}
+    assert "does not compile" in found["broken"][0] and "power of 2" in found["broken"][0]
+    assert "spills" in found["crowd"][0]
+    assert "float64" in found["add_wide"][0] and "atomics" in found["add_wide"][1]
+
+
+@interpreted
+@pytest.mark.long
+def test_kernels_of_views_compile_into_what_they_should():
+    """One of each kernel of a few views, since compiling takes seconds; all of them below."""
+    launches = {each.name: each for each in record_views("clean")}
+    assert launches.keys() >= {"project_gaussians", "count_tiles", "list_pairs", "blend_blocks"}
+    assert not complaints(compile_launches([*launches.values()]))
+
+
+@pytest.mark.gpu
+def test_kernels_of_all_views_compile_into_what_they_should():
+    """In a process in which they are interpreted, since here they run on the GPU."""
+    code = (
+        "from tests.augment.test_cuda_compiles import *\n"
+        "assert not (wrong := complaints(compile_launches(record_views()))), wrong"
+    )
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
+    )
+    if "only 0-dimensional arrays" in done.stderr:
+        pytest.skip("this Triton interprets loops with older numpy only (3.6 with less than 2.4)")
+    assert done.returncode == 0, done.stderr
+
+
+@interpreted
+@pytest.mark.long
+def test_the_next_frame_compiles_nothing_new():
+    """Counts and places that change from frame to frame are none of a kernel's constants."""
+    scene = small_scene()
+    camera, recipe = scene.frames[0].cameras["ahead"], KERNEL_RECIPES["flood, sky"]
+    with recorded_launches() as first:
+        render_view(scene, camera, recipe, backend="cuda")
+    pose = camera.camera_from_world.clone()
+    pose[:3, 3] += torch.tensor([0.2, 0.1, -0.3], dtype=torch.float64)
+    later = dataclasses.replace(camera, camera_from_world=pose, timestamp_ns=10**7)
+    fewer = scene.background.select(torch.arange(len(scene.background)) >= 5)
+    with recorded_launches() as second:
+        render_view(dataclasses.replace(scene, background=fewer), later, recipe, backend="cuda")
+    assert second and set(second) <= set(first)

@@ -30,7 +30,6 @@ from recipes.load import parse_recipe
 from recipes.schema import Recipe
 from recipes.snow import Snow
 from recipes.template import FieldSpec, Kind
-from tests.augment.examples import drawing
 from tests.augment.extremes import (
     CELL_M,
     EFFECTS,
@@ -49,6 +48,7 @@ from tests.augment.extremes import (
     snow_model,
     street,
 )
+from tests.augment.hard_scenes import drawing
 from tests.scenes import one_gaussian
 from tests.snow_beds import cells_on_grid
 

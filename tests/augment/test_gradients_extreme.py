@@ -37,8 +37,7 @@ from augment.render.part_views import part_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
-from tests.augment.examples import drawing
-from tests.augment.hard_scenes import KINDS, SMOGS, hard_gaussians, in_float64, wide_camera
+from tests.augment.hard_scenes import KINDS, SMOGS, drawing, hard_gaussians, in_float64, wide_camera
 from tests.augment.loss_definition import reference_loss
 
 pytestmark = pytest.mark.long

@@ -1,6 +1,9 @@
 """Training of the style network: what it learns from, and that nothing else decides it."""
 
+from __future__ import annotations
+
 import dataclasses
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,8 +12,22 @@ import torch
 from scenes import camera_ahead, one_gaussian, random_gaussians
 
 from augment.cameras import Frame
-from augment.effects.style.losses import FilterBank
-from augment.effects.style.network import apply_map
+from augment.effects.style.losses import FilterBank, weighted_sum
+from augment.effects.style.network import Gscm, apply_map
+from augment.effects.style.pairs import (
+    GREY,
+    PAIR_WEIGHTS,
+    PairBatch,
+    RecolorSettings,
+    closed_method,
+    network_method,
+    pair_losses,
+    recolor,
+    sample_pairs,
+    sample_recolorings,
+    score_pairs,
+)
+from augment.effects.style.statistics import reinhard_map
 from augment.effects.style.train import (
     StyleTrainer,
     TrainingPool,
@@ -26,10 +43,12 @@ from augment.effects.style.train import (
 )
 from augment.errors import StyleError
 from augment.render.buffers import ALPHA, RGB
+from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Actor, Scene, Track
 from augment.sky import ConstantSky
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 SIZE = 16
 MILD = torch.tensor([[0.8, 0.1, 0.0, 0.05], [0.05, 0.7, 0.1, 0.1], [0.0, 0.15, 0.75, 0.02]])
@@ -278,3 +297,129 @@ def test_scores_of_a_network_that_restores_all():
     found = score_photos(net, photos(2))
     assert {"same", "half", "look", "mkl_same"} <= set(found) and found["mkl_same"] > found["same"]
     assert score_photos(net, photos(1)) == {}
+
+
+STILL = RecolorSettings(*[0.0] * 11)
+
+
+def pair_photos(count: int = 3, px: int = 24) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(count)
+    rough = torch.rand((count, 3, 4, 4), generator=generator)
+    return torch.nn.functional.interpolate(rough, (px, px), mode="bilinear")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_a_seed_is_a_recolouring():
+    images = pair_photos()
+    first, again, other = (recolor(images, seeded(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert first.min() >= 0 and first.max() <= 1
+    assert not torch.equal(first, images)
+
+
+def test_grey_and_night_are_reached():
+    images = pair_photos(1).expand(64, -1, -1, -1)
+    grey = sample_recolorings(64, seeded(), replace(STILL, grey_share=1.0))(images)
+    spread = images.std(1).mean()
+    assert (grey.std(1).mean((1, 2)) < 0.31 * spread).all()
+    luma = torch.tensor(GREY)
+    torch.testing.assert_close(  # what is taken away is colour alone
+        torch.einsum("c,bchw->bhw", luma, grey), torch.einsum("c,bchw->bhw", luma, images)
+    )
+    night = sample_recolorings(64, seeded(), replace(STILL, night_share=1.0))(images)
+    assert (night.mean((1, 2, 3)) < 0.4 * images.mean((1, 2, 3))).all()
+    assert (night.mean((2, 3))[:, 2] / night.mean((2, 3))[:, 0]).mean() > 1.3 * (
+        images.mean((2, 3))[:, 2] / images.mean((2, 3))[:, 0]
+    ).mean()
+
+
+def test_pairs_share_a_recolouring():
+    state = torch.random.get_rng_state()
+    batch, again = (sample_pairs(pair_photos(4), seeded(), 5, size_px=16) for _ in range(2))
+    assert batch.photos.shape == (5, 3, 16, 16)
+    assert all(torch.equal(*both) for both in zip(batch, again, strict=True))
+    assert (batch.photos - batch.others).abs().mean((1, 2, 3)).min() > 0.01
+    # One recolouring for both: colours that both hold become the same colour.
+    one = PairBatch(*(part[:1] for part in batch))
+    near = torch.cdist(*(picture[0].flatten(1).T for picture in (one.photos, one.others)))
+    first, second = divmod(int(near.argmin()), near.shape[1])
+    became = (one.recolored[0].flatten(1)[:, first], one.others_recolored[0].flatten(1)[:, second])
+    assert (became[0] - became[1]).abs().max() < 0.05 + 3 * float(near.min())
+    assert torch.equal(torch.random.get_rng_state(), state)
+    with pytest.raises(ValueError, match="at least 2 photos; got 1"):
+        sample_pairs(pair_photos(1), seeded(), 2, size_px=16)
+
+
+def test_losses_fall_by_training():
+    torch.manual_seed(0)
+    net = Gscm()
+    batch = sample_pairs(pair_photos(6), seeded(), 2, size_px=32)
+    optimizer = torch.optim.Adam(net.parameters(), 3e-4)
+    totals = []
+    for _ in range(8):
+        losses = pair_losses(net, batch)
+        total = weighted_sum(losses, PAIR_WEIGHTS | {"range": 4.0})
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        totals.append(total.item())
+    assert totals[-1] < totals[0] - 0.1
+    assert losses.keys() == {*PAIR_WEIGHTS, "range"}
+
+
+# ---- scores -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scored() -> torch.Tensor:
+    return 0.1 + 0.7 * pair_photos(4, 32)
+
+
+def test_order_of_methods(scored):
+    none, half, full = (
+        score_pairs(closed_method(strength=strength), scored, repeats=1)
+        for strength in (0.0, 0.5, 1.0)
+    )
+    assert none["same"] < half["same"] < full["same"]
+    assert none["same"] == pytest.approx(none["look"])  # the style does not matter to it
+    assert full["same"] > max(full["half"], full["below"], full["look"])
+    first, again = (score_pairs(closed_method(reinhard_map), scored, repeats=1) for _ in range(2))
+    assert first == again != full
+
+
+def test_untrained_network_is_near_the_closed_form(scored):
+    closed = score_pairs(closed_method(), scored, repeats=1)
+    network = score_pairs(network_method(Gscm().eval()), scored, repeats=1)
+    assert abs(network["same"] - closed["same"]) < 4
+
+
+def test_a_draw_is_the_same_on_every_device(monkeypatch):
+    expected = draw(pool_of(2, scene=True))
+    with pretended_gpu(monkeypatch):
+        found = draw(pool_of(2, scene=True, device=str(gpu.gpu_device())))
+        for name in ("pictures", "styles"):
+            tensor = getattr(found, name)
+            assert isinstance(tensor, AwayTensor)
+            assert torch.equal(tensor.cpu(), getattr(expected, name))
+        assert torch.equal(found.colors.bands.cpu(), expected.colors.bands)
+
+
+@pytest.mark.long
+def test_a_training_goes_on_between_devices(monkeypatch):
+    here = trainer_of(pool_of(2, scene=True))
+    expected = [here.run_step() for _ in range(2)]
+    with pretended_gpu(monkeypatch):
+        there = trainer_of(pool_of(2, scene=True, device=str(gpu.gpu_device())))
+        found = [there.run_step() for _ in range(2)]
+        assert all(isinstance(p, AwayTensor) for p in there.net.parameters())
+        arrays, facts = there.state()
+    # Adam's first step follows signs, which rounding decides where a gradient is nearly 0.
+    for a, b, tolerance in zip(found, expected, (1e-5, 1e-2), strict=True):
+        assert a.loss == pytest.approx(b.loss, rel=tolerance)
+    assert facts == {"step": 2}
+    here.load_state(arrays, facts)
+    assert here.run_step().step == 3
