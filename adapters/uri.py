@@ -64,9 +64,9 @@ SCHEMES = {
         "adapters.procedural:procedural_labels",
     ),
     "pandaset": Scheme(
-        "adapters.pandaset.adapter:open_pandaset",
+        "adapters.pandaset:open_pandaset",
         "pandaset:data/pandaset/002",
-        labels="adapters.pandaset.files:pandaset_labels",
+        labels="adapters.pandaset:pandaset_labels",
         is_raw=True,
     ),
     "nuscenes": Scheme(
