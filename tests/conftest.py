@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,6 +80,14 @@ LONG = {
         "render_backward", "snow_view",
     )
 }  # fmt: skip
+
+
+def pytest_runtest_setup() -> None:
+    """Kernels on one thread, in processes that share the cores: on two they wait for each other's
+    threads, at times 30 times as long as they compute. Tests of threads set their own numbers.
+    """
+    if threads := sys.modules.get("augment.render.threads"):
+        threads.limit_threads(1)
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from augment.errors import SceneError
-from augment.geometry import rotmat_from_quat
 from augment.reconstruct import kernels
 from augment.reconstruct.config import Growth, LearningRates
 from augment.reconstruct.splats import (
@@ -51,12 +50,6 @@ FASTER = LearningRates(means=0.5, quats=1e-2, scales=2e-2, opacities=0.2, sh_res
 STEPS = 100  # of the run
 BOTH = ((0, None), (1, slight_pose()))
 COUNTS = (2500, 37)  # of both parts; the first fills one block and begins a second
-
-
-@pytest.fixture
-def any_threads():
-    yield
-    limit_threads(None)
 
 
 def ahead(count: int, seed: int) -> Gaussians:
@@ -308,7 +301,6 @@ def test_values_are_clamped():
         assert np.isfinite(array).all()
 
 
-@pytest.mark.usefixtures("any_threads")
 def test_same_bits_for_any_number_of_threads():
     results = []
     for threads in (1, 2, 2):
@@ -444,16 +436,6 @@ def origins(splats: Splats, before: Splats) -> np.ndarray:
     assert np.array_equal(splats.sh, before.sh[rows])
     assert np.array_equal(splats.semantic, before.semantic[rows])
     return rows
-
-
-def test_rotation_is_the_quaternions_matrix() -> None:
-    import torch
-
-    splats = splats_of(20)
-    matrices = rotmat_from_quat(torch.from_numpy(splats.quats)).numpy()
-    expected = np.einsum("nij,nj->ni", matrices, splats.means)
-    # Means reach 30 m; a few roundings of float32 at that size.
-    np.testing.assert_allclose(rotate(splats.quats, splats.means), expected, atol=3e-5)
 
 
 # --- clones and splits ---

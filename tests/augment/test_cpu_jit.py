@@ -219,17 +219,12 @@ def test_without_tbb_callers_take_turns():
 
 
 def test_limits():
-    before = threads.thread_count()
-    try:
-        threads.limit_threads(1)
-        assert threads.thread_count() == 1
-        with threads.kernel_threads():
-            assert numba.get_num_threads() == 1
-        threads.limit_threads(10_000)
-        assert threads.thread_count() == numba.get_num_threads()
-    finally:
-        threads.limit_threads(None)
-    assert threads.thread_count() == before
+    threads.limit_threads(1)
+    assert threads.thread_count() == 1
+    with threads.kernel_threads():
+        assert numba.get_num_threads() == 1
+    threads.limit_threads(10_000)
+    assert threads.thread_count() == numba.get_num_threads()
     with pytest.raises(ValueError, match="count must be >= 1 thread, or None for no limit; got 0"):
         threads.limit_threads(0)
 

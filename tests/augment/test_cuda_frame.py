@@ -25,15 +25,7 @@ from augment.effects.snow import placement
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
-from augment.render.buffers import (
-    AUTO,
-    CPU,
-    CUDA,
-    REFERENCE,
-    RenderOutput,
-    available_backends,
-    kernels_for,
-)
+from augment.render.buffers import CUDA, RenderOutput, available_backends
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
@@ -49,8 +41,7 @@ from recipes.style import Style
 from tests import snow_scenes
 from tests.augment import compiled_kernels as kernels
 from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
-from tests.augment.kernel_frames import RECIPES as KERNEL_RECIPES
-from tests.augment.kernel_frames import small_scene, views
+from tests.augment.kernel_frames import views
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.snow_scenes import box_car, cameras_of, drive, sheet
 
@@ -352,14 +343,6 @@ def test_without_a_gpu_kernels_are_interpreted_and_auto_does_not_take_them():
     assert available_backends()[CUDA] is None and not gpu.has_gpu()
 
 
-def test_passes_take_kernels_for_plain_float32_only():
-    image = torch.ones(2, 2)
-    assert [kernels_for(name, image) for name in (REFERENCE, CPU, CUDA)] == [REFERENCE, CPU, CUDA]
-    assert kernels_for(CUDA, image.double()) == kernels_for(CUDA, image.clone().requires_grad_())
-    assert kernels_for(CUDA, image, None, image.double()) == REFERENCE
-    assert kernels_for(AUTO, image) == CPU and kernels_for(AUTO, image.to("meta")) == CUDA
-
-
 interpreted = pytest.mark.skipif(
     not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"
 )
@@ -383,18 +366,6 @@ def record_views(*names: str) -> list[Launch]:
         for name in names or every:
             every[name]()
     return [*counts]
-
-
-@pytest.mark.long
-@interpreted
-def test_launches_are_told_apart_by_what_is_compiled_for_them():
-    counts = record_small_kernels()
-    assert [(each.name, n) for each, n in counts.items()] == [
-        ("scale", 3), ("scale", 1), ("add_wide", 1)
-    ]  # fmt: skip
-    first, unaligned, _ = [each.arguments for each in counts]
-    assert first["source"] == {"tensor": "float32", "aligned": True} and first["BLOCK"] == 16
-    assert not unaligned["source"]["aligned"] and unaligned["num_warps"] == 2
 
 
 @pytest.mark.long
@@ -437,20 +408,3 @@ def test_kernels_of_all_views_compile_into_what_they_should():
     if "only 0-dimensional arrays" in done.stderr:
         pytest.skip("this Triton interprets loops with older numpy only (3.6 with less than 2.4)")
     assert done.returncode == 0, done.stderr
-
-
-@interpreted
-@pytest.mark.long
-def test_the_next_frame_compiles_nothing_new():
-    """Counts and places that change from frame to frame are none of a kernel's constants."""
-    scene = small_scene()
-    camera, recipe = scene.frames[0].cameras["ahead"], KERNEL_RECIPES["flood, sky"]
-    with recorded_launches() as first:
-        render_view(scene, camera, recipe, backend="cuda")
-    pose = camera.camera_from_world.clone()
-    pose[:3, 3] += torch.tensor([0.2, 0.1, -0.3], dtype=torch.float64)
-    later = dataclasses.replace(camera, camera_from_world=pose, timestamp_ns=10**7)
-    fewer = scene.background.select(torch.arange(len(scene.background)) >= 5)
-    with recorded_launches() as second:
-        render_view(dataclasses.replace(scene, background=fewer), later, recipe, backend="cuda")
-    assert second and set(second) <= set(first)

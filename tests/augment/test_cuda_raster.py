@@ -12,10 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
 
 from augment.cameras import Camera
-from augment.geometry import rigid
 from augment.render import layout
 from augment.render.buffers import (
     ALPHA,
@@ -42,12 +40,10 @@ from augment.render.shading import LINES
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.augment import hard_scenes
-from tests.augment.extremes import wild_gaussians
 from tests.augment.hard_scenes import (
     KINDS,
     SMOGS,
     colour_maps,
-    drawing,
     hard_gaussians,
     in_float64,
     snow_light,
@@ -229,17 +225,6 @@ def test_an_orthographic_camera(weather):
     )
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("keep", [BELOW])
-def test_what_a_clip_cannot_reach_is_not_drawn(keep):
-    camera, part = camera_ahead(), PosedGaussians(random_gaussians(100, seed=6))
-    clip = HeightClip(0.1, keep, reach_m=0.5, overlaps=True)
-    actual = splats_of([part], camera, clip=clip)
-    assert_close(actual, drawn_splats(in_float64([part]), camera, None, clip))
-    whole = splats_of([part], camera)
-    assert 0 < int((actual.counts > 0).sum()) < int((whole.counts > 0).sum())
-
-
 @pytest.mark.parametrize("rows", ["rows", pytest.param("classes", marks=pytest.mark.long)])
 def test_maps_by_class_or_by_row(rows):
     camera, gaussians = camera_ahead(), random_gaussians(70, seed=7)
@@ -300,27 +285,6 @@ def test_ties_stay_ties():
     splats = splats_of([PosedGaussians(gaussians, slight_pose())], camera_ahead())
     assert splats.keys[37] == splats.keys[-1] != HIDDEN
     assert torch.equal(splats.rects[37], splats.rects[-1])
-
-
-# ---- extremes ------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@drawing(8)
-@given(wild_gaussians())
-def test_whatever_is_drawn_is_finite(gaussians):
-    camera = camera_ahead()
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    for clip, settings in ((None, DEFAULT), (UNCUT, RasterSettings(antialiased=True))):
-        smog = SMOGS["layered"]
-        splats = splats_of([PosedGaussians(gaussians)], camera, settings, smog, clip)
-        drawn = splats.counts > 0
-        assert bool(torch.isfinite(splats.records[drawn]).all())
-        assert bool((splats.records[drawn, layout.SHARP_X] > 0).all())
-        assert splats.cuts is None or bool(torch.isfinite(splats.cuts[drawn]).all())
-        corners = splats.rects[drawn]
-        assert bool((corners & 0xFFFF < columns).all()) and bool((corners >> 16 < rows).all())
-        assert bool((corners >= 0).all())
 
 
 # ---- on a GPU ------------------------------------------------------------------------------------
@@ -510,17 +474,6 @@ def test_blending_random_splats(size):
     parts = [PosedGaussians(random_gaussians(30, seed=sum(size), size=0.4))]
     expected = rasterize_reference(in_float64(parts), camera, ALL, DEFAULT, None)
     assert_agrees(blend_alone(in_float64(parts), camera), expected)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("stop", [0.25, 0.01, 1e-6])
-def test_a_pixel_is_finished_at_the_stop(stop):
-    """Layers over layers; ids, depths and sums end where the definition's do."""
-    layers = [one_gaussian((2 + 0.3 * i, 0.02 * i, 0), 0.5 + 0.05 * i, 0.6) for i in range(45)]
-    parts, camera = [PosedGaussians(stack(*layers))], camera_ahead(9, 7, 14.0)
-    settings = RasterSettings(transmittance_stop=stop, alpha_max=0.5)
-    expected = rasterize_reference(in_float64(parts), camera, ALL, settings, None)
-    assert_agrees(blend_alone(in_float64(parts), camera, settings=settings), expected)
 
 
 @pytest.mark.long
@@ -756,10 +709,3 @@ def test_a_crowd_has_the_same_bits_every_time(crowd):
     first = render(*crowd)
     for _ in range(3):
         assert_same_bits(render(*crowd), first)
-
-
-@pytest.mark.gpu
-def test_kilometres_from_the_origin():
-    pose = rigid(torch.eye(3, dtype=torch.float64), torch.tensor([31e3, -17e3, 250.0]).double())
-    camera = camera_ahead(97, 61, 80.0, position=(31_000.1, -17_000.3, 250.2))
-    assert_matches_definition([PosedGaussians(random_gaussians(300), pose)], camera)

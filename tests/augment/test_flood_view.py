@@ -390,14 +390,6 @@ def test_snells_window(scene):
     assert picture[r < radius - 3][:, 2].min() > 60
 
 
-def test_time_moves_the_waves_and_nothing_else_does(scene):
-    view = camera()
-    water = flood(waves=Waves(preset="breeze"), reflection="sky")
-    later = dataclasses.replace(view, timestamp_ns=50_000_000)
-    first, again, moved = (view_of(scene, water, v).rgb for v in (view, view, later))
-    assert np.array_equal(first, again) and not np.array_equal(first, moved)
-
-
 def test_an_upright_box_is_submerged_by_its_height() -> None:
     boxes = make_boxes(((5, 0, 0.75), CAR_M, UPRIGHT))  # from 0 to 1.5 m
     levels = {-1.0: 0.0, 0.0: 0.0, 0.3: 0.2, 0.75: 0.5, 1.5: 1.0, 9.0: 1.0}
@@ -434,23 +426,6 @@ def test_the_road_under_a_car_is_not_the_car() -> None:
     assert hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.0), none).pixels[0] == 0
     # A bonnet or sill at 15 cm is.
     assert hidden_pixels(placed(boxes), camera, plane_depth(camera, 0.15), none).pixels[0] > 100
-
-
-@pytest.mark.parametrize("resolution", [0.5, 1.0, 2.0])
-def test_the_hidden_part_is_that_under_the_water_line(resolution: float) -> None:
-    """A box face straight ahead, under water below half its height: half of its pixels."""
-    camera = dataclasses.replace(make_camera(), cx=80.0, cy=53.0).scaled(resolution)
-    boxes = make_boxes(((10, 0, 1.6), (1, 2, 2), UPRIGHT))  # face at x = 9.5 m, 0.6 to 2.6 m
-    depth = np.full((camera.height, camera.width), 9.5, np.float32)
-    rays = camera.ray_directions(torch.float64).numpy()
-    z = 1.6 + depth * rays[..., 2]
-    water = np.where(z < 1.6, 255, 0).astype(np.uint8)
-    counted = hidden_pixels(placed(boxes), camera, depth, water)
-    assert submerged_fraction(placed(boxes), 1.6)[0] == pytest.approx(0.5, abs=1e-8)
-    # Below, 1 - BOTTOM_M of the metre counts, above 1 + SIDES_M; the water line and
-    # each edge are off by half a pixel, of the 21 that the face has at resolution 1.
-    expected = (1 - BOTTOM_M) / (2 - BOTTOM_M + SIDES_M)
-    assert counted.marked[0] / counted.pixels[0] == pytest.approx(expected, abs=1 / 21 / resolution)
 
 
 def cosines(*degrees: float) -> torch.Tensor:
@@ -599,14 +574,6 @@ def test_a_flooded_view_stays_on_the_gpu_and_is_the_cpu_s(monkeypatch, reflectio
         there = flooded("cuda", view, water, smog, deferred=deferred)
         # The screen's march interpolates on the CPU, and traces all pixels on the GPU.
         same_picture(there, here, 0.05 if reflection == "screen_space" else 0.01)
-
-
-def test_a_view_from_under_the_water_stays_on_the_gpu(monkeypatch):
-    view, water = small_camera(z=-1.3, pitch=-0.3), medium("sky", "still")
-    here = flooded("cpu", view, water, LAYERED, deferred=False)
-    with pretended_gpu(monkeypatch):
-        drawn_elsewhere(monkeypatch)
-        same_picture(flooded("cuda", view, water, LAYERED, deferred=False), here, 0.01)
 
 
 @pytest.mark.long

@@ -218,13 +218,6 @@ def test_a_road_that_climbs_and_falls_has_a_plane_for_each_part(with_open3d) -> 
     assert ground.median_z_m == pytest.approx(np.median(drive[:, 2]), abs=0.1)
 
 
-def test_steep_planes_are_no_road(with_open3d) -> None:
-    """A hillside of 20 degrees, more than a wrong gravity or a road can be."""
-    steep = road(math.tan(math.radians(20)))
-    assert len(ground_points(steep, path())) == 0
-    assert len(ground_points(road(math.tan(math.radians(12))), path())) > 0
-
-
 @pytest.mark.parametrize(("ego_m", "lowest"), [(0.0, 0.0), (CAMERA_M, 0.1), (2.0, 0.1)])
 def test_without_points_the_path_says_where_the_car_stood(ego_m: float, lowest: float) -> None:
     """An ego origin well below the cameras is on the road; otherwise the road is 1.5 m below the

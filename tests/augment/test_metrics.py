@@ -11,14 +11,10 @@ from safetensors.torch import save_file
 from scenes import camera_ahead
 from scipy import ndimage
 from torch import nn
-from walls import FRAME_NS, board_boxes, board_centre, driving_camera, wall_view
+from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
 from augment.errors import MetricError
-from augment.jobs.tables import FrameBoxes
-from augment.labels import Boxes
 from augment.metrics.consistency import (
-    MAX_GAP_NS,
-    STILL_M,
     ActorPaths,
     DepthView,
     carry,
@@ -30,7 +26,6 @@ from augment.metrics.consistency import (
 from augment.metrics.image import DepthErrors, depth_errors, flip, psnr, ssim
 from augment.metrics.lpips import ALEX, VGG16, Conv, Lpips, expected_shapes, load_lpips
 from augment.metrics.lpips import picture_lpips as lpips_of
-from tests.augment.loss_definition import ssim_map
 
 
 def pictures(height=23, width=31, *, noise=0.1, seed=0):
@@ -179,12 +174,6 @@ def test_bad_depths_are_refused():
         depth_errors(np.ones(3), np.array([0, 1, np.inf]))
 
 
-def test_ssim_is_the_one_that_reconstruction_learns_with():
-    a, b = pictures(17, 40)
-    learnt = ssim_map(torch.from_numpy(a), torch.from_numpy(b))
-    assert ssim(a, b) == pytest.approx(float(learnt.mean()), abs=1e-11)  # both float64
-
-
 WALL_M = 8.0
 
 
@@ -322,33 +311,6 @@ def test_what_moves_and_whose_pose_is_not_known_does_not_count():
     on_board = a.depth_m < 7
     assert not carried.moved.any() and np.isnan(carried.points_m[on_board]).all()
     assert np.isfinite(carried.points_m[:, :5]).all()
-
-
-def test_a_box_that_stands_is_the_worlds():
-    frames = {n: dataclasses.replace(f, timestamp_ns=n) for n, f in board_boxes(2).items()}
-    for frame in frames.values():
-        frame.boxes.centers_m[0] = board_centre(0)
-    frames[1].boxes.centers_m[0, 1] += 0.9 * STILL_M  # a label that trembles
-    frames = {n: FrameBoxes(n * FRAME_NS, f.boxes) for n, f in frames.items()}
-    a = wall_view(driving_camera(0))
-    b = wall_view(dataclasses.replace(driving_camera(1), timestamp_ns=0))
-    b = dataclasses.replace(b, camera=driving_camera(1))
-    carried = carry(ActorPaths(frames), a, b)
-    assert not carried.moved.any() and not carried.unclear_b.any()
-    assert np.isfinite(carried.points_m).all()
-    after = dataclasses.replace(b, camera=dataclasses.replace(b.camera, timestamp_ns=2 * FRAME_NS))
-    assert np.isfinite(carry(ActorPaths(frames), a, after).points_m).all()
-
-
-def test_labels_without_numbers_or_far_in_time_are_no_boxes():
-    frames = board_boxes(1)
-    broken = Boxes(("x",), ("Car",), np.full((1, 3), np.nan), np.ones((1, 3)), np.ones((1, 4)))
-    frames[1] = FrameBoxes(FRAME_NS, broken)
-    paths = ActorPaths(frames)
-    assert set(paths.at(0)) == {"board"}
-    assert paths.at(MAX_GAP_NS)["board"].known is False
-    assert paths.at(MAX_GAP_NS + 1) == {}
-    assert ActorPaths({}).at(0) == {}
 
 
 SIZE = 40

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
@@ -21,10 +20,9 @@ from augment.render.buffers import (
 )
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
-from augment.render.cpu import driver as cpu_scratch
-from augment.render.cpu.driver import gather_inputs, rasterize_cpu
+from augment.render.cpu.driver import rasterize_cpu
 from augment.render.fog import Fog
-from augment.render.reference import project_parts, rasterize_reference
+from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.scenes import (
@@ -140,25 +138,6 @@ def test_settings(settings):
     assert_matches_definition(parts, camera_ahead(97, 61, 80.0), settings)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("clip_px", "antialiased"), [(1.0, False), (8.0, True)])
-def test_ranking_keeps_every_splat_that_is_larger_than_the_clip(clip_px, antialiased):
-    """Its bound on the radius is generous, and what it drops would pay no further."""
-    settings = RasterSettings(radius_clip_px=clip_px, antialiased=antialiased)
-    parts = [PosedGaussians(random_gaussians(3000, size=0.3, sh_degree=0), slight_pose())]
-    camera = camera_ahead(37, 21, 9.0)  # wide, so that bounds at the image's edge matter
-    with cpu_scratch.borrowed_scratch() as scratch:
-        inputs = gather_inputs(parts, camera, settings, None, with_color=True)
-        kept = cpu.rank(inputs, camera, scratch)[0][:3000].copy() > 0
-        plain = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
-        seen = cpu.rank(plain, camera, scratch)[0][:3000].copy() > 0
-    exact = np.zeros(3000, bool)
-    exact[project_parts(in_float64(parts), camera, settings).ids] = True
-    assert not (seen & exact & ~kept).any()
-    if clip_px >= 2:
-        assert (seen & ~kept).sum() > 0.2 * (seen & ~exact).sum()
-
-
 @pytest.mark.parametrize(("scale_height_m", "base_z_m"), [(0.05, -3000.0), (0.05, 3000.0)])
 def test_smog_far_below_and_above_its_layer(scale_height_m, base_z_m):
     smog = Fog(0.2, (0.8, 0.7, 0.5), scale_height_m, base_z_m)
@@ -263,16 +242,3 @@ def test_threads_that_render_at_once(crowd):
     with ThreadPoolExecutor(4) as pool:
         for output in pool.map(lambda _: render(*crowd), range(8)):
             assert_same_bits(output, expected)
-
-
-# ---- input and work space ----------------------------------------------------------------------
-
-
-def test_strided_and_float64_input():
-    scene, camera = random_gaussians(100), camera_ahead()
-    strided = dataclasses.replace(
-        scene, means=torch.cat([scene.means, scene.means], 1)[:, :3], sh=scene.sh.flip(1).flip(1)
-    )
-    assert not strided.means.is_contiguous()
-    assert_same_bits(render(strided, camera), render(scene, camera))
-    assert_same_bits(render(in_float64([PosedGaussians(scene)]), camera), render(scene, camera))

@@ -528,13 +528,6 @@ def test_moving_and_scaling_depths():
     np.testing.assert_allclose(modes_of(depths, weights * 0.3, 0.2), modes, rtol=1e-9)
 
 
-def test_a_mode_lies_at_its_cluster():
-    """Two depths joined: before their mean, and before the nearer by 5 % of the gap at most."""
-    shares = np.linspace(0.001, 0.999, 999)
-    ahead = modes_of(np.tile([5.0, 5.1], (999, 1)), np.c_[shares, 1 - shares]) - 5.0
-    assert ahead.min() > -0.0052 and (ahead < 0.1 * (1 - shares)).all()
-
-
 # ---- images ------------------------------------------------------------------------------------
 
 
@@ -583,14 +576,6 @@ def test_the_floor_decides_what_is_one_surface(backend):
         image = render_mode_depth(stack(*layers), camera_ahead(), backend, settings=settings)
         modes.append(float(image.mode_depth[10, 16]))
     assert modes[0] == pytest.approx(5.0, abs=1e-3) and 5.05 < modes[1] < 5.15
-
-
-def test_another_unit_of_length_scales_the_image(scale=100.0):
-    scene, camera = open_scene(), camera_ahead(97, 61, 80.0)
-    other = dataclasses.replace(scene, means=scene.means * scale, scales=scene.scales * scale)
-    settings = RasterSettings(near_m=0.01 * scale, mode_depth_floor_m=0.2 * scale)
-    modes = render_mode_depth(other, camera, settings=settings).mode_depth / scale
-    assert_images_close(modes, render_mode_depth(scene, camera).mode_depth, p999=2e-4, max_flips=8)
 
 
 # ---- gradients ---------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
-from augment.render.buffers import ALPHA, BUFFERS, OVERLAY, RGB
+from augment.render.buffers import ALPHA, OVERLAY, RGB
 from augment.render.fog import Fog
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
@@ -245,23 +245,6 @@ def test_the_identity_changes_no_bit():
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_classes_without_a_map_take_the_first(backend):
-    gaussians = labelled(10)
-    beyond = dataclasses.replace(
-        gaussians, semantic=torch.where(gaussians.semantic == 0, 30, gaussians.semantic).short()
-    )
-    negative = dataclasses.replace(
-        gaussians, semantic=torch.where(gaussians.semantic == 0, -1, gaussians.semantic).short()
-    )
-    maps = some_maps(CLASSES, 11)
-    images = [
-        rasterize([PosedGaussians(g, color_maps=maps)], camera_ahead(), backend=backend).rgb
-        for g in (gaussians, beyond, negative)
-    ]
-    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
-
-
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_rows_come_before_classes(backend):
     gaussians = labelled(10)
     rows = torch.arange(len(gaussians), dtype=torch.int16) % CLASSES
@@ -286,14 +269,6 @@ def test_maps_that_are_none_are_refused(maps, words):
     part = PosedGaussians(random_gaussians(3))
     object.__setattr__(part, "color_maps", maps)  # past what the tests' type checks refuse
     with pytest.raises(ValueError, match=words):
-        rasterize([part], camera_ahead())
-
-
-def test_light_per_pixel_is_not_mapped():
-    gaussians = random_gaussians(3)
-    light = SplatShading(torch.ones(3, 3), (0.0, 0.0, 1.0), 0.5)
-    part = PosedGaussians(gaussians, shading=light, color_maps=some_maps(1))
-    with pytest.raises(ValueError, match="light per pixel"):
         rasterize([part], camera_ahead())
 
 
@@ -346,11 +321,3 @@ def test_what_hides_snow_counts_against_it(backend):
     glass = PosedGaussians(one_gaussian((3.0, 0, 0), 30.0, 0.75))
     middle = render_overlay([glass, snow], backend).overlay[20:40, 40:60]
     torch.testing.assert_close(middle, torch.full_like(middle, 0.25 * 0.9), rtol=0, atol=1e-4)
-
-
-def test_what_is_called_snow_changes_nothing_else():
-    colder, warmer = (
-        render_overlay(crowd(False, is_overlay), buffers=BUFFERS) for is_overlay in (True, False)
-    )
-    for name in set(BUFFERS) - {OVERLAY}:
-        assert torch.equal(getattr(colder, name), getattr(warmer, name)), name

@@ -9,7 +9,7 @@ import torch
 
 from augment.geometry import multiply_quats, quat_from_rotmat, transform_points
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
-from augment.render.constants import MAX_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import RasterSettings
 from augment.render.fog import Fog
 from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
@@ -222,13 +222,6 @@ def test_a_greater_stop_blends_the_splat_that_reaches_it():
     assert float(output.alpha.max()) == pytest.approx(0.999, abs=1e-5)
 
 
-def test_no_stop_moves_the_median_depth(stop=MAX_TRANSMITTANCE_STOP):
-    gaussians, camera = random_gaussians(400, dtype=torch.float64, size=0.7), camera_ahead(19, 13)
-    settings = RasterSettings(transmittance_stop=stop)
-    expected = render(gaussians, camera).median_depth
-    assert torch.equal(render(gaussians, camera, settings=settings).median_depth, expected)
-
-
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_splats_no_larger_than_the_radius_clip_are_left_out(orthographic):
     """An upright ellipsoid on the axis: 3 px right and 6 px down at one sigma, before the blur."""
@@ -315,14 +308,6 @@ def test_a_scene_far_from_the_origin_keeps_its_detail_in_float32():
 
 
 # ---- smog -------------------------------------------------------------------------------------
-
-
-def test_smog_without_density_is_the_clear_image_to_the_bit():
-    gaussians, camera = random_gaussians(), camera_ahead()
-    clear = render(gaussians, camera)
-    for height in (None, 30.0):
-        output = render(gaussians, camera, smog=Fog(0.0, (0.7, 0.6, 0.5), height))
-        assert all(torch.equal(getattr(output, n), getattr(clear, n)) for n in BUFFERS)
 
 
 def test_smog_fades_by_euclidean_distance():

@@ -303,21 +303,6 @@ def test_a_value_is_made_once_and_forgotten_when_too_many_bytes_came_after_it():
     assert made == ["a", "b", "c", "b"]
 
 
-def test_a_value_beyond_the_limit_drives_out_no_other_and_none_drives_it_out():
-    memo, made = SceneMemo(max_bytes=100), []
-    for _ in range(3):
-        for key, count in (("large", 10_000), ("small", 10), ("empty", 0)):
-            memo.get((key,), lambda k=key, n=count: made.append(k) or np.zeros(n, np.float32))
-    assert made == ["large", "small", "empty"]
-
-
-def test_a_value_that_could_not_be_made_is_asked_for_again():
-    memo = SceneMemo()
-    with pytest.raises(ZeroDivisionError):
-        memo.get(("key",), lambda: 1 // 0)
-    assert memo.get(("key",), lambda: 1) == 1
-
-
 def test_threads_wait_for_the_one_that_makes_a_value():
     memo, made = SceneMemo(), []
 

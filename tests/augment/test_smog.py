@@ -227,20 +227,6 @@ def test_the_optical_depth_is_that_of_the_image(medium: Fog) -> None:
     np.testing.assert_allclose(got, expected, rtol=2e-9)
 
 
-def test_boxes_behind_the_camera_around_it_and_of_no_number() -> None:
-    behind = ((-20, 0, EYE_Z_M), CAR_M, UPRIGHT)
-    ahead = ((20, 0, EYE_Z_M), CAR_M, UPRIGHT)
-    around = ((0, 0, EYE_Z_M), (4, 4, 4), UPRIGHT)
-    lost, unturned = ((np.nan, 0, 0), CAR_M, UPRIGHT), ((5, 0, 0.5), CAR_M, (0.0, 0, 0, 0))
-    empty = np.zeros(SHAPE, np.float32)  # nothing but sky
-    for medium in (THICK, LAYERED, None):
-        got = measure(make_boxes(behind, ahead, around, lost, unturned), medium, empty)
-        t = got.transmittance
-        assert t[0] == pytest.approx(t[1], rel=1e-8) and t[1] <= t[2] <= 1
-        assert np.isnan(t[3:]).all() and np.isfinite(t[:3]).all()
-        assert (got.pixels <= 0).all()
-
-
 def test_denser_smog_lets_less_through_and_none_all() -> None:
     boxes, camera = boxes_at_random(np.random.default_rng(7)), make_camera(pitch=0.1)
     depth = np.random.default_rng(8).uniform(0, 20, SHAPE).astype(np.float32)

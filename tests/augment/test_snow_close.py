@@ -22,7 +22,6 @@ from augment.effects.snow.near_camera import (
     Layer,
     SnowLayers,
     finest_split,
-    near_rows,
     shift_m,
     split_discs,
     split_near,
@@ -250,22 +249,6 @@ def test_the_kernel_splits_discs_as_its_definition_does(lit, shift):
         torch.testing.assert_close(*pair, rtol=2e-7, atol=1e-7)
     if lit:
         torch.testing.assert_close(found.fine_slopes, expected.fine_slopes, rtol=2e-7, atol=1e-7)
-
-
-def test_no_point_near_the_eye_is_left_out_and_few_others_are_looked_at():
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-30, 5, -1), (30, 40, 2), (5000, 3)).astype(np.float32)
-    points = points[np.argsort(np.floor(points[:, 1] / 5) * 100 + points[:, 0])]  # in strips
-    owner = discs(1, 0)
-    for eye in ((3.0, 10.0, 1.0), (90.0, 0.0, 1.0), (-31.0, 41.0, 0.0)):
-        gaps = np.linalg.norm(points.astype(np.float64) - eye, axis=1)
-        for reach in (1.0, 12.0, 200.0):
-            near = near_rows(owner, points, np.array(eye), reach)
-            assert (np.diff(near) > 0).all()
-            assert set(np.flatnonzero(gaps < reach)) <= set(near.tolist())
-        assert len(near) == 5000
-    assert len(near_rows(owner, points, np.array([3.0, 10.0, 1.0]), 5.0)) < 2000
-    assert len(near_rows(owner, points[:0], np.zeros(3), 9.0)) == 0
 
 
 def yawed(angle: float, x: float, y: float) -> torch.Tensor:

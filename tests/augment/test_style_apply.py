@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
 from augment.effects.snow.effect import snow_layers_of
@@ -17,7 +16,6 @@ from augment.effects.style.color_maps import (
     style_actor,
     style_gaussians,
     style_sky,
-    styled_scene,
 )
 from augment.effects.style.style import scene_style_of
 from augment.memo import memo_of
@@ -30,7 +28,6 @@ from augment.scene import Actor, ColorWaves, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from augment.views import render_buffers, render_view
-from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
@@ -80,16 +77,6 @@ def test_the_kernel_equals_the_definition(backend, sh_degree, count):
         torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_every_class_takes_its_own_map():
-    gaussians, maps = with_classes(600, 1, runs=True), maps_by_class()
-    styled = style_gaussians(gaussians, maps).sh
-    for value in range(CLASSES):
-        own = gaussians.semantic == value
-        alone = style_gaussians(gaussians.select(own), maps_of(maps.splats[value : value + 1])).sh
-        assert torch.equal(styled[own], alone)
-    assert torch.equal(styled[gaussians.semantic == 3], gaussians.sh[gaussians.semantic == 3])
-
-
 @pytest.mark.parametrize("backend", ["cpu", "cuda"])
 def test_identities_leave_every_bit(backend):
     gaussians = with_classes(100, 2)
@@ -126,27 +113,6 @@ def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(mon
         assert in_place is there.sh and torch.equal(in_place.cpu(), got)
         with pytest.raises(ValueError, match="out must lie on meta"):
             style_gaussians(gaussians, maps, out=torch.zeros_like(bits), backend="cuda")
-
-
-@pytest.mark.parametrize("backend", ["cpu", "cuda"])
-def test_none_and_strided_and_float64(backend):
-    maps = maps_by_class()
-    none = with_classes(5, 1).select(torch.zeros(0, dtype=torch.long))
-    assert style_gaussians(none, maps, backend=backend).sh.shape == (0, 4, 3)
-    wide = with_classes(40, 3)
-    strided = dataclasses.replace(wide, sh=wide.sh[:, :4])
-    tight = dataclasses.replace(wide, sh=wide.sh[:, :4].contiguous())
-    assert torch.equal(
-        style_gaussians(strided, maps, backend=backend).sh,
-        style_gaussians(tight, maps, backend=backend).sh,
-    )
-    double = random_gaussians(40, sh_degree=1, dtype=torch.float64)
-    single = random_gaussians(40, sh_degree=1)
-    styled = style_gaussians(double, maps, backend=backend)
-    assert styled.sh.dtype == torch.float64
-    torch.testing.assert_close(
-        styled.sh.float(), style_gaussians(single, maps).sh, rtol=1e-6, atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("wrong", [-1, CLASSES])
@@ -203,22 +169,6 @@ def test_skies(sky):
     assert extreme.min() >= 0 and extreme.max() <= 1
 
 
-def test_a_styled_scene_keeps_everything_else():
-    scene, maps = fitted_scene(), maps_by_class()
-    styled = styled_scene(scene, maps)
-    same = [f.name for f in dataclasses.fields(scene) if f.name not in changed]
-    assert all(getattr(styled, name) is getattr(scene, name) for name in same)
-    assert torch.equal(styled.background.sh, style_gaussians(scene.background, maps).sh)
-    assert torch.equal(styled.sky.faces, style_sky(scene.sky, maps.sky).faces)
-    for before, after in zip(scene.actors, styled.actors, strict=True):
-        assert torch.equal(after.gaussians.sh, style_gaussians(before.gaussians, maps).sh)
-        assert after.gaussians.means is before.gaussians.means
-        for name in ("track_id", "label", "track", "size_m"):
-            assert getattr(after, name) is getattr(before, name)
-    same_bits = styled_scene(scene, IDENTITY_MAPS)
-    assert same_bits.background is scene.background and same_bits.sky is scene.sky
-
-
 changed = {"background", "actors", "sky"}
 
 
@@ -250,7 +200,6 @@ def test_colours_that_change_over_time_are_mapped_at_all_times():
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
 STYLE = Style(preset="dusk")
-STILL = Waves(preset="still")
 
 
 @pytest.fixture
@@ -326,13 +275,6 @@ def test_every_class_takes_its_map(scene):
     assert not changed[~reach].any()
 
 
-def test_only_colours_change(scene):
-    known_maps(scene)
-    clean, styled = (render_view(scene, camera_of(scene), recipe_of(s)) for s in (None, STYLE))
-    for name in ("depth_m", "semantic", "instance"):
-        assert np.array_equal(getattr(clean, name), getattr(styled, name))
-
-
 @pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1)}])
 def test_no_strength_is_no_style_to_the_bit(scene, weather):
     none = Style(preset="dusk", strength=0)
@@ -385,24 +327,6 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     covered = view.raster.overlay > 0.995
     assert covered.sum() > 500
     torch.testing.assert_close(view.rgb[covered], drawn.rgb[covered], rtol=0, atol=0.02)
-
-
-def test_water_mirrors_the_styled_sky(scene):
-    unchanged = torch.eye(3, 4)[None]
-    maps = StyleMaps(
-        unchanged, torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]]), gentle(3)
-    )
-    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
-    deep = {"flood": Flood(level_m=0.5, reference="absolute", waves=STILL, reflection="sky",
-                           turbidity_ntu=1000)}  # fmt: skip
-    clean, styled = (
-        render_view(scene, camera_of(scene), recipe_of(s, classes=False, **deep))
-        for s in (None, STYLE)
-    )
-    far = (clean.masks["water"] == 255) & (np.arange(90)[:, None] < 55)
-    assert far.sum() > 100
-    redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
-    assert redder[0] > 5 and redder[2] < -5
 
 
 def with_directions(scene: Scene, spread: float) -> Scene:

@@ -33,7 +33,7 @@ from augment.effects.style.statistics import (
     reinhard_map,
     statistics_of,
 )
-from augment.effects.style.style import SHARES, parse_statistics, preset_statistics, together
+from augment.effects.style.style import parse_statistics, preset_statistics
 from augment.errors import StyleError
 from augment.semantics import SemanticClass
 from recipes.style import style_preset_names, style_preset_text
@@ -113,21 +113,6 @@ def test_mkl_is_symmetric_positive_definite_and_moves_colours_least(seed):
         other = root(style.covariance) @ rotation @ inverse
         assert other @ content.covariance @ other.T == pytest.approx(style.covariance)
         assert cost(other) >= cost(matrix) - 1e-12
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-def test_channels_have_no_order(method, order):
-    content, style = photo_like(3), photo_like(4)
-    p = np.eye(3)[list(order)]
-
-    def swapped(statistics):
-        return ColorStatistics(p @ statistics.mean, p @ statistics.covariance @ p.T)
-
-    matrix, offset = parts(METHODS[method](content, style))
-    other, other_offset = parts(METHODS[method](swapped(content), swapped(style)))
-    assert other == pytest.approx(p @ matrix @ p.T, abs=1e-10)
-    assert other_offset == pytest.approx(p @ offset, abs=1e-10)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -227,23 +212,6 @@ def test_regions_have_maps_of_their_own_by_class():
         assert torch.equal(found.splats[kind], expected), kind
 
 
-def test_a_small_region_fades_into_the_land_without_a_step():
-    regions = (SKY, LAND, ROAD)
-    style = scene(20, *regions)
-
-    def road(share):
-        content = scene(0, *regions)
-        content[ROAD] = ColorStatistics(content[ROAD].mean, content[ROAD].covariance, share)
-        return maps(content, style, per_region=True).splats[SemanticClass.ROAD]
-
-    land = maps(scene(0, *regions), style).splats[0]
-    shares = np.linspace(0.005, 0.2, 40)
-    distances = [float((road(share) - land).abs().max()) for share in shares]
-    assert distances[0] == 0 and distances[-1] == distances[-5] > 0.05
-    assert distances == sorted(distances)
-    assert max(np.diff(distances)) < 0.08 * distances[-1]
-
-
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("per_region", [False, True])
 def test_strength_zero_is_the_identity_to_the_bit_and_half_lies_between(method, per_region):
@@ -258,17 +226,6 @@ def test_strength_zero_is_the_identity_to_the_bit_and_half_lies_between(method, 
         assert torch.allclose(
             getattr(half, name), torch.lerp(torch.eye(3, 4), value, 0.5), atol=1e-6
         )
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_strength_two_of_extremes_turns_no_colour_round(method):
-    for content, style in itertools.product(EXTREMES.values(), repeat=2):
-        color_map = maps({WHOLE: content}, {WHOLE: style}, method=method, strength=2.0).picture
-        matrix, offset = parts(color_map.double())
-        gains = np.linalg.eigvalsh(matrix)
-        assert gains[0] > 0.04 and gains[-1] < 3.5
-        mean = matrix @ content.mean + offset
-        assert (mean > -1e-6).all() and (mean < 1 + 1e-6).all()
 
 
 def test_wrong_method_and_strength_are_refused(unchecked):
@@ -351,22 +308,6 @@ def test_moods_are_what_their_names_say():
     assert warmth("blue-hour") < -0.08 and warmth("blue-hour", SKY) < -0.2
 
 
-def test_the_whole_is_put_together_from_shares():
-    rng = np.random.default_rng(1)
-    land, sky = rng.random((750, 3)), 0.5 + 0.1 * rng.random((250, 3))
-    assert SHARES == {LAND: 0.75, SKY: 0.25}
-    parts = (statistics_of(land, total=1000.0), statistics_of(sky, total=1000.0))
-    found, expected = together(parts), statistics_of(np.concatenate([land, sky]))
-    assert found.mean == pytest.approx(expected.mean) and found.share == 1
-    assert found.covariance == pytest.approx(expected.covariance)
-
-
-def test_good_numbers_are_read_as_they_are():
-    found = parse_statistics(GOOD, source="good")
-    assert found[SKY].mean.tolist() == [1, 0, 0.5] and not found[SKY].covariance.any()
-    assert found[LAND].covariance[0].tolist() == [0.02, 0.01, 0.01]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -394,12 +335,6 @@ def test_wrong_files_say_where(old, new, words):
 def test_unknown_names_list_the_styles():
     with pytest.raises(StyleError, match=r"did you mean dusk.*overcast"):
         preset_statistics("dsk")
-
-
-@pytest.mark.parametrize("text", ["", "3", "[1, 2]", "{"])
-def test_what_is_no_mapping_is_refused(text):
-    with pytest.raises(StyleError, match=r"^here(:1)?: "):
-        parse_statistics(text, source="here")
 
 
 def different() -> Gscm:

@@ -57,12 +57,6 @@ STEPS = 120
 QUICK = Tuning(sh_every=30, growth=Growth(every=20, start=0.1, stop=0.8))
 
 
-@pytest.fixture
-def any_threads():
-    yield
-    limit_threads(None)
-
-
 # ---- a truth, what is recorded of it, and where a fit starts -----------------------------------
 
 
@@ -308,7 +302,6 @@ def test_labelled_boxes_move_to_where_the_images_show_them(recorded):
 # ---- the same bits -----------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("any_threads")
 def test_a_saved_state_continues_to_the_same_bits_with_any_number_of_threads(recorded):
     """Between the densifications at steps 20 and 40, into a trainer made anew."""
     limit_threads(1)

@@ -119,13 +119,6 @@ def test_smog_fades_each_surface_by_its_own_distance(scene, model):
     assert view.rgb[NOTHING].tolist() == [179, 179, 179]  # no sky through uniform smog
 
 
-def test_what_else_is_asked_for_does_not_change_the_colours(scene):
-    plain = view_of(scene, depth="none")
-    full = view_of(scene, depth="expected", semantic=True, instance=True)
-    assert plain.depth_m is None and plain.semantic is None and plain.instance is None
-    assert np.array_equal(plain.rgb, full.rgb)
-
-
 def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     """The pixels of a car in the smog are mixed with the airlight as its label says."""
     smog = Smog(extinction_per_m=0.1, color=AIRLIGHT)
@@ -150,12 +143,6 @@ def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):
     assert (np.diff(rgb[:24, 2]) <= 0).all()  # blue fades towards the horizon
     assert rgb[0, 2] > rgb[23, 2] + 10
     assert rgb[24:].tolist() == [[179, 179, 179]] * 24  # rays that do not climb never leave it
-
-
-def test_the_recipe_scales_the_image(scene):
-    view = render_view(scene, camera(), Recipe(render=Render(scale=0.5)))
-    assert view.rgb.shape == (24, 32, 3)
-    assert view.camera.fx == 30.0
 
 
 def test_a_camera_exposes_what_the_weather_left(scene):

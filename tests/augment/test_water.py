@@ -14,14 +14,7 @@ from augment.cameras import Camera
 from augment.effects.flood import water as water_module
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection, trace_screen
-from augment.effects.flood.water import is_smooth, smooth_variance
-from augment.effects.flood.water_plane import (
-    Margins,
-    Window,
-    mirrored_camera,
-    plane_depth,
-    plane_window,
-)
+from augment.effects.flood.water_plane import Window, mirrored_camera, plane_depth, plane_window
 from augment.effects.flood.waves import WaveField, WaveSet
 from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.render.fog import Fog, blend_airlight, optical_depth
@@ -365,34 +358,6 @@ def test_extreme_views_stay_finite(backend, above, pitch_deg):
         assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
 
 
-@ALL
-def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(backend):
-    eye = camera(pitch_deg=-8)
-    white, grey = (
-        Layer(view, torch.full((43, 61, 3), shade), torch.ones(43, 61), torch.full((43, 61), 50.0))
-        for view, shade in ((eye, 1.0), (mirrored(eye), 0.5))
-    )
-    screen = ScreenReflection(white, torch.full((43, 61), 40.0), torch.ones(43, 61))
-    water = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
-    limit = smooth_variance(eye)
-    bed, sky, zero = plane_layer(eye, LEVEL - 0.3), noise_sky(), torch.zeros(43, 61)
-    both = []
-    for variance in (0.99 * limit, 1.01 * limit):
-        field = WaveField(zero, zero, torch.full((43, 61), variance))
-        assert bool(is_smooth(field, eye).all()) == (variance < limit)
-        views = [
-            shade_water(eye, water, field, bed, mirror=grey, screen=shown, sky=sky, backend=backend)
-            for shown in (None, screen)
-        ]
-        both.append(views)
-    (mirror, image), (rough_mirror, rough_image) = both
-    assert torch.equal(rough_mirror, rough_image)
-    met = mirror > 0
-    ratio = image[met] / mirror[met]
-    # White instead of grey where the ray ends before the white wall; float32 roundings.
-    assert float(ratio.max()) < 2 + 1e-5 and int((ratio > 2 - 1e-5).sum()) > 500
-
-
 def test_a_bed_seen_by_another_camera_is_refused():
     eye = camera()
     turned = plane_layer(camera(pitch_deg=-21), LEVEL - 0.3)
@@ -443,24 +408,6 @@ def test_a_pixel_of_the_mirrored_camera_looks_along_the_reflected_ray(seed):
     # Twice mirrored is where it was.
     back = mirrored_camera(mirrored, level)
     assert torch.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-12)
-
-
-def test_masks_grow_at_least_by_their_margins():
-    margins = Margins(5, 40, 20, 0)
-    mask = torch.zeros(100, 120, dtype=torch.bool)
-    mask[50, 60] = True
-    grown = margins.around(mask, margins)
-    assert grown.shape == (140, 145)
-    row, column = 50 + 40, 60 + 5  # where that pixel stands in the grown window
-    assert bool(grown[row - 40 : row + 1, column - 5 : column + 21].all())
-    rows, columns = grown.any(1).nonzero(), grown.any(0).nonzero()
-    # No farther than the squares of 16 pixels that hold the margins.
-    assert row - int(rows.min()) < 40 + 32 and int(rows.max()) - row < 32
-    assert column - int(columns.min()) < 5 + 32 and int(columns.max()) - column < 20 + 32
-    none = torch.zeros(10, 10, dtype=torch.bool)
-    assert not margins.around(none, margins).any()
-    further = margins.around(mask, Margins(5, 40, 20, 33))
-    assert bool(further[row : row + 34, column].all())
 
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
@@ -621,17 +568,6 @@ def test_rays_that_come_back_to_the_camera_are_not_known(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize(("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4)])
-def test_nothing_stands_anywhere(backend, stride):
-    camera = looking(0, height=65)
-    front = see(camera)
-    found = trace_screen(front, camera, LEVEL_M, stride=stride, backend=backend)
-    assert found.distance.isinf().all()
-    middle = found.weight[40:60, 8:-8]  # these rays end between rows 5 and 25 of 65
-    assert (middle == 1).all()
-    assert (found.weight[:32] == 0).all()  # above the horizon there is no water
-
-
 @BACKENDS
 def test_pixels_without_water_have_no_reflection(backend):
     camera = looking(10)
@@ -641,26 +577,6 @@ def test_pixels_without_water_have_no_reflection(backend):
     for front, level in ((everything, LEVEL_M), (see(camera), 5.0)):  # covered; under water
         found = trace_screen(front, camera, level, backend=backend)
         assert (found.weight == 0).all() and found.distance.isinf().all()
-
-
-@pytest.mark.parametrize(("size", "stride"), [((1, 1), 4), ((17, 5), 4), ((129, 64), 1)])
-def test_every_size_of_image_and_window(size, stride):
-    camera = looking(15, 4, *size, fx=0.6 * max(size))
-    front = see(camera, CAR, WALL)
-    whole = trace_screen(front, camera, LEVEL_M, stride=1)
-    left, top = size[0] // 3, size[1] // 3
-    window = camera.cropped(left, top, size[0] - left, size[1] - top)
-    part = trace_screen(front, window, LEVEL_M, stride=stride)
-    assert part.distance.shape == part.weight.shape == (window.height, window.width)
-    if stride == 1:
-        assert torch.equal(part.distance, whole.distance[top:, left:])
-        assert torch.equal(part.weight, whole.weight[top:, left:])
-    wider = camera.cropped(-3, -2, size[0] + 5, size[1] + 7)
-    beyond = trace_screen(front, wider, LEVEL_M, stride=1)
-    inside = (slice(2, 2 + size[1]), slice(3, 3 + size[0]))
-    assert torch.equal(beyond.distance[inside], whole.distance)
-    assert torch.equal(beyond.weight[inside], whole.weight)
-    assert float(beyond.weight.sum()) == pytest.approx(float(whole.weight.sum()), rel=1e-5)
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [SCREEN_VIEWS[2], SCREEN_VIEWS[4], (80, 20)])
