@@ -465,8 +465,7 @@ def scene_of_drive(
     Raises:
         AdapterError: there is no return or no image to build from, or no image shows a return."""
     # Labels are read without the kernels that scenes are built by.
-    from adapters.lidar_scene.scene import build_lidar_scene, views_of
-    from adapters.lidar_scene.split import join_tracks
+    from adapters.lidar_scene.scene import build_lidar_scene
 
     numbers = some([frame.index for frame in drive.used])
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
@@ -475,28 +474,9 @@ def scene_of_drive(
             f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
             f"without them, unpack the sweeps again{first}"
         )
-    views = views_of(drive.used, drive.used_rows)
-    if not views:
+    if not any(frame.image_paths for frame in drive.used):
         raise AdapterError(
             f"{drive.source}: there is no usable image in {numbers} that are not held out; colours "
             f"cannot be had without them, choose more frames or unpack the images again{first}"
         )
-    return build_lidar_scene(
-        drive.sweeps,
-        join_tracks(drive.boxes),
-        views,
-        options,
-        lidar_top_deg=drive.lidar_top_deg,
-        name=drive.name,
-        source=drive.source,
-        frames=drive.frames,
-        labels=drive.labels,
-        world_origin_m=drive.world_origin_m,
-        problems=drive.problems,
-        has_metric_scale=drive.has_metric_scale,
-        added=added,
-        ground=ground,
-        if_empty=f"{drive.source}: none of the points that were measured is in any image; check "
-        f"that calibration, sweeps and images are of one drive, that camera axes are x right, y "
-        f"down, z forward, and that LiDAR and poses are in one world with z up",
-    )
+    return build_lidar_scene(drive, options, added=added, ground=ground)
