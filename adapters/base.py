@@ -16,10 +16,12 @@ import itertools
 import math
 import os
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 from adapters.camera_files.paths import with_camera_path
 from adapters.detect_format import looked_for, recognised
+from adapters.scene_cache import cached_scene
 from adapters.uri import (
     CAMERA_PATH_KEY,
     GROUND_KEY,
@@ -60,8 +62,9 @@ def open_scene(uri: str) -> Scene:
         scene = entry.open(query)
     else:
         _check_there(Path(path))
+        build = partial(entry.open, path, query)
         try:
-            scene = entry.open(path, query)
+            scene = cached_scene(scheme, path, query, build) if entry.is_raw else build()
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
     if ground_z is not None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import cv2
 import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
 
 from augment.errors import AdapterError
+from augment.files.image_size import image_header
 from recipes.errors import RecipeError
 from recipes.files import open_file
 from recipes.yaml_tree import read_plain
@@ -21,6 +24,7 @@ LARGEST = 1e9  # metres or pixels: float64 tells a micrometre there, and no driv
 _MAX_BYTES = 1 << 30  # of a text; the longest table of nuScenes' training set has 0.6 GB
 _MAX_YAML = 1 << 18  # characters; the configurations of trained scenes have some 10 000
 _FROM_DATASET = "copy it from the dataset"
+Value = TypeVar("Value")
 
 
 def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
@@ -55,7 +59,7 @@ def read_yaml(path: Path, *, if_missing: str = _FROM_DATASET) -> dict[str, Any]:
 def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET) -> Any:
     """The contents of a JSON file, a `kind` (dict, list, or object for either) at its top.
 
-    Python reads NaN, Infinity and whole numbers of any length from JSON; `number_of` and `array_of`
+    Python reads NaN, Infinity and whole numbers of any length from JSON; `Number` and `array_of`
     tell them apart."""
     text = read_text(path, if_missing=if_missing)
     try:
@@ -96,13 +100,27 @@ def _is_nested(value: object) -> bool:
     return isinstance(value, dict | list)
 
 
-def number_of(value: object, where: str, *, largest: float = LARGEST) -> float:
-    """A value from JSON as a number of at most `largest`, whatever its sign."""
-    if type(value) not in (int, float) or not -largest <= value <= largest:  # type: ignore[operator]
-        raise AdapterError(
-            f"{where} must be a number from {-largest:g} to {largest:g}; got {value!r:.80}"
-        )
-    return float(value)  # type: ignore[arg-type]
+# No texts, true or false, which pydantic otherwise takes for numbers; and none beyond LARGEST.
+Number = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Text = Annotated[str, Field(strict=True, max_length=_MAX_BYTES)]  # no half pairs of surrogates
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def validated(kind: type[Value], content: object, where: str) -> Value:
+    """What a file holds as a model, or as another type of pydantic's. where: file and place in it,
+    for messages."""
+    try:
+        return _adapter(kind).validate_python(content)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_context=False)[0]
+    names = [str(step) for step in found["loc"]]
+    said = str(found["msg"]).removeprefix("Value error, ").replace("Input should", "must")
+    said = "is missing" if found["type"] == "missing" else f"{said}; got {found['input']!r:.200}"
+    raise AdapterError(f"{where}: {'.'.join(names)}{' ' if names else ''}{said}")
 
 
 def array_of(value: object) -> np.ndarray | None:
@@ -155,21 +173,37 @@ def is_whole_jpeg(path: Path) -> bool:
 
 
 _IMAGE_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
+MISSING = "does not exist"
 
 
 def read_image_size(path: Path) -> tuple[int, int] | str:
-    """Width and height of a PNG or JPEG, decoded once to be sure of it, or what is wrong with it as
-    the end of a sentence."""
+    """Width and height of a PNG or JPEG, decoded once to be sure of it (a JPEG at an eighth of its
+    size), or what is wrong with it as the end of a sentence."""
     try:
         with open_file(path) as file:
             data = file.read()
+    except FileNotFoundError:
+        return MISSING
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     # Decoders fill what is cut off with grey.
     if not any(data.startswith(start) and end in data[-64:] for start, end in _IMAGE_ENDS):
         return "is cut short, or neither PNG nor JPEG"
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return "cannot be decoded" if image is None else (image.shape[1], image.shape[0])
+    header = image_header(data)
+    is_jpeg = header is not None and header.format == "JPEG"
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if is_jpeg else cv2.IMREAD_COLOR
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # larger than OpenCV allows
+        image = None
+    if image is None or header is None:
+        return "cannot be decoded"
+    rows, columns = image.shape[:2]
+    if not is_jpeg:
+        return columns, rows
+    size = header.width, header.height
+    # What differs has been turned as EXIF asks for.
+    return size if (columns, rows) == (-(-size[0] // 8), -(-size[1] // 8)) else size[::-1]
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:

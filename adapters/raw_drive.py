@@ -1,25 +1,32 @@
-"""What raw drives have in common: the options of their URIs, which frames are used and held out,
-sweeps, boxes, class tables, and weathered sweeps in the form of the dataset's files.
+"""One drive as any raw dataset has it, and the scene that is made of it.
+
+An adapter fills a `RawDrive` from its dataset's files; `scene_of_drive` turns that into Gaussians.
+Between them stands what datasets have in common: options of URIs, held-out frames, the origin,
+images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset's files.
 """
 
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import BeforeValidator, Field
 
+from adapters.plain_files import MISSING, read_image_size
 from adapters.uri import UriOptions
 from augment.cameras import Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, MOVED, SCATTERED
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
-from augment.labels import Boxes, LidarSweep
+from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.scene import Gaussians, Ground, Scene
 from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
@@ -28,6 +35,13 @@ MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatev
 _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
+_READERS = 4  # threads that decode images to check them; decoding releases the interpreter
+_MAX_FAULTS = 3  # sentences about one camera's images; more become one
+_MAX_NAMED = 3  # frames that a message lists
+_NO_FILE = "has no image"
+
+
+# ---- Which frames --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -110,12 +124,98 @@ class DriveOptions(UriOptions):
         return DriveFrames(kept, held, () if held else (problem,))
 
 
+def some(numbers: Sequence[int]) -> str:
+    """How many frames and the first of them, for messages."""
+    named = ", ".join(map(str, numbers[:_MAX_NAMED]))
+    more = ", ..." if len(numbers) > _MAX_NAMED else ""
+    return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({named}{more})"
+
+
 def drive_origin(positions_m: np.ndarray) -> np.ndarray:
     """What to subtract from the dataset's coordinates so that float32 keeps its digits, float64
     [3]: zero near the dataset's origin, else whole metres near the first of the car's positions [F,
     3]."""
     far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
     return np.round(positions_m[0]) if far else np.zeros(3)
+
+
+# ---- Images --------------------------------------------------------------------------------------
+
+
+class Picture(NamedTuple):
+    """One camera's image of one frame. path: None where there is none. size: width and height as
+    the calibration says; without it, that of most of the camera's images."""
+
+    camera: str
+    frame: int
+    path: Path | None
+    size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DriveImages:
+    """paths: of the images that can be used, by frame and camera. sizes: width and height of the
+    cameras' images. problems: a sentence for each image that cannot be used."""
+
+    paths: Mapping[int, Mapping[str, str]]
+    sizes: Mapping[str, tuple[int, int]]
+    problems: tuple[str, ...]
+
+
+def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> DriveImages:
+    """The images that are whole and of their camera's size, each decoded once to be sure of it.
+
+    Raises:
+        AdapterError: a camera's size is known from no calibration and no image; or, for
+            every_camera, none of the images that it has can be used."""
+    with ThreadPoolExecutor(_READERS) as pool:
+        seen = dict(zip(pictures, pool.map(_size_or_fault, pictures), strict=True))
+    by_camera: dict[str, list[Picture]] = defaultdict(list)
+    for picture in pictures:
+        by_camera[picture.camera].append(picture)
+    paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
+    sizes, problems = {}, []
+    for camera, own in by_camera.items():
+        usual = Counter(seen[p] for p in own if not isinstance(seen[p], str)).most_common(1)
+        size = own[0].size or (usual[0][0] if usual else None)
+        faults = []
+        for picture in own:
+            fault = _fault(picture, seen[picture], picture.size or size)
+            if fault:
+                faults.append(f"camera {camera}, frame {picture.frame}: {fault}")
+            else:
+                paths[picture.frame][camera] = str(picture.path)
+        there = any(seen[picture] not in (MISSING, _NO_FILE) for picture in own)
+        if size is None or (len(faults) == len(own) and every_camera and there):
+            raise AdapterError(
+                f"none of the {len(own)} images of camera {camera} can be used: "
+                f"{'; '.join(faults[:_MAX_FAULTS])}. Images and calibration must be of one drive, "
+                f"and not resized; unpack them again"
+            )
+        if len(faults) > _MAX_FAULTS:
+            faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
+        sizes[camera] = size
+        problems += faults
+    return DriveImages(paths, sizes, tuple(problems))
+
+
+def _size_or_fault(picture: Picture) -> tuple[int, int] | str:
+    return _NO_FILE if picture.path is None else read_image_size(picture.path)
+
+
+def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:
+    if seen == expected:
+        return ""
+    if picture.path is None:
+        return "its image is missing"
+    if isinstance(seen, str):
+        return f"image {picture.path} {seen}; left out"
+    where = "by the calibration" if picture.size else "as the camera's others"
+    size = "{0[0]}x{0[1]}".format
+    return f"image {picture.path} is {size(seen)} pixels, not {size(expected)} {where}; left out"
+
+
+# ---- Sweeps and classes --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,150 +239,33 @@ class Sweep:
             np.full(len(points), SemanticClass.UNKNOWN, np.int16),
         )
 
+    def select(self, keep: np.ndarray) -> Sweep:
+        return Sweep(self.points[keep], self.timestamps_ns[keep], self.semantic[keep])
+
 
 def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
     """Which points [N, 3] lie strictly inside an axis-aligned box, such as the recording car."""
     return ((points > low_m) & (points < high_m)).all(axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class BoxSample:
-    """One box of a moving object: where it stood at one moment.
-
-    object_id: the dataset's name of the object. sibling_id: the name that another sensor's box of
-    the same object goes by, or None. frame: the dataset's frame number. world_from_box: float64
-    [4, 4] in the scene's world, box x forward. size_m: length, width, height."""
-
-    object_id: str
-    sibling_id: str | None
-    label: str
-    frame: int
-    timestamp_ns: int
-    world_from_box: np.ndarray
-    size_m: np.ndarray
+def is_usable(sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray):
+    """Which returns are finite, of a surface, and not in the recording car's box ego_m [2, 3] in
+    its own axes, bool [N]. points_m: the sweep's in float64."""
+    with np.errstate(all="ignore"):
+        ego = (points_m - world_from_ego[:3, 3]) @ world_from_ego[:3, :3]
+    keep = ~is_in_box(ego, *ego_m) & (sweep.semantic != NO_SURFACE)
+    return keep & np.isfinite(sweep.points).all(axis=1)
 
 
-def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
-    """The objects of which two boxes are further apart in plan than MOVED_M. places: the name of
-    each box's object and its centre, metres."""
-    by_name: dict[str, list[np.ndarray]] = defaultdict(list)
-    for name, centre in places:
-        by_name[name].append(centre[:2])
-    extents = {n: np.fmax.reduce(xy) - np.fmin.reduce(xy) for n, xy in by_name.items()}
-    return {name for name, extent in extents.items() if np.hypot(*extent) > MOVED_M}
-
-
-@dataclass(frozen=True, eq=False)
-class TimedBoxes:
-    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there; None: the frame's."""
-
-    boxes: Boxes
-    timestamps_ns: np.ndarray | None
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedObjects:
-    """moving: samples of the objects that move, in order of frames. still: one sample of each
-    object that does not. problems: one sentence each."""
-
-    moving: tuple[BoxSample, ...]
-    still: tuple[BoxSample, ...]
-    problems: tuple[str, ...]
-
-
-def read_objects(
-    frames: Sequence[Frame], boxes: Mapping[int, TimedBoxes], world_origin_m: np.ndarray
-) -> RecordedObjects:
-    """The objects of the frames. An object moves if an attribute says that it is not stationary or
-    if its boxes lie further apart than MOVED_M; others stay part of the static world."""
-    samples: list[BoxSample] = []
-    labelled: set[str] = set()
-    bad, twice = [], []
-    for frame in frames:
-        timed = boxes.get(frame.index)
-        seen: set[str] = set()
-        for sample, moves in [] if timed is None else _samples(frame, timed, world_origin_m):
-            if sample is None:
-                bad.append(frame.index)
-            elif sample.object_id in seen:
-                twice.append((sample.object_id, frame.index))
-            else:
-                seen.add(sample.object_id)
-                samples.append(sample)
-                labelled |= {sample.object_id} if moves else set()
-    moving = labelled | objects_that_travel((s.object_id, s.world_from_box[:3, 3]) for s in samples)
-    still = {s.object_id: s for s in reversed(samples) if s.object_id not in moving}
-    problems = []
-    if bad:
-        problems.append(
-            f"labels/boxes.parquet: {len(bad)} boxes, the first in frame {bad[0]}, have a centre, "
-            f"size or rotation that is not finite or zero; objects are built without them"
-        )
-    if twice:
-        name, frame = twice[0]
-        problems.append(
-            f"labels/boxes.parquet: {len(twice)} boxes share track_id and frame with another, such "
-            f"as {name!r} in frame {frame}; the first one counts"
-        )
-    return RecordedObjects(
-        tuple(s for s in samples if s.object_id in moving),
-        tuple(reversed(still.values())),
-        tuple(problems),
-    )
-
-
-def _samples(
-    frame: Frame, timed: TimedBoxes, world_origin_m: np.ndarray
-) -> Iterator[tuple[BoxSample | None, bool]]:
-    """Each box as a sample, None where it is unusable, and whether it is labelled as moving."""
-    boxes = timed.boxes
-    times = timed.timestamps_ns
-    values = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
-    good = np.isfinite(values).all(1) & (boxes.sizes_m > 0).all(1)
-    good &= np.linalg.norm(boxes.quats, axis=1) > 1e-6
-    stationary = next((boxes.attributes[n] for n in _STATIONARY if n in boxes.attributes), None)
-    siblings = next((boxes.attributes[n] for n in _SIBLING if n in boxes.attributes), None)
-    for i in range(len(boxes)):
-        if not good[i]:
-            yield None, False
-            continue
-        pose = np.eye(4)
-        pose[:3, :3] = rotmat_from_quat(torch.from_numpy(boxes.quats[i])).numpy()
-        pose[:3, 3] = boxes.centers_m[i] - world_origin_m
-        sibling = None if siblings is None else siblings[i]
-        sample = BoxSample(
-            boxes.track_ids[i],
-            sibling if isinstance(sibling, str) and sibling not in ("", "-") else None,
-            boxes.labels[i],
-            frame.index,
-            frame.timestamp_ns if times is None else int(times[i]),
-            pose,
-            boxes.sizes_m[i],
-        )
-        yield sample, stationary is not None and _is_false(stationary[i])
-
-
-def _is_false(value: object) -> bool:
-    """False or 0; a missing value says nothing."""
-    return isinstance(value, bool | int | np.bool_ | np.integer) and not value
-
-
-def class_table(names: Mapping[int, str], meaning: Mapping[str, int]) -> np.ndarray:
-    """SemanticClass, or NO_SURFACE, by the dataset's class number, int16 [256]; UNKNOWN for names
-    without a meaning."""
-    table = np.full(256, SemanticClass.UNKNOWN, np.int16)
-    for number, name in names.items():
-        if number < len(table):
-            table[number] = meaning.get(name, SemanticClass.UNKNOWN)
-    return table
-
-
-def classes_of(sweep: LidarSweep, table: np.ndarray) -> np.ndarray | None:
-    """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
-    classes = sweep.columns.get("semantic")
-    if classes is None:
-        return None
-    return table[np.clip(classes.astype(np.int64), 0, len(table) - 1)]
+def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray:
+    """The SemanticClass, or NO_SURFACE, of class numbers [N] of a dataset, int16; UNKNOWN for
+    numbers without a meaning."""
+    if not meaning:
+        return np.full(len(numbers), SemanticClass.UNKNOWN, np.int16)
+    known = np.array(sorted(meaning), np.int64)
+    classes = np.array([meaning[int(number)] for number in known], np.int16)
+    at = np.clip(np.searchsorted(known, numbers), 0, len(known) - 1)
+    return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
 def stored_records(
@@ -301,3 +284,199 @@ def stored_records(
         out[moved, columns.index(name)] = places[axis]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
     return out.tobytes()
+
+
+# ---- Boxes ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class BoxSample:
+    """One box of a moving object: where it stood at one moment.
+
+    object_id: the dataset's name of the object. sibling_id: the name that another sensor's box of
+    the same object goes by, or None. frame: the dataset's frame number. world_from_box: float64
+    [4, 4] in the scene's world, box x forward. size_m: length, width, height. row: its number among
+    the frame's boxes."""
+
+    object_id: str
+    sibling_id: str | None
+    label: str
+    frame: int
+    timestamp_ns: int
+    world_from_box: np.ndarray
+    size_m: np.ndarray
+    row: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class TimedBoxes:
+    """Boxes of one frame, by its number. timestamps_ns: int64 [B], when each stood there, or one
+    time for all. moves: bool [B], which are labelled as moving; None: as their attributes say.
+    rotations: float64 [B, 3, 3], where they are known better than from the quaternions."""
+
+    frame: int
+    boxes: Boxes
+    timestamps_ns: np.ndarray | int
+    moves: np.ndarray | None = None
+    rotations: np.ndarray | None = None
+
+    def samples(self, world_origin_m: np.ndarray) -> Iterator[tuple[BoxSample | None, bool]]:
+        """Each box, None where it can stand nowhere, and whether it is labelled as moving."""
+        boxes = self.boxes
+        values = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
+        good = np.isfinite(values).all(1) & (boxes.sizes_m > 0).all(1)
+        good &= np.linalg.norm(boxes.quats, axis=1) > 1e-6
+        times = np.broadcast_to(self.timestamps_ns, len(boxes))
+        rotations = self.rotations
+        if rotations is None:
+            rotations = rotmat_from_quat(torch.from_numpy(boxes.quats)).numpy()
+        moves = self.moves
+        if moves is None:
+            stationary = _attribute(boxes, _STATIONARY)
+            moves = [False] * len(boxes) if stationary is None else list(map(_is_false, stationary))
+        siblings = _attribute(boxes, _SIBLING)
+        for i in range(len(boxes)):
+            if not good[i]:
+                yield None, False
+                continue
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotations[i], boxes.centers_m[i] - world_origin_m
+            sibling = None if siblings is None else siblings[i]
+            sibling = sibling if isinstance(sibling, str) and sibling not in ("", "-") else None
+            name, label, size_m = boxes.track_ids[i], boxes.labels[i], boxes.sizes_m[i]
+            sample = BoxSample(name, sibling, label, self.frame, int(times[i]), pose, size_m, row=i)
+            yield sample, bool(moves[i])
+
+
+def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
+    return next((boxes.attributes[name] for name in names if name in boxes.attributes), None)
+
+
+def _is_false(value: object) -> bool:
+    """False or 0; a missing value says nothing."""
+    return isinstance(value, bool | int | np.bool_ | np.integer) and not value
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedObjects:
+    """moving: samples of the objects that move, in order of frames. still: one sample of each
+    object that does not. problems: one sentence each."""
+
+    moving: tuple[BoxSample, ...]
+    still: tuple[BoxSample, ...]
+    problems: tuple[str, ...]
+
+
+def find_objects(
+    frames: Iterable[TimedBoxes], world_origin_m: np.ndarray, *, several: bool = False
+) -> RecordedObjects:
+    """The objects of the frames. An object moves if a box is labelled so or if its boxes lie
+    further apart than MOVED_M; others stay part of the static world.
+
+    several: an object may have several boxes in a frame; else the first one counts."""
+    samples: list[BoxSample] = []
+    labelled: set[str] = set()
+    bad, twice = [], []
+    for timed in frames:
+        seen: set[str] = set()
+        for sample, moves in timed.samples(world_origin_m):
+            if sample is None:
+                bad.append(timed.frame)
+            elif sample.object_id in seen and not several:
+                twice.append((sample.object_id, timed.frame))
+            else:
+                seen.add(sample.object_id)
+                samples.append(sample)
+                labelled |= {sample.object_id} if moves else set()
+    moving = labelled | objects_that_travel((s.object_id, s.world_from_box[:3, 3]) for s in samples)
+    still = {s.object_id: s for s in reversed(samples) if s.object_id not in moving}
+    problems = []
+    if bad:
+        problems.append(
+            f"{len(bad)} boxes, the first in frame {bad[0]}, have a centre, size or rotation that "
+            f"is not finite or zero; objects are built without them"
+        )
+    if twice:
+        name, frame = twice[0]
+        problems.append(
+            f"{len(twice)} boxes share name and frame with another, such as {name!r} in frame "
+            f"{frame}; the first one counts"
+        )
+    return RecordedObjects(
+        tuple(s for s in samples if s.object_id in moving),
+        tuple(reversed(still.values())),
+        tuple(problems),
+    )
+
+
+def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
+    """The objects of which two boxes are further apart in plan than MOVED_M. places: the name of
+    each box's object and its centre, metres."""
+    by_name: dict[str, list[np.ndarray]] = defaultdict(list)
+    for name, centre in places:
+        by_name[name].append(centre[:2])
+    extents = {n: np.fmax.reduce(xy) - np.fmin.reduce(xy) for n, xy in by_name.items()}
+    return {name for name, extent in extents.items() if np.hypot(*extent) > MOVED_M}
+
+
+# ---- The drive, and the scene that is made of it -------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RawDrive:
+    """What a dataset has of one drive, in the scene's world: the dataset's less world_origin_m.
+
+    frames: those asked for, in order of time, with cameras and the images that can be used.
+    held_out: numbers of those that the scene is built without. sweeps: usable returns, one sweep a
+    frame that is used and has any. boxes: of the objects that move, in order of frames. labels: of
+    all frames, in the dataset's world, with the meaning of the sweeps' classes. lidar_top_deg: the
+    highest elevation that the LiDAR looks at. problems: what is missing or damaged, a sentence
+    each. used_rows: by camera, the part of the rows from the top that does not show the car."""
+
+    name: str
+    source: str
+    frames: tuple[Frame, ...]
+    held_out: frozenset[int]
+    sweeps: tuple[Sweep, ...]
+    boxes: tuple[BoxSample, ...]
+    labels: LabelSource
+    world_origin_m: np.ndarray
+    lidar_top_deg: float
+    problems: tuple[str, ...]
+    used_rows: Mapping[str, float] = field(default_factory=dict)
+    has_metric_scale: bool = True
+
+    @property
+    def used(self) -> tuple[Frame, ...]:
+        """The frames that the scene is built from."""
+        return tuple(frame for frame in self.frames if frame.index not in self.held_out)
+
+
+def scene_of_drive(
+    drive: RawDrive,
+    options: DriveOptions,
+    *,
+    added: Gaussians | None = None,
+    ground: Ground | None = None,
+) -> Scene:
+    """The scene of a drive: accumulated returns, coloured by the images. added, ground: of the
+    background, and of the road, from elsewhere.
+
+    Raises:
+        AdapterError: there is no return or no image to build from, or no image shows a return."""
+    # Labels are read without the kernels that scenes are built by.
+    from adapters.lidar_scene.scene import build_lidar_scene
+
+    numbers = some([frame.index for frame in drive.used])
+    first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
+    if not any(map(len, drive.sweeps)):
+        raise AdapterError(
+            f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
+            f"without them, unpack the sweeps again{first}"
+        )
+    if not any(frame.image_paths for frame in drive.used):
+        raise AdapterError(
+            f"{drive.source}: there is no usable image in {numbers} that are not held out; colours "
+            f"cannot be had without them, choose more frames or unpack the images again{first}"
+        )
+    return build_lidar_scene(drive, options, added=added, ground=ground)

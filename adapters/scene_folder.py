@@ -61,8 +61,8 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     if _DATA_KEY in query:
         found = _given(query[_DATA_KEY])
         if recorded is not None:
-            frames = tuple(_moved(frame, recorded.path, found.path) for frame in scene.frames)
-            scene = dataclasses.replace(scene, frames=frames)
+            moved = (with_images_in(found.path, frame, recorded.path) for frame in scene.frames)
+            scene = dataclasses.replace(scene, frames=tuple(moved))
         recorded = found
     try:
         if recorded is None or not recorded.is_there:
@@ -128,10 +128,10 @@ def _recording(uri: str, working_folder: Path) -> Recording | None:
     return Recording(scheme, os.path.normpath(working_folder / path), query)
 
 
-def _moved(frame: Frame, old: str, new: str) -> Frame:
+def with_images_in(new: str, frame: Frame, old: str) -> Frame:
     """The frame with the image paths that lay in one folder in another."""
     paths = {
-        name: os.path.join(new, os.path.relpath(path, old)) if path.startswith(old + "/") else path
+        name: str(Path(new, os.path.relpath(path, old))) if path.startswith(old + "/") else path
         for name, path in frame.image_paths.items()
     }
     return dataclasses.replace(frame, image_paths=paths)

@@ -35,12 +35,14 @@ class Scheme:
     opener: from path and query to a Scene whose `source` is `format_uri(scheme, path, query)`, with
     an AdapterError for unknown keys. builtin: names that the path may be where it is no file; the
     opener takes the query alone then. labels: from path and query to the labels alone (None where
-    there are none), which a scene fitted to such data needs."""
+    there are none), which a scene fitted to such data needs. is_raw: whether opening builds the
+    scene from raw data, which takes long (see adapters.scene_cache)."""
 
     opener: str
     example: str
     builtin: tuple[str, ...] = ()
     labels: str | None = None
+    is_raw: bool = False
 
     def open(self, *path_and_query: object) -> Scene:
         return _imported(self.opener)(*path_and_query)
@@ -62,19 +64,22 @@ SCHEMES = {
         "adapters.procedural:procedural_labels",
     ),
     "pandaset": Scheme(
-        "adapters.pandaset.adapter:open_pandaset",
+        "adapters.pandaset:open_pandaset",
         "pandaset:data/pandaset/002",
-        labels="adapters.pandaset.files:pandaset_labels",
+        labels="adapters.pandaset:pandaset_labels",
+        is_raw=True,
     ),
     "nuscenes": Scheme(
         "adapters.nuscenes.adapter:open_nuscenes",
         "nuscenes:data/nuscenes?scene=scene-0061",
         labels="adapters.nuscenes.adapter:nuscenes_labels",
+        is_raw=True,
     ),
     "kitti": Scheme(
         "adapters.kitti.adapter:open_kitti",
         "kitti:data/kitti/2011_09_26/2011_09_26_drive_0001_sync",
         labels="adapters.kitti.adapter:kitti_labels",
+        is_raw=True,
     ),
     "street_gaussians": Scheme(
         "adapters.street_gaussians.adapter:open_street_gaussians",
@@ -90,6 +95,7 @@ SCHEMES = {
         "adapters.recording.adapter:open_recording",
         "recording:out/street-seed3/clear-000",
         labels="adapters.recording.adapter:recording_labels",
+        is_raw=True,
     ),
     "gaussians": Scheme(
         "adapters.gaussian_files:open_gaussians", "gaussians:model/point_cloud.ply?up=-y"

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 # Before torch is loaded. Processes that share the cores wait for each other's threads at the end of
 # every operation, ten times as long as these small ones take. (numba's threads are others.)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["CLIMATEGS_SCENE_CACHE_GB"] = "0"  # tests build what they look at
 
 import pytest
 import torch
@@ -74,10 +76,18 @@ LONG = {
     f"test_{name}.py"
     for name in (
         "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
-        "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
-        "render_backward", "snow_accuracy",
+        "flood_view", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
+        "render_backward", "snow_view",
     )
 }  # fmt: skip
+
+
+def pytest_runtest_setup() -> None:
+    """Kernels on one thread, in processes that share the cores: on two they wait for each other's
+    threads, at times 30 times as long as they compute. Tests of threads set their own numbers.
+    """
+    if threads := sys.modules.get("augment.render.threads"):
+        threads.limit_threads(1)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import tyro
 from pydantic import AfterValidator, Field, model_validator
 from tyro.conf import Positional, arg
 
-from tools.options import Command, FitOptions, StyleTrainOptions
+from tools.options import Command, FitOptions, SceneCommand, StyleTrainOptions
 from tools.output import JsonFile, check_local, write_json
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def _local(instead: str) -> AfterValidator:
     return AfterValidator(partial(check_local, instead=instead))
 
 
-class RenderOptions(Command):
+class RenderOptions(SceneCommand):
     """Render a scene under recipes into images, depth, labels and a manifest.
 
     Run it again to go on after an interruption: what is finished is not rendered twice.
@@ -104,7 +104,7 @@ class RenderOptions(Command):
         return render_recipes(self)
 
 
-class GenerateOptions(Command):
+class GenerateOptions(SceneCommand):
     """Make a dataset: many scenes under many recipes, as a job file says (docs/generate.md).
 
     Run it again to go on after an interruption, on this machine or another; what is published is
@@ -152,9 +152,7 @@ class GenerateOptions(Command):
         return show_status(self.out) if self.status else generate_dataset(self)
 
 
-def inspect(
-    uri: Positional[str], camera_path: Path | None = None, json_file: JsonFile = None
-) -> int:
+class InspectOptions(SceneCommand):
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
     Args:
@@ -162,15 +160,21 @@ def inspect(
         camera_path: A JSON file of camera poses to look at instead of the scene's own.
         json_file: Also write the facts to this file.
     """
-    from tools.explain import describe_scene, scene_text
 
-    facts = describe_scene(open_with_path(uri, camera_path))
-    print(scene_text(facts))
-    write_json(json_file, facts)
-    return 0
+    uri: Positional[str]
+    camera_path: Path | None = None
+    json_file: JsonFile = None
+
+    def run(self) -> int:
+        from tools.explain import describe_scene, scene_text
+
+        facts = describe_scene(open_with_path(self.uri, self.camera_path))
+        print(scene_text(facts))
+        write_json(self.json_file, facts)
+        return 0
 
 
-class ExplainOptions(Command):
+class ExplainOptions(SceneCommand):
     """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
     Args:
@@ -327,7 +331,7 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     return run_demo(out, frames)
 
 
-class ExportOptions(Command):
+class ExportOptions(SceneCommand):
     """Write a scene as one file to share, or for other programs: .ply, .splat.
 
     What the kind of file cannot keep is said.
@@ -384,7 +388,7 @@ class MirrorOptions(Command):
         return mirror_again(self.out, self.scene, links=self.links)
 
 
-class ApplyOptions(Command):
+class ApplyOptions(SceneCommand):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
     Args:
@@ -459,7 +463,7 @@ COMMANDS = {
     "render": RenderOptions,
     "generate": GenerateOptions,
     "fit": FitOptions,
-    "inspect": inspect,
+    "inspect": InspectOptions,
     "explain": ExplainOptions,
     "recipes": recipes,
     "sheet": SheetOptions,
@@ -491,7 +495,13 @@ def main(arguments: list[str] | None = None) -> int:
         result = tyro.extras.subcommand_cli_from_dict(
             table, args=arguments, prog=prog, description=description, sort_subcommands=False
         )
-        return result if isinstance(result, int | None) else result.run()
+        if isinstance(result, int | None):
+            return result
+        if isinstance(result, SceneCommand) and not result.cache:
+            from adapters.scene_cache import leave_out_cache
+
+            leave_out_cache()
+        return result.run()
     except KeyboardInterrupt as interruption:
         print(str(interruption) or "interrupted", file=sys.stderr)
         return 130

@@ -59,7 +59,18 @@ class Command(BaseModel):
         raise NotImplementedError
 
 
-class FitOptions(FitConfig, Command):
+class SceneCommand(Command):
+    """A command that opens scenes.
+
+    Args:
+        cache: Take a scene that was built from raw data before from the user's cache folder, and
+            keep it there (docs/scenes.md).
+    """
+
+    cache: bool = True
+
+
+class FitOptions(FitConfig, SceneCommand):
     """Reconstruct a scene of Gaussians from recorded images, LiDAR and boxes.
 
     Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
@@ -136,6 +147,7 @@ class FitOptions(FitConfig, Command):
         from adapters.uri import format_uri
 
         asides = {"out", "minutes", "steps", "image_cache_mb", "truth", "overwrite", "json_file"}
+        asides.add("cache")
         return self.model_dump(exclude=asides) | {
             "scene": format_uri(*resolved_uri(self.scene)),
             "depth": _depth_text(parse_depth(self.depth)),
@@ -236,7 +248,7 @@ _Count = Annotated[int, Field(ge=1)]
 _LossWeight = Annotated[float, Field(ge=0)]
 
 
-class StyleTrainOptions(Command):
+class StyleTrainOptions(SceneCommand):
     """Train the network that turns a style image into a colour map, on photos and scenes.
 
     Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
@@ -317,7 +329,9 @@ class StyleTrainOptions(Command):
         """All that decides the result, as JSON keeps it; not how long it is trained."""
         weights = {name: getattr(self, name) for name in ("encoder_weights", "vgg")}
         return {
-            **self.model_dump(exclude={"out", "minutes", "steps", "overwrite", "json_file"}),
+            **self.model_dump(
+                exclude={"out", "minutes", "steps", "overwrite", "json_file", "cache"}
+            ),
             **{name: None if path is None else path.name for name, path in weights.items()},
             "scenes": [uri_text(uri) for uri in self.scenes],
             "photos": [path.resolve().name for path in self.photos],

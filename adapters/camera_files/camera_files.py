@@ -265,8 +265,13 @@ def find_colmap_model(folder: Path) -> Path | None:
 
 def read_colmap_views(model: Path) -> ViewSet:
     """Views of the registered images. Lens distortion is left out, and said so."""
-    import pycolmap  # 0.2 s and a large native library: only those who have COLMAP models pay
-
+    try:
+        import pycolmap  # a large native library: only those who have COLMAP models need it
+    except ImportError:
+        raise AdapterError(
+            f"{model}: COLMAP models are read by pycolmap, which is not installed: "
+            "pip install 'climategs[colmap]'"
+        ) from None
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
     except (ValueError, RuntimeError, IndexError) as error:

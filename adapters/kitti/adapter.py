@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from pydantic import Field
 from tqdm import tqdm
@@ -47,20 +46,23 @@ from adapters.kitti.files import (
     read_velodyne_from_imu,
     registered_poses,
     rotation_about,
-    some,
 )
-from adapters.lidar_scene.scene import build_lidar_scene, views_of
-from adapters.lidar_scene.split import join_tracks
-from adapters.plain_files import parse_numbers, read_image_size, read_text
+from adapters.plain_files import parse_numbers, read_text
 from adapters.raw_drive import (
     DriveFrames,
+    DriveImages,
     DriveOptions,
+    Picture,
+    RawDrive,
     Sweep,
     TimedBoxes,
     drive_origin,
+    find_objects,
     is_in_box,
-    read_objects,
+    scene_of_drive,
+    some,
     stored_records,
+    usable_images,
 )
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
@@ -82,13 +84,13 @@ ATTRIBUTES = (
     "amt_border_l", "amt_border_r", "amt_border_kf",
 )  # fmt: skip
 _POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
-_MAX_BYTES, _MAX_ELEMENTS, _MAX_DEPTH = 64 * 2**20, 4_000_000, 8
+_MAX_BYTES, _MAX_TAGS = 64 * 2**20, 8_000_000
 _OWN_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")  # declares nothing
 _LAST_FRAME = 10**9
-_OBJECT_ATTRIBUTES = (
-    "truncated", "occluded", "alpha", "bbox_left", "bbox_top", "bbox_right", "bbox_bottom",
+_OBJECT_COLUMNS = (
+    "type", "truncated", "occluded", "alpha", "bbox_left", "bbox_top", "bbox_right", "bbox_bottom",
+    "h", "w", "l", "x", "y", "z", "rotation_y", "score",
 )  # fmt: skip
-_COLUMNS = 15
 _RECORD = ("x", "y", "z", "intensity")  # of a sweep's file
 
 
@@ -215,27 +217,6 @@ def _pose(tracklet: Tracklet, row: int) -> np.ndarray:
     return pose
 
 
-class _BoundedBuilder(ET.TreeBuilder):
-    """Stops at more elements, or deeper ones, than a drive has."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._path, self._depth, self._count = path, 0, 0
-
-    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
-        self._depth, self._count = self._depth + 1, self._count + 1
-        if self._depth > _MAX_DEPTH or self._count > _MAX_ELEMENTS:
-            raise AdapterError(
-                f"{self._path} is nested deeper than {_MAX_DEPTH} elements, or has more than "
-                f"{_MAX_ELEMENTS} of them; no drive has that"
-            )
-        return super().start(tag, attrs)
-
-    def end(self, tag: str, /) -> ET.Element:
-        self._depth -= 1
-        return super().end(tag)
-
-
 def _parsed(path: Path) -> ET.Element:
     """The file's root element; nothing in it is expanded or fetched, and it is of bounded size."""
     if path.stat().st_size > _MAX_BYTES:
@@ -247,10 +228,10 @@ def _parsed(path: Path) -> ET.Element:
             f"{path} is not UTF-8, or declares a document type or entities, as no file of KITTI "
             f"does; copy it from the dataset"
         )
-    parser = ET.XMLParser(target=_BoundedBuilder(path))
+    if text.count("<") > _MAX_TAGS:
+        raise AdapterError(f"{path} has more than {_MAX_TAGS} tags; no drive has that")
     try:
-        parser.feed(text)
-        root = parser.close()
+        root = ET.fromstring(text)
     except ET.ParseError as error:
         raise AdapterError(f"{path} is not whole XML ({error}); copy it again") from None
     if root.find("tracklets") is None:
@@ -291,71 +272,52 @@ def _number(element: ET.Element, name: str, where: str) -> float:
     return value
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectLines:
-    """The objects of a file. rows: their lines' numbers, from 0. labels: their types. values:
-    float64 [B, 14], the columns after the type. scores: float64 [B], NaN without one. dont_care:
-    how many lines are regions."""
-
-    rows: tuple[int, ...]
-    labels: tuple[str, ...]
-    values: np.ndarray
-    scores: np.ndarray
-    dont_care: int
-
-
-def read_object_lines(path: Path) -> ObjectLines:
-    """The objects of a label file."""
-    rows, labels, values, dont_care = [], [], [], 0
-    for row, line in enumerate(read_text(path).splitlines()):
-        words = line.split()
+def read_object_lines(path: Path) -> pd.DataFrame:
+    """The objects of a label file: `type` and numbers by column (score NaN without one), indexed by
+    the lines' numbers from 0; DontCare lines too, of which only the type is read."""
+    rows = {}
+    for number, line in enumerate(read_text(path).splitlines()):
+        words, where = line.split(), f"{path}, line {number + 1}"
         if not words:
             continue
         if words[0] == "DontCare":
-            dont_care += 1
+            rows[number] = [words[0], *[np.nan] * 15]
             continue
-        rows.append(row)
-        labels.append(words[0])
-        values.append(_object_numbers(words, f"{path}, line {row + 1}"))
-    table = np.array(values, np.float64).reshape(-1, _COLUMNS)
-    return ObjectLines(tuple(rows), tuple(labels), table[:, :-1], table[:, -1], dont_care)
+        if len(words) not in (15, 16):
+            raise AdapterError(
+                f"{where}: expected a type and 14 numbers, and maybe a score; got {len(words)} "
+                f"words"
+            )
+        values = parse_numbers(" ".join(words[1:]), where)
+        if min(values[7:10]) <= 0:
+            raise AdapterError(f"{where}: h, w, l must be metres > 0; got {values[7:10].tolist()}")
+        rows[number] = [words[0], *values, *[np.nan] * (16 - len(words))]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=_OBJECT_COLUMNS)
 
 
-def boxes_of_lines(lines: ObjectLines, velodyne_from_rectified: np.ndarray) -> Boxes:
+def boxes_of_lines(lines: pd.DataFrame, velodyne_from_rectified: np.ndarray) -> Boxes:
     """The objects as boxes in the Velodyne's frame. A track_id is the line's number from 0.
     Attributes: truncated, occluded, alpha, bbox_left, bbox_top, bbox_right, bbox_bottom as in the
     file, and score where a line has one, float64."""
-    height, width, length = lines.values[:, 7:10].T
-    heading = lines.values[:, 13]
+    lines = lines[lines["type"] != "DontCare"]
+    values = lines.drop(columns="type").to_numpy(np.float64)
+    height, width, length = values[:, 7:10].T
+    heading = values[:, 13]
     zero, one = np.zeros_like(heading), np.ones_like(heading)
     forward = np.stack([np.cos(heading), zero, -np.sin(heading)], axis=1)
     up = np.stack([zero, -one, zero], axis=1)
     rectified_from_box = np.stack([forward, np.cross(up, forward), up], axis=2)
-    centres = lines.values[:, 10:13] + up * height[:, None] / 2
+    centres = values[:, 10:13] + up * height[:, None] / 2
     turn = velodyne_from_rectified[:3, :3]
-    attributes = {name: lines.values[:, i].copy() for i, name in enumerate(_OBJECT_ATTRIBUTES)}
-    if np.isfinite(lines.scores).any():
-        attributes["score"] = lines.scores
+    names = _OBJECT_COLUMNS[1:8] + (("score",) if lines["score"].notna().any() else ())
     return Boxes(
-        track_ids=tuple(map(str, lines.rows)),
-        labels=lines.labels,
+        track_ids=tuple(map(str, lines.index)),
+        labels=tuple(lines["type"]),
         centers_m=centres @ turn.T + velodyne_from_rectified[:3, 3],
         sizes_m=np.stack([length, width, height], axis=1),
         quats=quat_from_rotmat(torch.from_numpy(turn @ rectified_from_box)).numpy(),
-        attributes=attributes,
+        attributes={name: lines[name].to_numpy(np.float64, copy=True) for name in names},
     )
-
-
-def _object_numbers(words: list[str], where: str) -> np.ndarray:
-    """The numbers after the type, the score last, NaN without one: float64 [15]."""
-    if len(words) not in (_COLUMNS, _COLUMNS + 1):
-        raise AdapterError(
-            f"{where}: expected a type and 14 numbers, and maybe a score; got {len(words)} words"
-        )
-    numbers = parse_numbers(" ".join(words[1:]), where)
-    if min(numbers[7:10]) <= 0:
-        raise AdapterError(f"{where}: h, w, l must be metres > 0; got {numbers[7:10].tolist()}")
-    return numbers if len(numbers) == _COLUMNS else np.append(numbers, np.nan)
 
 
 # ---- The scene -----------------------------------------------------------------------------------
@@ -364,8 +326,7 @@ ICP = "icp"
 _LIDAR_TOP_DEG = 2.0  # the HDL-64E's uppermost channel
 # The recording car around its Velodyne: in measured sweeps all returns within 2.6 m of it that no
 # neighbour made.
-_EGO_LOW_M, _EGO_HIGH_M = np.array([-2.0, -1.35, -1.5]), np.array([2.6, 1.35, 0.5])
-_READERS = 4  # threads that decode; decoding releases the interpreter
+_EGO_M = np.array([[-2.0, -1.35, -1.5], [2.6, 1.35, 0.5]])
 
 
 class KittiOptions(DriveOptions):
@@ -391,84 +352,43 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
         AdapterError: a wrong option; missing or damaged calibration, poses, times or labels; no
             usable sweep or image. What single frames lack is in Scene.problems."""
     source, options = find_source(path, query)
-    numbers, held_out = source.chosen.numbers, source.chosen.held_out
-    images, image_problems = {}, []
-    for camera in source.calibration.cameras:
-        files = source.images[camera.name]
-        images[camera.name] = _usable_images(
-            source.labels.root, camera.name, files, numbers, camera.size, image_problems
-        )
-    frames = tuple(_frame(source, images, number) for number in numbers)
-    used = [frame for frame in frames if frame.index not in held_out]
-    sweeps, sweep_problems = _read_sweeps(source.labels, used)
-    if not any(frame.image_paths for frame in used):
-        raise AdapterError(
-            f"{source.labels.root}: none of the frames that are not held out has a usable image; "
-            f"colours cannot be had without them"
-        )
-    boxes = {frame.index: TimedBoxes(source.labels.boxes(frame.index), None) for frame in frames}
-    objects = read_objects(frames, boxes, source.world_origin_m)
-    return build_lidar_scene(
-        sweeps,
-        join_tracks(objects.moving),
-        views_of(used),
-        options,
-        lidar_top_deg=_LIDAR_TOP_DEG,
+    return scene_of_drive(read_kitti(path, query, source), options)
+
+
+def read_kitti(path: str, query: dict[str, str], source: Source) -> RawDrive:
+    """The source's frames with their images, sweeps and boxes."""
+    labels, calibration = source.labels, source.calibration
+    pictures = [
+        Picture(name, n, file_in(labels.root, files[n]) if n in files else None, camera.size)
+        for name, camera in calibration.cameras.items()
+        for n in source.chosen.numbers
+        for files in [source.images[name]]
+    ]
+    images = usable_images(pictures)
+    frames = tuple(_frame(source, images, number) for number in source.chosen.numbers)
+    used = [frame for frame in frames if frame.index not in source.chosen.held_out]
+    sweeps, sweep_problems = _read_sweeps(labels, used)
+    objects = find_objects(
+        (TimedBoxes(f.index, labels.boxes(f.index), f.timestamp_ns) for f in frames),
+        source.world_origin_m,
+    )
+    return RawDrive(
         name=source.name,
         source=format_uri("kitti", path, query),
         frames=frames,
-        labels=source.labels,
+        held_out=source.chosen.held_out,
+        sweeps=sweeps,
+        boxes=objects.moving,
+        labels=labels,
         world_origin_m=source.world_origin_m,
-        problems=(*source.problems, *image_problems, *sweep_problems, *objects.problems),
-        if_empty=f"{source.labels.root}: none of the sweeps' points is in any image; check that "
-        f"calibration, sweeps and images are of one day",
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        problems=(*source.problems, *images.problems, *sweep_problems, *objects.problems),
     )
 
 
 def kitti_labels(path: str, query: dict[str, str]) -> KittiLabels:
     """The labels alone, in the world that `open_kitti` with this query has before recentring."""
     return find_source(path, query)[0].labels
-
-
-def _usable_images(
-    root: Path,
-    camera: str,
-    names: Mapping[int, str],
-    numbers: Sequence[int],
-    size: tuple[int, int] | None,
-    problems: list[str],
-) -> tuple[dict[int, Path], tuple[int, int]]:
-    """The camera's images `names` of the frames, all decoded once to be sure of them, and their
-    width and height: `size` by the calibration, else that of most images."""
-    present = [number for number in numbers if number in names]
-    missing = [number for number in numbers if number not in names]
-    faults = [f"camera {camera}: {some(missing)} without an image"] if missing else []
-    paths = {number: file_in(root, names[number]) for number in present}
-    with ThreadPoolExecutor(_READERS) as pool:
-        found = dict(zip(present, pool.map(read_image_size, paths.values()), strict=True))
-    sizes = Counter(seen for seen in found.values() if not isinstance(seen, str))
-    if not sizes:
-        faults = [f"{paths[n]} {found[n]}" for n in present[:3]] or faults
-        raise AdapterError(f"camera {camera}: none of its images is usable: {'; '.join(faults)}")
-    expected = size or sizes.most_common(1)[0][0]
-    text = "{0[0]}x{0[1]}".format
-    if expected not in sizes:
-        first = next(n for n in present if not isinstance(found[n], str))
-        raise AdapterError(
-            f"{paths[first]} is {text(found[first])} pixels, the calibration's S_rect says "
-            f"{text(expected)}; images and calibration must be of one day, rectified (sync) and "
-            f"not resized"
-        )
-    problems += faults
-    for number, seen in found.items():
-        if seen != expected:
-            fault = (
-                seen if isinstance(seen, str) else f"is {text(seen)} pixels, not {text(expected)}"
-            )
-            problems.append(
-                f"camera {camera}, frame {number}: image {paths.pop(number)} {fault}; left out"
-            )
-    return paths, expected
 
 
 def _read_sweeps(
@@ -479,11 +399,10 @@ def _read_sweeps(
     problems = [f"{some(missing)} without a sweep"] if missing else []
     sweeps = []
     for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
-        name = labels.sweeps.get(frame.index)
-        if name is None:
+        if frame.index not in labels.sweeps:
             continue
         try:
-            points = read_returns(labels.root, name)[:, :3].astype(np.float64)
+            points = read_returns(labels.root, labels.sweeps[frame.index])[:, :3].astype(np.float64)
         except AdapterError as error:
             problems.append(f"frame {frame.index}: {error}")
             continue
@@ -491,22 +410,15 @@ def _read_sweeps(
         bad = int((~finite).sum())
         if bad:
             problems.append(f"frame {frame.index}: left out {bad} returns that are not finite")
-        points = points[finite & ~is_in_box(points, _EGO_LOW_M, _EGO_HIGH_M)]
+        points = points[finite & ~is_in_box(points, *_EGO_M)]
         pose = frame.world_from_ego.numpy()
         with np.errstate(over="ignore"):
             world = points @ pose[:3, :3].T + pose[:3, 3]
             sweeps.append(Sweep.of_unknown_class(world, frame.timestamp_ns))
-    if not sum(len(sweep) for sweep in sweeps):
-        raise AdapterError(
-            f"{labels.root}: there are no returns in {some([f.index for f in frames])}; a scene "
-            f"cannot be built without them" + "".join(f"; {problem}" for problem in problems[:3])
-        )
     return tuple(sweeps), tuple(problems)
 
 
-def _frame(
-    source: Source, images: Mapping[str, tuple[dict[int, Path], tuple[int, int]]], number: int
-) -> Frame:
+def _frame(source: Source, images: DriveImages, number: int) -> Frame:
     pose = source.labels.world_from_velodyne[number].copy()
     pose[:3, 3] -= source.world_origin_m
     ego_from_world = invert_rigid(torch.from_numpy(pose))
@@ -516,18 +428,16 @@ def _frame(
         timestamp_ns=time,
         world_from_ego=torch.from_numpy(pose),
         cameras={
-            camera.name: Camera(
-                camera.name,
-                *images[camera.name][1],
+            name: Camera(
+                name,
+                *images.sizes[name],
                 *camera.lens,
                 camera_from_world=torch.from_numpy(camera.camera_from_velodyne) @ ego_from_world,
-                timestamp_ns=source.image_times_ns[camera.name].get(number, time),
+                timestamp_ns=source.image_times_ns.get(name, {}).get(number, time),
             )
-            for camera in source.calibration.cameras
+            for name, camera in source.calibration.cameras.items()
         },
-        image_paths={
-            name: str(paths[number]) for name, (paths, _) in images.items() if number in paths
-        },
+        image_paths=images.paths[number],
     )
 
 
@@ -571,7 +481,7 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
             f"without them, unpack the drive again"
         )
     chosen = options.select(numbers, where=f"kitti:{root}")
-    calibration = read_raw_calibration(calibration_folder, tuple(images))
+    calibration = read_raw_calibration(calibration_folder, images)
     image_times = {name: read_times(root, name) for name in images}
     known = read_times(root, VELODYNE) or next(filter(None, image_times.values()), {})
     times, time_problems = frame_times(root, known, numbers)
@@ -681,7 +591,7 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
             f"had without an image"
         )
     chosen = options.select([number], where=f"kitti:{root}, frame {number}")
-    calibration = read_object_calibration(calibration_folder, digits, tuple(images))
+    calibration = read_object_calibration(calibration_folder, digits, images)
     labels = KittiLabels(
         root,
         {number: sweeps[number]},
@@ -693,12 +603,11 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
     problems = list(chosen.problems)
     if not path.exists():
         problems.append(f"{path} does not exist: no boxes are known")
-    elif ignored := read_object_lines(path).dont_care:
+    elif ignored := int((read_object_lines(path)["type"] == "DontCare").sum()):
         problems.append(
             f"{path}: {ignored} regions marked DontCare have no 3D box; boxes are without them"
         )
-    times = {name: {} for name in images}
-    return Source(digits, chosen, calibration, images, times, labels, np.zeros(3), tuple(problems))
+    return Source(digits, chosen, calibration, images, {}, labels, np.zeros(3), tuple(problems))
 
 
 def _object_frame(root: Path, asked: int | None, numbers: list[int]) -> int:

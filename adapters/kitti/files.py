@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from adapters.plain_files import checked_pose, inside, parse_numbers, read_numbers, read_text
+from adapters.raw_drive import some
 from augment.errors import AdapterError
 
 CAM_TO_CAM = "calib_cam_to_cam.txt"
@@ -37,7 +39,7 @@ COLOUR_CAMERAS, GREY_CAMERAS = ("image_02", "image_03"), ("image_00", "image_01"
 OBJECT_CAMERAS = ("image_2", "image_3")
 IMAGE_SUFFIXES = (".jpg", ".png")  # the later wins where a frame has both
 RAW_DIGITS, OBJECT_DIGITS = 10, 6
-_MAX_NAMED = 3
+_MAX_DRIVES = 3  # that a message names
 FRAME_NS = 100_000_000  # the Velodyne turns ten times a second and triggers the cameras
 _TIME = re.compile(r"(19[7-9]\d|20\d\d|21\d\d)-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 _RETURN_BYTES = 16
@@ -82,8 +84,8 @@ def kitti_root(path: str | Path) -> tuple[Path, Path]:
             return place, place / "calib"
     drives = sorted(p.parent for p in root.glob(f"*/{VELODYNE}"))
     if drives:
-        rest = len(drives) - _MAX_NAMED
-        few = ", ".join(map(str, drives[:_MAX_NAMED])) + (f" and {rest} more" if rest > 0 else "")
+        rest = len(drives) - _MAX_DRIVES
+        few = ", ".join(map(str, drives[:_MAX_DRIVES])) + (f" and {rest} more" if rest > 0 else "")
         raise AdapterError(f"{root} holds drives, it is none itself; give one: {few}")
     parents = root.absolute().parents[:2]
     above = next((p for p in parents if (p / VELODYNE).is_dir() or is_object_folder(p)), None)
@@ -118,29 +120,20 @@ def file_in(root: Path, name: str) -> Path:
     return inside(root, name, str(root))
 
 
-def some(numbers: Sequence[int]) -> str:
-    """How many frames and the first of them, for messages."""
-    named = ", ".join(map(str, numbers[:_MAX_NAMED]))
-    more = ", ..." if len(numbers) > _MAX_NAMED else ""
-    return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({named}{more})"
+class RectifiedCamera(NamedTuple):
+    """lens: fx, fy, cx, cy, pixels. camera_from_velodyne: float64 [4, 4]. size: width and height in
+    pixels where the calibration says so."""
 
-
-@dataclass(frozen=True, eq=False)
-class RectifiedCamera:
-    """A rectified camera. lens: fx, fy, cx, cy, pixels. camera_from_velodyne: float64 [4, 4]. size:
-    width and height in pixels where the calibration says so."""
-
-    name: str
     lens: tuple[float, float, float, float]
     camera_from_velodyne: np.ndarray
     size: tuple[int, int] | None
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """rectified_from_velodyne: float64 [4, 4], into camera 0 after rectification."""
+class Calibration(NamedTuple):
+    """cameras: by name. rectified_from_velodyne: float64 [4, 4], into camera 0 after
+    rectification."""
 
-    cameras: tuple[RectifiedCamera, ...]
+    cameras: Mapping[str, RectifiedCamera]
     rectified_from_velodyne: np.ndarray
 
 
@@ -188,29 +181,25 @@ class KeyedLines:
         return checked_pose(matrix, f"{self.path}: {keys}")
 
 
-def read_raw_calibration(folder: Path, names: Sequence[str]) -> Calibration:
+def read_raw_calibration(folder: Path, names: Iterable[str]) -> Calibration:
     """The calibration of a day's drives. names: of the cameras, such as image_02."""
     keyed = KeyedLines.read(folder, CAM_TO_CAM)
     velodyne = KeyedLines.read(folder, "calib_velo_to_cam.txt").pose("R", "T")
     rectified = keyed.pose("R_rect_00") @ velodyne
-    numbers = [name.removeprefix("image_") for name in names]
-    cameras = [
-        _camera(name, keyed, f"P_rect_{number}", rectified, _size(keyed, f"S_rect_{number}"))
-        for name, number in zip(names, numbers, strict=True)
-    ]
-    return Calibration(tuple(cameras), rectified)
+    return Calibration(
+        {n: _camera(keyed, n.replace("image", "P_rect"), rectified) for n in names}, rectified
+    )
 
 
-def read_object_calibration(folder: Path, frame: str, names: Sequence[str]) -> Calibration:
+def read_object_calibration(folder: Path, frame: str, names: Iterable[str]) -> Calibration:
     """The calibration of one frame of the object benchmark. frame: its digits. names: of the
     cameras, such as image_2."""
     keyed = KeyedLines.read(folder, f"{frame}.txt")
     velodyne = checked_pose(keyed.numbers("Tr_velo_to_cam", 3, 4), f"{keyed.path}: Tr_velo_to_cam")
     rectified = keyed.pose("R0_rect") @ velodyne
-    cameras = [
-        _camera(name, keyed, f"P{name.removeprefix('image_')}", rectified, None) for name in names
-    ]
-    return Calibration(tuple(cameras), rectified)
+    return Calibration(
+        {n: _camera(keyed, n.replace("image_", "P"), rectified) for n in names}, rectified
+    )
 
 
 def read_velodyne_from_imu(folder: Path) -> np.ndarray:
@@ -218,13 +207,7 @@ def read_velodyne_from_imu(folder: Path) -> np.ndarray:
     return KeyedLines.read(folder, "calib_imu_to_velo.txt").pose("R", "T")
 
 
-def _camera(
-    name: str,
-    keyed: KeyedLines,
-    key: str,
-    rectified_from_velodyne: np.ndarray,
-    size: tuple[int, int] | None,
-) -> RectifiedCamera:
+def _camera(keyed: KeyedLines, key: str, rectified_from_velodyne: np.ndarray) -> RectifiedCamera:
     projection = keyed.numbers(key, 3, 4)
     k = projection[:, :3]
     pinhole = np.array([[k[0, 0], 0, k[0, 2]], [0, k[1, 1], k[1, 2]], [0, 0, 1]])
@@ -236,11 +219,12 @@ def _camera(
     camera_from_rectified = np.eye(4)
     camera_from_rectified[:3, 3] = np.linalg.solve(pinhole, projection[:, 3])
     lens = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
-    return RectifiedCamera(name, lens, camera_from_rectified @ rectified_from_velodyne, size)
+    pose = camera_from_rectified @ rectified_from_velodyne
+    return RectifiedCamera(lens, pose, _size(keyed, key.replace("P_rect", "S_rect")))
 
 
 def _size(keyed: KeyedLines, key: str) -> tuple[int, int] | None:
-    if key not in keyed.lines:
+    if not key.startswith("S_rect") or key not in keyed.lines:
         return None
     width, height = keyed.numbers(key, 2)
     if not (1 <= width <= 1e5 and 1 <= height <= 1e5 and width % 1 == 0 and height % 1 == 0):
@@ -312,8 +296,7 @@ def read_returns(root: Path, name: str) -> np.ndarray:
         raise AdapterError(f"{path} cannot be read ({error.strerror or error})") from None
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
+class Poses(NamedTuple):
     """world_from_velodyne: float64 [4, 4] by frame number, in the dataset's world, z up. problems:
     one sentence each."""
 
@@ -400,8 +383,7 @@ def rotation_about(axis: int, angle: float) -> np.ndarray:
     return matrix
 
 
-@dataclass(frozen=True, eq=False)
-class _Surface:
+class _Surface(NamedTuple):
     """Thinned points [N, 3] of a sweep, those of them on surfaces [M, 3], and normals [M, 3]."""
 
     points: np.ndarray
@@ -409,8 +391,7 @@ class _Surface:
     normals: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Match:
+class Match(NamedTuple):
     """before_from_after: float64 [4, 4]. fitness: part of the points with a surface within half a
     metre. rmse_m: of their distances from it."""
 

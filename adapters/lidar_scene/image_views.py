@@ -58,30 +58,13 @@ class Seen(NamedTuple):
     seen: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """The best KEPT observations of N surfels or places. scores: float32 [N, KEPT], 0 where there
-    is none. colours: uint8 [N, KEPT, 3]. cameras: uint8 [N, KEPT], numbers of cameras."""
+class _Observations(NamedTuple):
+    """The best KEPT observations of N surfels. scores: float32 [N, KEPT], 0 where there is none.
+    colours: uint8 [N, KEPT, 3]. cameras: uint8 [N, KEPT], numbers of cameras."""
 
     scores: np.ndarray
     colours: np.ndarray
     cameras: np.ndarray
-
-    @staticmethod
-    def empty(count: int) -> Observations:
-        return Observations(
-            np.zeros((count, kernels.KEPT), np.float32),
-            np.zeros((count, kernels.KEPT, 3), np.uint8),
-            np.zeros((count, kernels.KEPT), np.uint8),
-        )
-
-    def blended(self) -> Seen:
-        """A camera's observations by their median, cameras averaged; see kernels."""
-        return Seen(
-            *kernels.blended_colours(
-                self.scores, self.colours, self.cameras, _KEEP_SCORE, _CAMERA_POWER
-            )
-        )
 
 
 def observe_views(
@@ -93,7 +76,12 @@ def observe_views(
     takes the image's colour there. A camera's best observations count by their median; cameras are
     averaged with weights that fall towards the border. What nothing covers goes to the sky."""
     names = list(dict.fromkeys(view.camera.name for view in views))
-    stores = [Observations.empty(len(body.surfels)) for body in bodies]
+    stores = [
+        _Observations(
+            np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+        )
+        for shape in ((len(body.surfels), kernels.KEPT) for body in bodies)
+    ]
     problems: list[str] = []
     for view in tqdm(views, desc="colours from images", unit="image", disable=None):
         image = read_image(view.path, image_scale)
@@ -105,7 +93,9 @@ def observe_views(
             problems.append(f"{where} is {width} px wide, not {view.camera.width}; left out")
         else:
             _observe_one(bodies, stores, view, names.index(view.camera.name), image, sky)
-    return tuple(store.blended() for store in stores), tuple(problems)
+    # A camera's observations by their median, cameras averaged.
+    blended = (kernels.blended_colours(*store, _KEEP_SCORE, _CAMERA_POWER) for store in stores)
+    return tuple(Seen(*found) for found in blended), tuple(problems)
 
 
 def read_image(path: Path, image_scale: float) -> np.ndarray | None:
@@ -116,42 +106,37 @@ def read_image(path: Path, image_scale: float) -> np.ndarray | None:
 
 def _observe_one(
     bodies: Sequence[Body],
-    stores: Sequence[Observations],
+    stores: Sequence[_Observations],
     view: View,
     camera_number: int,
     image: np.ndarray,
     sky: SkyGatherer,
 ) -> None:
     camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    cover = depth.copy()
+    cover, nothing = depth.copy(), depth.copy()
     posed = []
-    for body in bodies:
+    for body, store in zip(bodies, stores, strict=True):
         transform = camera.camera_from_world.numpy()
         if body.track is not None:
             pose = body.track.motion.pose_at(camera.timestamp_ns)
             if pose is None:
-                posed.append(None)
                 continue
             transform = transform @ pose
             _draw_cover(cover, camera, transform, body.track.size_m)
-        posed.append((transform[:3, :3].copy(), transform[:3, 3].copy()))
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    extents = [body.surfels.spacing * np.float32(DISC_PER_SPACING) for body in bodies]
-    for body, extent, pose in zip(bodies, extents, posed, strict=True):
-        if pose is not None:
-            s = body.surfels
-            kernels.draw_depth(s.centres, s.normals, s.major, extent, *pose, *intrinsics, depth)
+        extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
+        posed.append((body, store, extent, transform[:3, :3].copy(), transform[:3, 3].copy()))
+    for body, _, extent, *pose in posed:
+        s = body.surfels
+        kernels.draw_depth(s.centres, s.normals, s.major, extent, *pose, *intrinsics, depth)
     levels, sizes = _pyramid(image)
-    nothing = np.full_like(cover, np.inf)
-    for body, extent, pose, store in zip(bodies, extents, posed, stores, strict=True):
-        if pose is not None:
-            s = body.surfels
-            kernels.observe(
-                s.centres, s.normals, extent, *pose, *intrinsics,
-                depth, cover if body.track is None else nothing, levels, sizes, view.used_rows,
-                camera_number, store.scores, store.colours, store.cameras,
-            )  # fmt: skip
+    for body, store, extent, *pose in posed:
+        kernels.observe(
+            body.surfels.centres, body.surfels.normals, extent, *pose, *intrinsics,
+            depth, cover if body.track is None else nothing, levels, sizes, view.used_rows,
+            camera_number, *store,
+        )  # fmt: skip
     free = np.isinf(depth) & np.isinf(cover)
     free[int(view.used_rows * camera.height) :] = False
     sky.add(camera, free, levels, sizes)

@@ -1,4 +1,4 @@
-"""Sweeps, tracks and images into Gaussians, actors and sky: the same steps for any dataset."""
+"""A raw drive into Gaussians, actors and sky: the same steps for any dataset."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ from types import MappingProxyType
 
 import numpy as np
 
-from adapters.lidar_scene.image_views import Body, Seen, View, observe_views
+from adapters.lidar_scene.image_views import Body, View, observe_views
 from adapters.lidar_scene.kernels import SkyGatherer
-from adapters.lidar_scene.split import ObjectTrack, PointSet, indices_between, is_flat, split_sweeps
+from adapters.lidar_scene.split import (
+    ObjectTrack,
+    PointSet,
+    indices_between,
+    is_flat,
+    join_tracks,
+    split_sweeps,
+)
 from adapters.lidar_scene.surfels import (
     Surfels,
     borrow_colours,
@@ -23,12 +30,11 @@ from adapters.lidar_scene.surfels import (
     surfels_from_points,
     thin_points,
 )
-from adapters.raw_drive import DriveOptions, Sweep
+from adapters.raw_drive import DriveOptions, RawDrive
 from adapters.world import join_gaussians
 from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.ground import measure_from_classes
-from augment.labels import LabelSource
 from augment.scene import Actor, Gaussians, Ground, Scene
 
 logger = logging.getLogger(__name__)
@@ -42,11 +48,10 @@ _TRIAL = 3.0  # voxels of the trial in units of those asked for
 _REACHES_M = (8.0, 16.0)
 _MIN_RETURNS = 200
 _LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
-_ALL_ROWS: Mapping[str, float] = MappingProxyType({})
 
 
 def views_of(
-    frames: Iterable[Frame], used_rows: Mapping[str, float] = _ALL_ROWS
+    frames: Iterable[Frame], used_rows: Mapping[str, float] = MappingProxyType({})
 ) -> tuple[View, ...]:
     """The recorded images of frames. used_rows: see View, by camera name; 1 for the others."""
     return tuple(
@@ -57,63 +62,60 @@ def views_of(
 
 
 def build_lidar_scene(
-    sweeps: Sequence[Sweep],
-    tracks: Sequence[ObjectTrack],
-    views: Sequence[View],
+    drive: RawDrive,
     options: DriveOptions,
     *,
-    lidar_top_deg: float,
-    name: str,
-    source: str,
-    frames: tuple[Frame, ...],
-    labels: LabelSource,
-    world_origin_m: np.ndarray,
-    problems: tuple[str, ...],
-    has_metric_scale: bool = True,
     added: Gaussians | None = None,
     ground: Ground | None = None,
-    if_empty: str = "",
 ) -> Scene:
-    """Accumulate, thin, find surfaces, colour from images, and turn into Gaussians.
+    """Accumulate a drive's returns, thin them, find surfaces, colour them from the images, and turn
+    them into Gaussians.
 
     Surfels that no image shows take the colour of a near seen one, or are left out; so are points
-    without neighbours, and actors of which nothing is left. lidar_top_deg: highest elevation that
-    the LiDAR looks at. problems: of reading; those of building follow them. added: Gaussians of the
-    background from elsewhere. ground: measured unless given; where it is not found, ground_z_m is a
-    low height."""
-    path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in frames])
-    times_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
-    background, actors = split_sweeps(sweeps, tracks)
+    without neighbours, and actors of which nothing is left. added: Gaussians of the background from
+    elsewhere. ground: measured unless given; where it is not found, ground_z_m is a low height."""
+    path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])
+    times_ns = np.array([frame.timestamp_ns for frame in drive.frames], np.int64)
+    tracks = join_tracks(drive.boxes)
+    background, actors = split_sweeps(drive.sweeps, tracks)
     if ground is None:
         ground = measure_from_classes(background.points, background.semantic, path)
     paths = [path, *(_path_in(track, path, times_ns) for track in tracks)]
     sampled = _sample_all([background, *actors], paths, options)
-    thinned = [(p, e, surfels_from_points(p.points, e, semantic=p.semantic)) for p, e in sampled]
-    bodies = [Body(s, t) for (_, _, s), t in zip(thinned, [None, *tracks], strict=True)]
-    gatherer = SkyGatherer(options.sky_size, math.radians(lidar_top_deg))
-    seen, faults = observe_views(bodies, views, gatherer, image_scale=options.image_scale)
-    gaussians = [_gaussians(*thing, colours) for thing, colours in zip(thinned, seen, strict=True)]
+    surfels = [surfels_from_points(p.points, e, semantic=p.semantic) for p, e in sampled]
+    bodies = [Body(*pair) for pair in zip(surfels, [None, *tracks], strict=True)]
+    sky = SkyGatherer(options.sky_size, math.radians(drive.lidar_top_deg))
+    views = views_of(drive.used, drive.used_rows)
+    seen, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
+    parts = [
+        _gaussians(*thing, found, *colours)
+        for thing, found, colours in zip(sampled, surfels, seen, strict=True)
+    ]
     if added is not None:
-        gaussians[0] = join_gaussians([gaussians[0], added])
-    if if_empty and not any(map(len, gaussians)):
-        raise AdapterError(if_empty)
+        parts[0] = join_gaussians([parts[0], added])
+    if not any(map(len, parts)):
+        raise AdapterError(
+            f"{drive.source}: none of the points that were measured is in any image; check that "
+            f"calibration, sweeps and images are of one drive, that camera axes are x right, y "
+            f"down, z forward, and that LiDAR and poses are in one world with z up"
+        )
     return Scene(
-        name=name,
-        source=source,
-        background=gaussians[0],
+        name=drive.name,
+        source=drive.source,
+        background=parts[0],
         actors=tuple(
-            Actor(track.track_id, track.label, g, track.track, tuple(map(float, track.size_m)))
-            for track, g in zip(tracks, gaussians[1:], strict=True)
-            if len(g)
+            Actor(track.track_id, track.label, part, track.track, tuple(map(float, track.size_m)))
+            for track, part in zip(tracks, parts[1:], strict=True)
+            if len(part)
         ),
-        sky=gatherer.finish(),
-        frames=frames,
-        labels=labels,
-        world_origin_m=world_origin_m,
+        sky=sky.finish(),
+        frames=drive.frames,
+        labels=drive.labels,
+        world_origin_m=drive.world_origin_m,
         ground_z_m=low_height(background, path) if ground is None else ground.lowest_z_m,
         ground=ground,
-        has_metric_scale=has_metric_scale,
-        problems=(*problems, *faults),
+        has_metric_scale=drive.has_metric_scale,
+        problems=(*drive.problems, *faults),
     )
 
 
@@ -153,25 +155,24 @@ def _sample_all(
     """Every thing thinned and its gaps filled with one voxel size, the smallest that respects
     max_gaussians. things: the world first. paths: the driven path in each one's frame."""
 
-    def sample(voxel_m: float) -> list[tuple[PointSet, np.ndarray]]:
+    def sample(voxel_m: float) -> tuple[list[tuple[PointSet, np.ndarray]], int]:
         sampled = [
             _sample(thing, path, voxel_m, is_world=i == 0)
             for i, (thing, path) in enumerate(zip(things, paths, strict=True))
         ]
-        logger.info("%d surfels at a voxel of %.3f m", _count(sampled), voxel_m)
-        return sampled
+        count = sum(len(points) for points, _ in sampled)
+        logger.info("%d surfels at a voxel of %.3f m", count, voxel_m)
+        return sampled, count
 
     # A coarse trial tells what the fine one needs: on surfaces the count goes with the square.
-    trial = _count(sample(_TRIAL * options.voxel_m))
+    _, trial = sample(_TRIAL * options.voxel_m)
     needed = 1.01 * _TRIAL * (trial / options.max_gaussians) ** 0.5
     voxel_m = options.voxel_m * max(1.0, needed)
-    while _count(sampled := sample(voxel_m)) > options.max_gaussians:
-        voxel_m *= max(1.02, (_count(sampled) / options.max_gaussians) ** 0.55)
-    return sampled
-
-
-def _count(sampled: Sequence[tuple[PointSet, np.ndarray]]) -> int:
-    return sum(len(points) for points, _ in sampled)
+    while True:
+        sampled, count = sample(voxel_m)
+        if count <= options.max_gaussians:
+            return sampled
+        voxel_m *= max(1.02, (count / options.max_gaussians) ** 0.55)
 
 
 def _sample(
@@ -195,8 +196,10 @@ def _path_in(track: ObjectTrack, path: np.ndarray, times_ns: np.ndarray) -> np.n
     return track.motion.into_actor(path[present], times_ns[present])
 
 
-def _gaussians(points: PointSet, edges: np.ndarray, surfels: Surfels, seen: Seen) -> Gaussians:
+def _gaussians(
+    points: PointSet, edges: np.ndarray, surfels: Surfels, colours: np.ndarray, seen: np.ndarray
+) -> Gaussians:
     reach = np.where(is_flat(points.semantic), np.float32(_BORROW_GROUND_M), _BORROW_EDGES * edges)
-    colours, known = borrow_colours(points.points, seen.colours, seen.seen, reach)
+    colours, known = borrow_colours(points.points, colours, seen, reach)
     keep = np.flatnonzero(known & ~surfels.isolated)
     return gaussians_from_surfels(surfels.select(keep), colours[keep], points.semantic[keep])

@@ -14,20 +14,16 @@ import dataclasses
 import io
 import zipfile
 import zlib
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from adapters.lidar_scene.scene import build_lidar_scene, views_of
-from adapters.lidar_scene.split import ObjectTrack, join_tracks
 from adapters.nuscenes.tables import (
-    Annotation,
     FrameFiles,
     NuScenesOptions,
     SceneTables,
@@ -35,19 +31,23 @@ from adapters.nuscenes.tables import (
     read_tables,
     scene_frames,
 )
-from adapters.plain_files import ImageFault, inside
+from adapters.plain_files import inside
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
+    Picture,
+    RawDrive,
     Sweep,
-    class_table,
-    classes_of,
+    TimedBoxes,
     drive_origin,
-    is_in_box,
-    objects_that_travel,
+    find_objects,
+    is_usable,
+    scene_of_drive,
+    some,
     stored_records,
+    usable_images,
+    world_classes,
 )
-from adapters.training_views.views import read_scaled
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
@@ -70,8 +70,7 @@ _STRAIGHT = 1e-9  # of the cosine: between nearly equal rotations a straight lin
 # The recording car with its sensors in its own frame (x forward, y left, z up, origin on the ground
 # below the rear axle). Measured on a published sweep: its returns on the car, a quarter of all, lie
 # in x -0.2..2.8, y -0.7..0.7, z 0.8..1.9; the car, 4.1 m by 1.8 m, reaches from -0.7 to 3.5.
-EGO_LOW_M = np.array([-0.8, -1.0, -0.5])
-EGO_HIGH_M = np.array([3.6, 1.0, 2.3])
+EGO_M = np.array([[-0.8, -1.0, -0.5], [3.6, 1.0, 2.3]])
 _EGO_CLASS = 31
 # lidarseg's classes as published, numbered from 0, and what they mean here.
 _S = SemanticClass
@@ -101,8 +100,7 @@ class SweepFault(Exception):
     """What is wrong with a sweep's file, as the end of a sentence that starts with its path."""
 
 
-@dataclass(frozen=True, eq=False)
-class Returns:
+class Returns(NamedTuple):
     """What one LiDAR file holds. points_m: float64 [N, 3], global. intensity, ring: float32 [N], as
     in the file. timestamps_ns: int64 [N], told by bearing. classes: uint8 [N], lidarseg's numbers,
     or None. problem: a sentence or ''."""
@@ -114,9 +112,6 @@ class Returns:
     classes: np.ndarray | None
     problem: str
 
-    def __len__(self) -> int:
-        return len(self.points_m)
-
 
 def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
     """All returns of a sweep, in the file's order.
@@ -124,7 +119,7 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
     Raises:
         SweepFault: no file, or not of whole records.
         AdapterError: the file's name leads outside of the dataset."""
-    content = _bytes(inside(tables.root, sweep.filename, f"sample_data {sweep.token!r}"))
+    content = _bytes(_path(tables, sweep))
     if len(content) == 0 or len(content) % RECORD_BYTES:
         raise SweepFault(
             f"is of {len(content)} bytes, not of whole records of {RECORD_BYTES}: it is cut short"
@@ -140,7 +135,7 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
     return Returns(points, times_ns, records[:, 3].copy(), records[:, 4].copy(), classes, problem)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class NuScenesLabels:
     """Labels of one scene: boxes from memory, sweeps read when asked.
 
@@ -180,7 +175,8 @@ class NuScenesLabels:
         return LidarSweep(columns)
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        return classes_of(sweep, _class_table(self.tables))
+        numbers = sweep.columns.get("semantic")
+        return None if numbers is None else world_classes(numbers, _class_meanings(self.tables))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """The sensor's place at the time of the file, to which its returns are compensated: within
@@ -207,7 +203,7 @@ class NuScenesLabels:
         if file.suffix == ".npz":
             return _panoptic_of(file, rows)
         content = np.fromfile(file, np.uint8)
-        if file != inside(self.tables.root, sensor.filename, f"sample_data {sensor.token!r}"):
+        if file != _path(self.tables, sensor):
             if rows.max(initial=-1) >= len(content):
                 raise AdapterError(
                     f"{file} has {len(content)} classes, fewer than {sensor.filename} has returns; "
@@ -219,56 +215,6 @@ class NuScenesLabels:
 
     def _frame(self, index: int) -> FrameFiles | None:
         return self.frames[index] if 0 <= index < len(self.frames) else None
-
-
-def read_sweeps(
-    tables: SceneTables,
-    frames: Sequence[FrameFiles],
-    world_origin_m: np.ndarray,
-    *,
-    held_out: Collection[int] = frozenset(),
-) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """The usable returns of every frame that has a file and is not held out, in the scene's world,
-    and what was missing. Left out: returns of the recording car, of no surface, not finite."""
-    sweeps, problems, missing = [], [], []
-    used = [frame for frame in frames if frame.index not in held_out]
-    table = _class_table(tables)
-    for frame in tqdm(used, desc="LiDAR", unit="sweep", disable=None):
-        try:
-            returns = read_returns(tables, frame.sweep)
-        except FileNotFoundError:
-            missing.append(frame)
-            continue
-        except SweepFault as fault:
-            problems.append(
-                f"frame {frame.index}: {frame.sweep.filename} {fault}; its points are left out"
-            )
-            continue
-        if returns.problem:
-            problems.append(f"frame {frame.index}: {returns.problem}")
-        sweeps.append(_usable(returns, frame.sweep, world_origin_m, table))
-    if missing:
-        problems.append(
-            f"{len(missing)} of {len(used)} LiDAR files are missing, their points too (the first: "
-            f"frame {missing[0].index}, {missing[0].sweep.filename})"
-        )
-    return tuple(sweeps), tuple(problems)
-
-
-def _usable(
-    returns: Returns, sweep: SensorFile, world_origin_m: np.ndarray, table: np.ndarray
-) -> Sweep:
-    pose = sweep.world_from_ego
-    keep = np.isfinite(returns.points_m).all(axis=1)
-    with np.errstate(all="ignore"):
-        ego = (returns.points_m - pose[:3, 3]) @ pose[:3, :3]
-    keep &= ~is_in_box(ego, EGO_LOW_M, EGO_HIGH_M)
-    semantic = np.full(len(returns), SemanticClass.UNKNOWN, np.int16)
-    if returns.classes is not None:
-        semantic = table[returns.classes]
-        keep &= (semantic != NO_SURFACE) & (returns.classes != _EGO_CLASS)
-    points = (returns.points_m[keep] - world_origin_m).astype(np.float32)
-    return Sweep(points, returns.timestamps_ns[keep], semantic[keep])
 
 
 def _bytes(path: Path) -> bytes:
@@ -302,10 +248,12 @@ def _read_classes(
     return classes, ""
 
 
-def _class_table(tables: SceneTables) -> np.ndarray:
-    """As class_table; where category.json numbers none, by the published numbers."""
-    numbered = tables.class_names or {n: name for n, (name, _) in enumerate(_CLASSES)}
-    return class_table(numbered, dict(_CLASSES))
+def _class_meanings(tables: SceneTables) -> dict[int, int]:
+    """SemanticClass or NO_SURFACE by number; by the published ones where category.json has none."""
+    if not tables.class_names:
+        return {number: meaning for number, (_, meaning) in enumerate(_CLASSES)}
+    meaning = dict(_CLASSES)
+    return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in tables.class_names.items()}
 
 
 def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
@@ -337,23 +285,23 @@ def boxes_of_sweep(tables: SceneTables, sweep: SensorFile) -> Boxes:
     """The boxes at a sweep's time, as in NuScenesLabels."""
     tokens = [sample.token for sample in tables.samples]
     number = tokens.index(sweep.sample_token)
-    sample = tables.samples[number]
+    sample, boxes = tables.samples[number], tables.samples[number].boxes
+    mark = {"interpolated": np.full(len(boxes), not sweep.is_key_frame)}
+    boxes = dataclasses.replace(boxes, attributes={**boxes.attributes, **mark})
     if sweep.is_key_frame or number == 0:
-        return _boxes(sample.annotations, interpolated=not sweep.is_key_frame)
+        return boxes
     before = tables.samples[number - 1]
-    earlier = {box.instance: box for box in before.annotations}
     span = sample.timestamp_ns - before.timestamp_ns
     fraction = (sweep.timestamp_ns - before.timestamp_ns) / span if span else 1.0
     fraction = min(max(fraction, 0.0), 1.0)
-    moved = []
-    for box in sample.annotations:
-        start = earlier.get(box.instance)
-        if start is not None:
-            center_m = start.center_m + fraction * (box.center_m - start.center_m)
-            quat = slerp(start.quat, box.quat, fraction)
-            box = dataclasses.replace(box, center_m=center_m, quat=quat)
-        moved.append(box)
-    return _boxes(moved, interpolated=True)
+    earlier = {name: i for i, name in enumerate(before.boxes.track_ids)}
+    centers_m, quats = boxes.centers_m.copy(), boxes.quats.copy()
+    for i, name in enumerate(boxes.track_ids):
+        if name in earlier:
+            start = before.boxes.centers_m[earlier[name]]
+            centers_m[i] = start + fraction * (boxes.centers_m[i] - start)
+            quats[i] = slerp(before.boxes.quats[earlier[name]], boxes.quats[i], fraction)
+    return dataclasses.replace(boxes, centers_m=centers_m, quats=quats)
 
 
 def slerp(a: np.ndarray, b: np.ndarray, fraction: float) -> np.ndarray:
@@ -370,25 +318,6 @@ def slerp(a: np.ndarray, b: np.ndarray, fraction: float) -> np.ndarray:
     return quat / np.linalg.norm(quat)
 
 
-def _boxes(annotations: Sequence[Annotation], *, interpolated: bool) -> Boxes:
-    count = len(annotations)
-    return Boxes(
-        track_ids=tuple(a.instance for a in annotations),
-        labels=tuple(a.category for a in annotations),
-        centers_m=np.array([a.center_m for a in annotations], np.float64).reshape(count, 3),
-        sizes_m=np.array([a.size_m for a in annotations], np.float64).reshape(count, 3),
-        quats=np.array([a.quat for a in annotations], np.float64).reshape(count, 4),
-        attributes={
-            "token": np.array([a.token for a in annotations], object),
-            "attributes": np.array([",".join(a.attributes) for a in annotations], object),
-            "visibility": np.array([a.visibility for a in annotations], object),
-            "num_lidar_pts": np.array([a.lidar_points for a in annotations], np.int64),
-            "num_radar_pts": np.array([a.radar_points for a in annotations], np.int64),
-            "interpolated": np.full(count, interpolated),
-        },
-    )
-
-
 # ---- The scene -----------------------------------------------------------------------------------
 
 _MOVING = ("vehicle.moving", "pedestrian.moving", "cycle.with_rider")
@@ -396,8 +325,6 @@ _LIDAR_TOP_DEG = 10.67  # the sensor's uppermost channel
 # The back camera looks over the recording car's own edge, which on a published image begins at row
 # 854 of 900.
 _ROWS_ABOVE_CAR = {"CAM_BACK": 0.945}
-_CHECK_SCALE = 0.125
-_MAX_FAULTS = 3  # sentences about one camera's images; more become one
 
 
 def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
@@ -413,146 +340,125 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
             LiDAR, no image, or a camera all of whose images are damaged. Single images and sweeps
             that are missing or damaged are Scene.problems."""
     options = NuScenesOptions.from_query("nuscenes", query)
+    return scene_of_drive(read_nuscenes(path, query, options), options)
+
+
+def read_nuscenes(path: str, query: dict[str, str], options: NuScenesOptions) -> RawDrive:
+    """The frames of the scene that the options ask for, with their sweeps and boxes."""
     tables = read_tables(Path(path), options.version, options.scene)
     files, unused = scene_frames(tables, sweeps=options.sweeps == "1")
     where = f"nuscenes:{path}, scene {tables.name}"
     if not files:
         raise AdapterError(f"{where} has no keyframe of LIDAR_TOP; sweeps=1 takes its sweeps")
     chosen = options.select(range(len(files)), where=where)
-    used = [files[number] for number in chosen.numbers]
+    own = [files[number] for number in chosen.numbers]
     origin = drive_origin(np.array([file.sweep.world_from_ego[:3, 3] for file in files]))
-    sweeps, lidar_problems = read_sweeps(tables, used, origin, held_out=chosen.held_out)
-    if sum(len(sweep) for sweep in sweeps) == 0:
-        raise AdapterError(
-            f"{where}: no LiDAR returns in {_span(used)}; a scene cannot be built without them, "
-            f"unpack samples/LIDAR_TOP and sweeps/LIDAR_TOP" + _first(lidar_problems)
-        )
-    usable, image_problems = _usable_images(tables, used)
-    frames = tuple(_frame(file, origin, usable) for file in used)
-    views = views_of((f for f in frames if f.index not in chosen.held_out), _ROWS_ABOVE_CAR)
-    if not views:
-        but = " but those held out" if chosen.held_out else ""
-        raise AdapterError(
-            f"{where}: no usable image in {_span(used)}{but}, and colours come from images; choose "
-            f"more frames, or unpack samples/CAM_* and sweeps/CAM_*" + _first(image_problems)
-        )
-    return build_lidar_scene(
-        sweeps,
-        read_tracks(tables, used, origin),
-        views,
-        options,
-        lidar_top_deg=_LIDAR_TOP_DEG,
+    pictures = [
+        Picture(channel, f.index, _path(tables, image), image.size)
+        for f in own
+        for channel, image in sorted(f.images.items())
+    ]
+    images = usable_images(pictures)
+    frames = tuple(_frame(file, origin, images.paths.get(file.index, {})) for file in own)
+    sweeps, problems = read_sweeps(tables, [files[n] for n in chosen.used], origin)
+    return RawDrive(
         name=tables.name,
         source=format_uri("nuscenes", path, query),
         frames=frames,
+        held_out=chosen.held_out,
+        sweeps=sweeps,
+        boxes=moving_boxes(tables, own, origin),
         labels=NuScenesLabels(tables, files),
         world_origin_m=origin,
-        problems=unused + chosen.problems + lidar_problems + image_problems,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        problems=unused + chosen.problems + problems + images.problems,
+        used_rows=_ROWS_ABOVE_CAR,
     )
 
 
-def read_tracks(
+def _path(tables: SceneTables, file: SensorFile) -> Path:
+    return inside(tables.root, file.filename, f"sample_data {file.token!r}")
+
+
+def _frame(file: FrameFiles, origin: np.ndarray, paths: Mapping[str, str]) -> Frame:
+    def recentred(pose: np.ndarray) -> torch.Tensor:
+        pose = pose.copy()
+        pose[:3, 3] -= origin
+        return torch.from_numpy(pose)
+
+    return Frame(
+        index=file.index,
+        timestamp_ns=file.sweep.timestamp_ns,
+        world_from_ego=recentred(file.sweep.world_from_ego),
+        cameras={
+            name: Camera(
+                name,
+                *image.size,
+                *image.intrinsic,
+                camera_from_world=invert_rigid(recentred(image.world_from_sensor)),
+                timestamp_ns=image.timestamp_ns,
+            )
+            for name, image in sorted(file.images.items())
+        },
+        image_paths=paths,
+    )
+
+
+def read_sweeps(
     tables: SceneTables, frames: Sequence[FrameFiles], world_origin_m: np.ndarray
-) -> tuple[ObjectTrack, ...]:
-    """The moving objects around the given frames, in the scene's world.
+) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
+    """The usable returns of every frame that has a file, in the scene's world, and what was
+    missing. Left out: returns of the recording car, of no surface, not finite."""
+    sweeps, problems, missing = [], [], []
+    meaning = _class_meanings(tables) | {_EGO_CLASS: NO_SURFACE}
+    for frame in tqdm(frames, desc="LiDAR", unit="sweep", disable=None):
+        try:
+            returns = read_returns(tables, frame.sweep)
+        except FileNotFoundError:
+            missing.append(frame.index)
+            continue
+        except SweepFault as fault:
+            problems.append(
+                f"frame {frame.index}: {frame.sweep.filename} {fault}; its points are left out"
+            )
+            continue
+        if returns.problem:
+            problems.append(f"frame {frame.index}: {returns.problem}")
+        unknown = np.full(len(returns.points_m), SemanticClass.UNKNOWN, np.int16)
+        classes = returns.classes
+        semantic = unknown if classes is None else world_classes(classes, meaning)
+        with np.errstate(over="ignore"):  # of returns that are no numbers
+            points = (returns.points_m - world_origin_m).astype(np.float32)
+        sweep = Sweep(points, returns.timestamps_ns, semantic)
+        keep = is_usable(sweep, returns.points_m, frame.sweep.world_from_ego, EGO_M)
+        sweeps.append(sweep.select(keep))
+    if missing:
+        problems.append(f"the LiDAR's files of {some(missing)} are missing, their points too")
+    return tuple(sweeps), tuple(problems)
+
+
+def moving_boxes(
+    tables: SceneTables, frames: Sequence[FrameFiles], world_origin_m: np.ndarray
+) -> tuple[BoxSample, ...]:
+    """The boxes of moving objects around the given frames, in the scene's world.
 
     An object moves if any of its boxes in the whole scene says so, or if it travels. Boxes are
     those of the keyframes around the frames' times, each at the time that the LiDAR met it."""
-    annotations = [box for sample in tables.samples for box in sample.annotations]
-    moving = {b.instance for b in annotations if any(name in _MOVING for name in b.attributes)}
-    moving |= objects_that_travel((box.instance, box.center_m) for box in annotations)
+    sweeps = {file.sample_token: file for file in tables.lidar if file.is_key_frame}
+    timed = []
+    for number, sample in enumerate(tables.samples):
+        boxes, sweep = sample.boxes, sweeps.get(sample.token)
+        times_ns = np.full(len(boxes), sample.timestamp_ns)
+        if sweep is not None:  # when it met the box
+            offsets = boxes.centers_m - sweep.world_from_sensor[:3, 3]
+            times_ns -= tables.turn.before_ns(offsets @ sweep.world_from_ego[:3, :3])
+        named = [text.split(",") for text in boxes.attributes["attributes"]]
+        moves = np.array([any(name in _MOVING for name in names) for names in named], bool)
+        turns = Rotation.from_quat(boxes.quats[:, [1, 2, 3, 0]]).as_matrix() if named else None
+        timed.append(TimedBoxes(number, boxes, times_ns, moves, turns))
+    moving = find_objects(timed, world_origin_m, several=True).moving
     first, last = frames[0].sweep.timestamp_ns, frames[-1].sweep.timestamp_ns
     times = [sample.timestamp_ns for sample in tables.samples]
     start = max((i for i, time in enumerate(times) if time <= first), default=0)
     stop = min((i for i, time in enumerate(times) if time >= last), default=len(times) - 1)
-    sweeps = {file.sample_token: file for file in tables.lidar if file.is_key_frame}
-    samples = []
-    for number in range(start, stop + 1):
-        sample = tables.samples[number]
-        sweep = sweeps.get(sample.token)
-        for box in sample.annotations:
-            if box.instance not in moving:
-                continue
-            w, x, y, z = box.quat
-            pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-            pose[:3, 3] = box.center_m - world_origin_m
-            time_ns = sample.timestamp_ns
-            if sweep is not None:  # when it met the box
-                offset = box.center_m - sweep.world_from_sensor[:3, 3]
-                direction = offset @ sweep.world_from_ego[:3, :3]
-                time_ns -= int(tables.turn.before_ns(direction[None])[0])
-            samples.append(
-                BoxSample(box.instance, None, box.category, number, time_ns, pose, box.size_m)
-            )
-    return join_tracks(samples)
-
-
-def _span(frames: Sequence[FrameFiles]) -> str:
-    first, last = frames[0].index, frames[-1].index
-    return f"frame {first}" if first == last else f"frames {first} to {last}"
-
-
-def _first(problems: Sequence[str]) -> str:
-    return "".join(f" ({problem})" for problem in problems[:1])
-
-
-def _usable_images(
-    tables: SceneTables, frames: Sequence[FrameFiles]
-) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The images that can be used, by token; what is wrong with others, one sentence each."""
-    paths: dict[str, Path] = {}
-    problems: list[str] = []
-    for channel in tables.images:
-        of_camera = [(f.index, f.images[channel]) for f in frames if channel in f.images]
-        faults, damaged = [], 0
-        for index, image in of_camera:
-            path = inside(tables.root, image.filename, f"sample_data {image.token!r}")
-            try:
-                camera = _camera(image, np.zeros(3))
-                read_scaled(path, camera, camera.scaled(_CHECK_SCALE))
-            except ImageFault as fault:
-                faults.append(f"camera {channel}, frame {index}: image {image.filename} {fault}")
-                damaged += path.exists()
-            else:
-                paths[image.token] = path
-        if damaged and len(faults) == len(of_camera):
-            raise AdapterError(
-                f"{tables.root / tables.version}, scene {tables.name}: none of the {len(faults)} "
-                f"images of {channel} can be used; {faults[0]}; unpack them again"
-            )
-        if len(faults) > _MAX_FAULTS:
-            faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(of_camera)}: left out"]
-        problems += faults
-    return paths, tuple(problems)
-
-
-def _frame(file: FrameFiles, origin: np.ndarray, usable: dict[str, Path]) -> Frame:
-    images = dict(sorted(file.images.items()))
-    world_from_ego = file.sweep.world_from_ego.copy()
-    world_from_ego[:3, 3] -= origin
-    return Frame(
-        index=file.index,
-        timestamp_ns=file.sweep.timestamp_ns,
-        world_from_ego=torch.from_numpy(world_from_ego),
-        cameras={name: _camera(image, origin) for name, image in images.items()},
-        image_paths={
-            name: str(usable[image.token])
-            for name, image in images.items()
-            if image.token in usable
-        },
-    )
-
-
-def _camera(image: SensorFile, origin: np.ndarray) -> Camera:
-    assert image.intrinsic is not None
-    world_from_camera = image.world_from_sensor
-    world_from_camera[:3, 3] -= origin
-    return Camera(
-        image.channel,
-        image.width,
-        image.height,
-        *image.intrinsic,
-        camera_from_world=invert_rigid(torch.from_numpy(world_from_camera)),
-        timestamp_ns=image.timestamp_ns,
-    )
+    return tuple(box for box in moving if start <= box.frame <= stop)

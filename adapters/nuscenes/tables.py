@@ -26,15 +26,16 @@ import re
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, FailFast, Field
 from scipy.spatial.transform import Rotation
 
-from adapters.plain_files import LARGEST, array_of, inside
+from adapters.plain_files import Number, Text, inside, validated
 from adapters.raw_drive import DriveOptions
 from augment.errors import AdapterError
+from augment.labels import Boxes
 from recipes.files import open_file
 
 _CHUNK = 1 << 22  # characters read at a time
@@ -51,11 +52,90 @@ _NEAR_NS = 100_000_000
 LIDAR = "LIDAR_TOP"
 _MAX_NAMES = 10  # that a message lists
 
+# ---- What rows must hold; later editions may have more fields ------------------------------------
 
-@dataclass(frozen=True)
-class Row:
-    """One row. path: its table. fields: as in the file, of which later editions may have more. All
-    readers raise AdapterError, naming table, row and field, where a field is missing or wrong."""
+_Model = TypeVar("_Model", bound=BaseModel)
+_Found = TypeVar("_Found")
+_Vector = tuple[Number, Number, Number]
+_Count = Annotated[int, Field(strict=True, ge=0, lt=2**62)]
+_Pixels = Annotated[_Count, Field(ge=1)]
+_Length = Annotated[Number, Field(gt=0)]
+
+
+def _unit(quat: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(float(np.linalg.norm(quat)) - 1) > _UNIT_TOLERANCE:
+        raise ValueError("must be a quaternion wxyz of length 1")
+    return quat
+
+
+def _pinhole(matrix: tuple[_Vector, _Vector, _Vector]) -> tuple[float, float, float, float]:
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    plain = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if min(fx, fy) <= 0 or not np.allclose(matrix, plain, rtol=0, atol=1e-6):
+        raise ValueError("must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0")
+    return fx, fy, cx, cy
+
+
+def _whole(time: object) -> object:
+    """Some converters write the same number as a float."""
+    return int(time) if isinstance(time, float) and time.is_integer() else time
+
+
+class _Timed(BaseModel):
+    """timestamp: microseconds."""
+
+    timestamp: Annotated[_Count, Field(gt=0, lt=2**62 // 1000), BeforeValidator(_whole)]
+
+
+class _Posed(BaseModel):
+    """translation: metres."""
+
+    translation: _Vector
+    rotation: Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
+
+    def pose(self) -> np.ndarray:
+        """float64 [4, 4]."""
+        w, x, y, z = self.rotation
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+        pose[:3, 3] = self.translation
+        return pose
+
+
+class _Camera(_Posed):
+    camera_intrinsic: Annotated[tuple[_Vector, _Vector, _Vector], AfterValidator(_pinhole)]
+
+
+class _Data(_Timed):
+    sample_token: Text
+    filename: Text
+    is_key_frame: Annotated[bool, Field(strict=True)]
+
+
+class _Image(_Data):
+    width: _Pixels
+    height: _Pixels
+
+
+class _Annotation(_Posed):
+    """size: width, length, height, metres."""
+
+    size: tuple[_Length, _Length, _Length]
+    attribute_tokens: Annotated[list[Text], FailFast()]
+    num_lidar_pts: _Count
+    num_radar_pts: _Count
+
+
+class _Category(BaseModel):
+    name: Text
+    index: _Count | None = None  # tables without lidarseg do not number them
+
+
+# ---- Tables --------------------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """One row as in the file. path: its table."""
 
     path: Path
     number: int
@@ -63,83 +143,30 @@ class Row:
 
     def __str__(self) -> str:
         name = self.fields.get("token")
-        return f"{self.path}: row {name!r}" if isinstance(name, str) else self._numbered
-
-    @property
-    def _numbered(self) -> str:
-        return f"{self.path}: row number {self.number}"
+        named = repr(name) if isinstance(name, str) and name else f"number {self.number}"
+        return f"{self.path}: row {named}"
 
     @property
     def token(self) -> str:
         token = self.text("token")
         if not token:
-            raise AdapterError(f"{self._numbered}: field 'token' must not be empty")
+            raise self.fault("token", "a text that is not empty")
         return token
-
-    def fault(self, field: str, expected: str) -> AdapterError:
-        """The error that the field is not what was expected."""
-        try:
-            got = repr(self.fields[field]) if field in self.fields else "no such field"
-        except RecursionError:
-            got = "lists in lists"
-        got = got if len(got) <= 200 else got[:200] + "…"
-        return AdapterError(f"{self}: field {field!r} must be {expected}; got {got}")
 
     def text(self, field: str) -> str:
         value = self.fields.get(field)
-        if not _is_text(value):
-            raise self.fault(field, "a text")
-        return value
+        # Half a pair of surrogates, as JSON can have, cannot be written again.
+        if isinstance(value, str) and (value.isascii() or not re.search("[\ud800-\udfff]", value)):
+            return value
+        raise self.fault(field, "a text")
 
-    def texts(self, field: str) -> tuple[str, ...]:
-        value = self.fields.get(field)
-        if not isinstance(value, list) or not all(map(_is_text, value)):
-            raise self.fault(field, "a list of texts")
-        return tuple(value)
+    def read(self, model: type[_Model]) -> _Model:
+        return validated(model, self.fields, str(self))
 
-    def integer(self, field: str, *, low: int = 0) -> int:
-        value = self.fields.get(field)
-        if type(value) is not int or not low <= value < 2**62:
-            raise self.fault(field, f"an integer of at least {low}")
-        return value
-
-    def nanoseconds(self) -> int:
-        """The field `timestamp`, which the table has in microseconds."""
-        value = self.fields.get("timestamp")
-        # Some converters write the same number as a float.
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-        if type(value) is not int or not 0 < value < 2**62 // 1000:
-            raise self.fault("timestamp", "a time in microseconds, a whole number above 0")
-        return value * 1000
-
-    def flag(self, field: str) -> bool:
-        value = self.fields.get(field)
-        if not isinstance(value, bool):
-            raise self.fault(field, "true or false")
-        return value
-
-    def numbers(self, field: str, count: int) -> np.ndarray:
-        """float64 [count], finite."""
-        value = self.fields.get(field)
-        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
-            raise self.fault(field, f"a list of {count} finite numbers of at most {LARGEST:g}")
-        return np.array(value, np.float64)
-
-    def quaternion(self) -> np.ndarray:
-        """The field `rotation`, wxyz, as it is: float64 [4]."""
-        quat = self.numbers("rotation", 4)
-        if abs(float(np.linalg.norm(quat)) - 1) > _UNIT_TOLERANCE:
-            raise self.fault("rotation", "a quaternion wxyz of length 1")
-        return quat
-
-    def pose(self) -> np.ndarray:
-        """The fields `translation` (metres) and `rotation`, float64 [4, 4]."""
-        w, x, y, z = self.quaternion()
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-        pose[:3, 3] = self.numbers("translation", 3)
-        return pose
+    def fault(self, field: str, expected: str) -> AdapterError:
+        """The error that the field is not what was expected."""
+        got = f"{self.fields[field]!r:.200}" if field in self.fields else "no such field"
+        return AdapterError(f"{self}: field {field!r} must be {expected}; got {got}")
 
 
 def read_rows(path: Path) -> Iterator[Row]:
@@ -171,7 +198,7 @@ def read_table(
     return kept
 
 
-def referred(row: Row, field: str, table: dict[str, Row], name: str) -> Row:
+def referred(row: Row, field: str, table: Mapping[str, _Found], name: str) -> _Found:
     """The row that a field names by its token. name: the table's, for the message."""
     found = table.get(row.text(field))
     if found is None:
@@ -212,17 +239,6 @@ def _rows(path: Path, file: Any) -> Iterator[Row]:
             )
         yield Row(path, number, fields)
         number += 1
-
-
-def _is_finite(value: object) -> bool:
-    return type(value) in (int, float) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
-
-
-def _is_text(value: object) -> TypeGuard[str]:
-    """Whether a text can be written again: half a pair of surrogates, as JSON can have, cannot."""
-    if not isinstance(value, str):
-        return False
-    return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
 @dataclass(frozen=True)
@@ -270,8 +286,8 @@ class SensorFile:
     """One image or sweep: a row of sample_data and what it refers to.
 
     filename: relative to the dataset's folder, inside it. world_from_ego, ego_from_sensor: float64
-    [4, 4], at the file's own time. intrinsic: fx, fy, cx, cy, pixels; None of a LiDAR. width,
-    height: pixels; 0 of a LiDAR."""
+    [4, 4], at the file's own time. intrinsic: fx, fy, cx, cy, pixels, and size: width, height, both
+    None of a LiDAR."""
 
     token: str
     sample_token: str
@@ -282,8 +298,7 @@ class SensorFile:
     world_from_ego: np.ndarray
     ego_from_sensor: np.ndarray
     intrinsic: tuple[float, float, float, float] | None
-    width: int
-    height: int
+    size: tuple[int, int] | None
 
     @property
     def world_from_sensor(self) -> np.ndarray:
@@ -291,29 +306,12 @@ class SensorFile:
 
 
 @dataclass(frozen=True, eq=False)
-class Annotation:
-    """One box of a keyframe, as in sample_annotation. center_m, quat (wxyz): global. size_m:
-    length, width, height. attributes, visibility: names, the latter '' where not known."""
-
-    token: str
-    instance: str
-    category: str
-    center_m: np.ndarray
-    size_m: np.ndarray
-    quat: np.ndarray
-    attributes: tuple[str, ...]
-    visibility: str
-    lidar_points: int
-    radar_points: int
-
-
-@dataclass(frozen=True, eq=False)
 class Sample:
-    """A keyframe and its boxes."""
+    """A keyframe and its boxes, with the attributes that NuScenesLabels says but `interpolated`."""
 
     token: str
     timestamp_ns: int
-    annotations: tuple[Annotation, ...]
+    boxes: Boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,7 +352,8 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         )
     cameras = sorted({file.channel for file in files if file.intrinsic is not None})
     images = {name: tuple(f for f in files if f.channel == name) for name in cameras}
-    categories = read_table(folder / "category.json")
+    rows = read_table(folder / "category.json")
+    categories = {token: row.read(_Category) for token, row in rows.items()}
     return SceneTables(
         root=root,
         version=folder.name,
@@ -364,12 +363,7 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         images=images,
         semantic_files=_files_of_sweeps(root, folder / "lidarseg.json", lidar),
         panoptic_files=_files_of_sweeps(root, folder / "panoptic.json", lidar),
-        # Tables without lidarseg do not number their categories.
-        class_names={
-            row.integer("index"): row.text("name")
-            for row in categories.values()
-            if "index" in row.fields
-        },
+        class_names={c.index: c.name for c in categories.values() if c.index is not None},
         turn=_read_turn(lidar, images),
     )
 
@@ -428,101 +422,97 @@ def _listed(names: list[str]) -> str:
 
 
 def _read_files(root: Path, folder: Path, samples: Mapping[str, Row]) -> tuple[SensorFile, ...]:
+    """The images, and the sweeps of LIDAR, of the keyframes and between them, in order of time."""
     sensors = read_table(folder / "sensor.json")
     calibrations = read_table(folder / "calibrated_sensor.json")
-    channels: dict[str, Row] = {}
+    channels: dict[str, tuple[str, _Posed]] = {}  # by calibration, of those sensors alone
     for token, row in calibrations.items():
         sensor = referred(row, "sensor_token", sensors, "sensor")
-        if sensor.text("channel") == LIDAR or sensor.text("modality") == "camera":
-            channels[token] = sensor
+        is_camera = sensor.text("modality") == "camera"
+        if is_camera or sensor.text("channel") == LIDAR:
+            channels[token] = sensor.text("channel"), row.read(_Camera if is_camera else _Posed)
     rows: dict[str, Row] = {}
     for token, row in read_table(folder / "sample_data.json", "sample_token", samples).items():
         referred(row, "calibrated_sensor_token", calibrations, "calibrated_sensor")
-        if row.text("calibrated_sensor_token") in channels:  # not a radar's
+        if row.text("calibrated_sensor_token") in channels:
             rows[token] = row
     pose_tokens = {row.text("ego_pose_token") for row in rows.values()}
     poses = read_table(folder / "ego_pose.json", "token", pose_tokens)
     files = []
     for row in rows.values():
-        calibration = calibrations[row.text("calibrated_sensor_token")]
-        pose = referred(row, "ego_pose_token", poses, "ego_pose")
-        files.append(_sensor_file(root, row, calibration, channels[calibration.token], pose))
+        channel, calibration = channels[row.text("calibrated_sensor_token")]
+        is_camera = isinstance(calibration, _Camera)
+        data = row.read(_Image if is_camera else _Data)
+        inside(root, data.filename, f"{row}: field 'filename'")
+        files.append(
+            SensorFile(
+                token=row.token,
+                sample_token=data.sample_token,
+                channel=channel,
+                filename=data.filename,
+                is_key_frame=data.is_key_frame,
+                timestamp_ns=data.timestamp * 1000,
+                world_from_ego=referred(row, "ego_pose_token", poses, "ego_pose")
+                .read(_Posed)
+                .pose(),
+                ego_from_sensor=calibration.pose(),
+                intrinsic=calibration.camera_intrinsic if is_camera else None,
+                size=(data.width, data.height) if isinstance(data, _Image) else None,
+            )
+        )
     return tuple(sorted(files, key=lambda file: file.timestamp_ns))
 
 
-def _sensor_file(root: Path, row: Row, calibration: Row, sensor: Row, pose: Row) -> SensorFile:
-    is_camera = sensor.text("modality") == "camera"
-    name = row.text("filename")
-    inside(root, name, f"{row}: field 'filename'")
-    return SensorFile(
-        token=row.token,
-        sample_token=row.text("sample_token"),
-        channel=sensor.text("channel"),
-        filename=name,
-        is_key_frame=row.flag("is_key_frame"),
-        timestamp_ns=row.nanoseconds(),
-        world_from_ego=pose.pose(),
-        ego_from_sensor=calibration.pose(),
-        intrinsic=_intrinsic(calibration) if is_camera else None,
-        width=row.integer("width", low=1) if is_camera else 0,
-        height=row.integer("height", low=1) if is_camera else 0,
-    )
-
-
-def _intrinsic(row: Row) -> tuple[float, float, float, float]:
-    expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
-    matrix = array_of(row.fields.get("camera_intrinsic"))
-    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise row.fault("camera_intrinsic", expected)
-    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    plain = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    if min(fx, fy) <= 0 or not np.allclose(matrix, plain, rtol=0, atol=1e-6):
-        raise row.fault("camera_intrinsic", expected)
-    return float(fx), float(fy), float(cx), float(cy)
-
-
 def _read_samples(
-    folder: Path, samples: Mapping[str, Row], categories: dict[str, Row]
+    folder: Path, samples: Mapping[str, Row], categories: Mapping[str, _Category]
 ) -> tuple[Sample, ...]:
     rows = read_table(folder / "sample_annotation.json", "sample_token", samples)
     instance_tokens = {row.text("instance_token") for row in rows.values()}
     instances = read_table(folder / "instance.json", "token", instance_tokens)
-    attributes = read_table(folder / "attribute.json")
-    visibilities = read_table(folder / "visibility.json")
-    by_sample: dict[str, list[Annotation]] = {token: [] for token in samples}
+    names = {
+        token: row.text("name") for token, row in read_table(folder / "attribute.json").items()
+    }
+    levels = {t: row.text("level") for t, row in read_table(folder / "visibility.json").items()}
+    by_sample: dict[str, list[tuple[Any, ...]]] = {token: [] for token in samples}
     for row in rows.values():
         instance = referred(row, "instance_token", instances, "instance")
+        category = referred(instance, "category_token", categories, "category")
         visibility = row.text("visibility_token")
-        if visibility and visibility not in visibilities:
+        if visibility and visibility not in levels:
             raise row.fault("visibility_token", "the token of a row of visibility.json, or empty")
-        names = row.texts("attribute_tokens")
-        if not all(name in attributes for name in names):
+        box = row.read(_Annotation)
+        if not all(name in names for name in box.attribute_tokens):
             raise row.fault("attribute_tokens", "tokens of rows of attribute.json")
+        width, length, height = box.size
         by_sample[row.text("sample_token")].append(
-            Annotation(
-                token=row.token,
-                instance=instance.token,
-                category=referred(instance, "category_token", categories, "category").text("name"),
-                center_m=row.numbers("translation", 3),
-                size_m=_size(row),
-                quat=row.quaternion(),
-                attributes=tuple(attributes[name].text("name") for name in names),
-                visibility=visibilities[visibility].text("level") if visibility else "",
-                lidar_points=row.integer("num_lidar_pts"),
-                radar_points=row.integer("num_radar_pts"),
+            (
+                *(instance.token, category.name, box.translation, (length, width, height)),
+                *(box.rotation, row.token, ",".join(names[name] for name in box.attribute_tokens)),
+                *(levels[visibility] if visibility else "", box.num_lidar_pts, box.num_radar_pts),
             )
         )
     read = [
-        Sample(token, row.nanoseconds(), tuple(by_sample[token])) for token, row in samples.items()
+        Sample(token, row.read(_Timed).timestamp * 1000, _boxes(by_sample[token]))
+        for token, row in samples.items()
     ]
     return tuple(sorted(read, key=lambda sample: sample.timestamp_ns))
 
 
-def _size(row: Row) -> np.ndarray:
-    width, length, height = row.numbers("size", 3)
-    if min(width, length, height) <= 0:
-        raise row.fault("size", "width, length and height above 0 (metres)")
-    return np.array([length, width, height])
+def _boxes(rows: Sequence[tuple[Any, ...]]) -> Boxes:
+    names, labels, *columns = zip(*rows, strict=True) if rows else [()] * 10
+    kinds = {"token": object, "attributes": object, "visibility": object}
+    kinds |= {"num_lidar_pts": np.int64, "num_radar_pts": np.int64}
+    return Boxes(
+        names,
+        labels,
+        centers_m=np.array(columns[0], np.float64).reshape(-1, 3),
+        sizes_m=np.array(columns[1], np.float64).reshape(-1, 3),
+        quats=np.array(columns[2], np.float64).reshape(-1, 4),
+        attributes={
+            name: np.array(column, kind)
+            for (name, kind), column in zip(kinds.items(), columns[3:], strict=True)
+        },
+    )
 
 
 def _files_of_sweeps(root: Path, path: Path, lidar: Sequence[SensorFile]) -> dict[str, str]:

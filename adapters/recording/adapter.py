@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from adapters.lidar_scene.depth import sweep_times, whole_numbers
 from adapters.lidar_scene.image_views import View, read_image
-from adapters.lidar_scene.scene import build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.scene import views_of, without_points
 from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
 from adapters.plain_files import LARGEST
@@ -36,11 +36,15 @@ from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
     DriveOptions,
+    RawDrive,
     RecordedObjects,
     Sweep,
     TimedBoxes,
+    find_objects,
     is_in_box,
-    read_objects,
+    scene_of_drive,
+    some,
+    world_classes,
 )
 from adapters.recording.files import (
     CALIBRATION,
@@ -84,6 +88,13 @@ _TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
 _TOP_DEG = (2.0, 60.0)
 
 
+class FrameBoxes(NamedTuple):
+    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there; None: the frame's."""
+
+    boxes: Boxes
+    timestamps_ns: np.ndarray | None
+
+
 @dataclass(frozen=True)
 class RecordingLabels:
     """Labels of one recording, read when asked, in the recording's own world."""
@@ -109,11 +120,11 @@ class RecordingLabels:
         """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
         mean anything."""
         column = sweep.columns.get("semantic")
-        if column is None:
+        if column is None or len(column) == 0:
             return None
         numbers = class_numbers(self.root / "lidar", column)
-        table, _ = class_table(self.root, np.unique(numbers), read_lidar_classes(self.root))
-        return None if table is None else table[numbers]
+        meaning, _ = class_meanings(read_lidar_classes(self.root), [numbers])
+        return None if meaning is None else world_classes(numbers, meaning)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """The columns origin_x, origin_y, origin_z, in the world of the returns, where all three
@@ -136,12 +147,12 @@ def lidar_files(root: Path) -> dict[int, Path]:
     return numbered_files(root.parent if is_variant else root, SWEEPS, (".parquet",))
 
 
-def all_boxes(root: Path) -> dict[int, TimedBoxes]:
+def all_boxes(root: Path) -> dict[int, FrameBoxes]:
     """The boxes of every frame that has any: of labels/boxes.parquet, or of a job's blocks, each of
     which has all boxes of its frames."""
     path = root / "labels" / "boxes.parquet"
     one = [inside(root, path)] if path.exists() else None
-    found: dict[int, TimedBoxes] = {}
+    found: dict[int, FrameBoxes] = {}
     for path in one or block_files(root, "labels/boxes", ".parquet"):
         found = read_frame_boxes(path) | found
     return found
@@ -181,10 +192,10 @@ def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
     return _reading(path, "a LiDAR file with columns x, y, z", content)
 
 
-def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
+def read_frame_boxes(path: Path) -> dict[int, FrameBoxes]:
     """The boxes of every frame that has any."""
 
-    def read() -> dict[int, TimedBoxes]:
+    def read() -> dict[int, FrameBoxes]:
         state = path.stat()
         return _read_boxes(path, state.st_mtime_ns, state.st_size)
 
@@ -192,10 +203,10 @@ def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
 
 
 @lru_cache(maxsize=_CACHED_FILES)
-def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, TimedBoxes]:
+def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, FrameBoxes]:
     if is_ours(path):
         return {
-            number: TimedBoxes(f.boxes, np.full(len(f.boxes), f.timestamp_ns, np.int64))
+            number: FrameBoxes(f.boxes, np.full(len(f.boxes), f.timestamp_ns, np.int64))
             for number, f in read_boxes(path).items()
         }
     table = read_table(path, str(path))
@@ -210,14 +221,14 @@ def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, TimedBoxe
     return {int(n): _boxes_at(columns, rows) for n, rows in zip(numbers, parts, strict=True)}
 
 
-def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> TimedBoxes:
+def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> FrameBoxes:
     vectors = {
         field: np.stack([columns[name][rows].astype(np.float64) for name in names], axis=1)
         for field, names in _VECTORS.items()
     }
     times = columns.get("timestamp_ns")
     used = {*_REQUIRED, "timestamp_ns"}
-    return TimedBoxes(
+    return FrameBoxes(
         Boxes(
             tuple(str(value) for value in columns["track_id"][rows]),
             tuple(str(value) for value in columns["label"][rows]),
@@ -253,37 +264,26 @@ def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
         raise AdapterError(f"{path}: {error}") from None
 
 
-def class_table(
-    root: Path, numbers: np.ndarray, lidar_classes: Mapping[int, int] | None
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """SemanticClass (or NO_SURFACE) by the files' class number, int16, None where their meaning is
-    not known; and a sentence where that is so. numbers: those that occur."""
-    if len(numbers) == 0:
-        return None, ()
-    if lidar_classes is None:
-        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
-        if not known.all():
+def class_meanings(
+    lidar_classes: Mapping[int, int] | None, numbers: Sequence[np.ndarray]
+) -> tuple[Mapping[int, int] | None, tuple[str, ...]]:
+    """SemanticClass (or NO_SURFACE) by the files' class number, None where their meaning is not
+    known, and a sentence where that is so. numbers: those that occur."""
+    if lidar_classes is not None:
+        return lidar_classes, ()
+    known = {number: number for number in range(SemanticClass.SKY)}
+    for column in numbers:
+        wrong = column[(column < 0) | (column >= SemanticClass.SKY)]
+        if len(wrong):
             return None, (
-                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
-                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
-                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
+                f"lidar/: the column semantic holds {int(wrong.min())}, which is no SemanticClass "
+                f"(0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the numbers mean "
+                f'in calibration.json: "lidar_classes": {{"7": "road", ...}}',
             )
-        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
-    size = max(0, int(numbers.max()), *lidar_classes) + 1
-    if numbers.min() < 0 or min(lidar_classes, default=0) < 0 or size > 2**16:
-        raise AdapterError(
-            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
-            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
-            f"{sorted(lidar_classes)}"
-        )
-    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
-    for number, meaning in lidar_classes.items():
-        table[number] = meaning
-    return table, ()
+    return known, ()
 
 
-@dataclass(frozen=True, eq=False)
-class LidarDrive:
+class LidarDrive(NamedTuple):
     """sweeps: one a frame that has a file, scene world. top_deg: about the highest elevation that
     the LiDAR looks at. problems: one sentence each."""
 
@@ -291,92 +291,74 @@ class LidarDrive:
     top_deg: float
     problems: tuple[str, ...]
 
-    def __len__(self) -> int:
-        return sum(len(sweep) for sweep in self.sweeps)
-
 
 def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Frame]) -> LidarDrive:
     """The sweeps of the given frames, without returns that are not finite, of no surface, or of the
     recording car (ego_box_m)."""
     files = lidar_files(root)
-    problems = []
-    if files:
-        missing = [f.index for f in frames if f.index not in files]
-        problems += [
-            f"frame {n}: lidar/{n:06d}.parquet is missing, its points too" for n in missing
-        ]
-    known = [(frame, files[frame.index]) for frame in frames if frame.index in files]
-    raws = [
-        _Raw.of(path, frame, calibration)
-        for frame, path in tqdm(known, desc="LiDAR", unit="frame", disable=None)
-    ]
-    timeless = [raw.frame for raw in raws if raw.timeless]
+    known = [frame for frame in frames if frame.index in files]
+    missing = [frame.index for frame in frames if frame.index not in files] if files else []
+    problems = [f"lidar/: the files of {some(missing)} are missing, their points too"] * bool(
+        missing
+    )
+    raws, timeless = [], []
+    for frame in tqdm(known, desc="LiDAR", unit="frame", disable=None):
+        sweep, numbers, has_times = _read_returns(files[frame.index], frame, calibration)
+        raws.append((sweep, numbers))
+        timeless += [] if has_times else [frame.index]
     if timeless:
         problems.append(
             f"lidar/: no column timestamp_ns, or t in seconds, near the frame's time in "
             f"{len(timeless)} sweeps (the first of frame {timeless[0]}); their frames' times are "
             f"used, fast objects are smeared"
         )
-    present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
-    numbers = np.unique(np.concatenate(present)) if present else np.zeros(0, np.int64)
-    table, more = class_table(root, numbers, calibration.lidar_classes)
-    sweeps = tuple(raw.usable(table) for raw in raws)
+    occurring = [numbers for _, numbers in raws if numbers is not None]
+    meaning, more = class_meanings(calibration.lidar_classes, occurring)
+    sweeps = []
+    for sweep, numbers in raws:
+        if numbers is not None and meaning is not None:
+            semantic = world_classes(numbers, meaning)
+            sweep = dataclasses.replace(sweep, semantic=semantic).select(semantic != NO_SURFACE)
+        sweeps.append(sweep)
     if calibration.ego_box_m is None:
         problems += _own_returns(sweeps, known)
-    return LidarDrive(sweeps, _top_deg(sweeps, known), (*problems, *more))
+    return LidarDrive(tuple(sweeps), _top_deg(sweeps, known), (*problems, *more))
 
 
-@dataclass(frozen=True, eq=False)
-class _Raw:
-    frame: int
-    points: np.ndarray  # float32 [N, 3], scene world, finite
-    timestamps_ns: np.ndarray  # int64 [N]
-    classes: np.ndarray | None  # int64 [N], the file's own numbers
-    timeless: bool
-
-    @staticmethod
-    def of(path: Path, frame: Frame, calibration: Calibration) -> _Raw:
-        sweep = read_sweep(path)
-        world = sweep.points_m - calibration.world_origin_m
-        pose = frame.world_from_ego.numpy()
-        keep = (np.abs(world) <= LARGEST).all(axis=1)  # not NaN, and float32 has it
-        ego = (np.where(keep[:, None], world, 0) - pose[:3, 3]) @ pose[:3, :3]
-        if keep.any() and np.median(np.abs(ego[keep]).max(axis=1)) > _FAR_M:
-            raise AdapterError(
-                f"{path}: most returns lie more than {_FAR_M:.0f} m from the car as "
-                f"calibration.json has it in frame {frame.index}; x, y, z must be metres in the "
-                f"world of its poses, not in the sensor's"
-            )
-        if calibration.ego_box_m is not None:
-            keep &= ~is_in_box(ego, *calibration.ego_box_m)
-        try:
-            times = sweep_times(sweep, frame.timestamp_ns)
-        except ValueError as error:
-            raise AdapterError(f"{path}: {error}") from None
-        classes = sweep.columns.get("semantic")
-        if classes is not None:
-            classes = class_numbers(path, classes)[keep]
-        return _Raw(
-            frame.index,
-            world[keep].astype(np.float32),
-            np.full(int(keep.sum()), frame.timestamp_ns) if times is None else times[keep],
-            classes,
-            timeless=times is None,
+def _read_returns(
+    path: Path, frame: Frame, calibration: Calibration
+) -> tuple[Sweep, np.ndarray | None, bool]:
+    """The finite returns that are not the recording car's, of unknown class; their class numbers in
+    the file, int64; and whether they have times of their own."""
+    sweep = read_sweep(path)
+    world = sweep.points_m - calibration.world_origin_m
+    pose = frame.world_from_ego.numpy()
+    keep = (np.abs(world) <= LARGEST).all(axis=1)  # not NaN, and float32 has it
+    ego = (np.where(keep[:, None], world, 0) - pose[:3, 3]) @ pose[:3, :3]
+    if keep.any() and np.median(np.abs(ego[keep]).max(axis=1)) > _FAR_M:
+        raise AdapterError(
+            f"{path}: most returns lie more than {_FAR_M:.0f} m from the car as calibration.json "
+            f"has it in frame {frame.index}; x, y, z must be metres in the world of its poses, not "
+            f"in the sensor's"
         )
+    if calibration.ego_box_m is not None:
+        keep &= ~is_in_box(ego, *calibration.ego_box_m)
+    try:
+        times = sweep_times(sweep, frame.timestamp_ns)
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
+    found = Sweep.of_unknown_class(world[keep], frame.timestamp_ns)
+    if times is not None:
+        found = dataclasses.replace(found, timestamps_ns=times[keep])
+    column = sweep.columns.get("semantic")
+    numbers = None if column is None else class_numbers(path, column)[keep]
+    return found, numbers, times is not None
 
-    def usable(self, table: np.ndarray | None) -> Sweep:
-        if self.classes is None or table is None:
-            unknown = np.full(len(self.points), SemanticClass.UNKNOWN, np.int16)
-            return Sweep(self.points, self.timestamps_ns, unknown)
-        semantic = table[np.clip(self.classes, 0, len(table) - 1)]
-        keep = semantic != NO_SURFACE
-        return Sweep(self.points[keep], self.timestamps_ns[keep], semantic[keep])
 
-
-def _own_returns(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> list[str]:
+def _own_returns(sweeps: Sequence[Sweep], known: Sequence[Frame]) -> list[str]:
     """A sentence where the LiDAR seems to see its own car."""
     near = total = 0
-    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+    for sweep, frame in zip(sweeps, known, strict=True):
         if frame.cameras:
             total += len(sweep)
             distance = np.linalg.norm(sweep.points - _middle(frame), axis=1)
@@ -395,11 +377,11 @@ def _middle(frame: Frame) -> np.ndarray:
     return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
 
 
-def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> float:
+def _top_deg(sweeps: Sequence[Sweep], known: Sequence[Frame]) -> float:
     """About the elevation of the highest channel: that of nearly the steepest return, as seen from
     the height of the cameras, for want of the sensor's own."""
     rises = []
-    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+    for sweep, frame in zip(sweeps, known, strict=True):
         if not frame.cameras or not len(sweep):
             continue
         offset = sweep.points - _middle(frame)
@@ -453,6 +435,17 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
         AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
             image; a damaged LiDAR file or table of boxes; a file outside the folder."""
     options = DriveOptions.from_query("recording", query)
+    drive, calibration = read_recording(path, query, options)
+    scene = _best_scene(Path(path), drive, calibration, options)
+    missing = without_points(join_tracks(drive.boxes), scene)
+    return dataclasses.replace(scene, problems=scene.problems + missing)
+
+
+def read_recording(
+    path: str, query: dict[str, str], options: DriveOptions
+) -> tuple[RawDrive, Calibration]:
+    """The frames that the options ask for with their boxes and the LiDAR's sweeps, of which there
+    may be none."""
     root = Path(path)
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")
@@ -464,88 +457,83 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
     used = [frame for frame in frames if frame.index not in chosen.held_out]
     if not any(frame.image_paths for frame in used):
         raise AdapterError(
-            f"{root / 'images'} holds no usable image of the frames that are not held out "
-            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
+            f"{root / 'images'} holds no usable image of {some(chosen.used)} that are not held "
+            f"out; colours cannot be had without them: " + "; ".join(image_problems[:3])
         )
-    objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
-    tracks = join_tracks(objects.moving)
-    found = (
-        *unlisted_images(root, calibration.frames),
-        *image_problems,
-        *chosen.problems,
-        *objects.problems,
+    objects = read_objects(root, frames, calibration.world_origin_m)
+    lidar = read_lidar_drive(root, calibration, used)
+    drive = RawDrive(
+        name=calibration.name,
+        source=format_uri("recording", path, query),
+        frames=frames,
+        held_out=chosen.held_out,
+        sweeps=lidar.sweeps,
+        boxes=objects.moving,
+        labels=RecordingLabels(root),
+        world_origin_m=calibration.world_origin_m,
+        lidar_top_deg=lidar.top_deg,
+        problems=(
+            *unlisted_images(root, calibration.frames),
+            *image_problems,
+            *chosen.problems,
+            *objects.problems,
+            *lidar.problems,
+        ),
+        has_metric_scale=calibration.has_metric_scale,
     )
+    return drive, calibration
 
-    def build(
-        sweeps: Sequence[Sweep],
-        options: DriveOptions,
-        top_deg: float,
-        problems: Sequence[str],
-        **guessed: Any,
-    ) -> Scene:
-        scene = build_lidar_scene(
-            sweeps,
-            tracks,
-            views_of(used),
-            options,
-            lidar_top_deg=top_deg,
-            name=calibration.name,
-            source=format_uri("recording", path, query),
-            frames=frames,
-            labels=RecordingLabels(root),
-            world_origin_m=calibration.world_origin_m,
-            problems=(*found, *problems),
-            has_metric_scale=calibration.has_metric_scale,
-            if_empty=f"{root}: none of the points that were measured is in any image; check in "
-            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
-            f"and poses are in one world with z up",
-            **guessed,
-        )
-        problems = scene.problems + without_points(tracks, scene)
-        return dataclasses.replace(scene, problems=problems)
 
-    return _best_scene(root, calibration, options, frames, used, objects, build)
+def read_objects(root: Path, frames: Sequence[Frame], origin: np.ndarray) -> RecordedObjects:
+    """The objects that the frames have boxes of, in the scene's world."""
+    boxes = all_boxes(root)
+    timed = (
+        TimedBoxes(f.index, found.boxes, f.timestamp_ns if times is None else times)
+        for f in frames
+        if (found := boxes.get(f.index)) is not None
+        for times in [found.timestamps_ns]
+    )
+    return find_objects(timed, origin)
 
 
 def _best_scene(
-    root: Path,
-    calibration: Calibration,
-    options: DriveOptions,
-    frames: Sequence[Frame],
-    used: Sequence[Frame],
-    objects: RecordedObjects,
-    build: Callable[..., Scene],
+    root: Path, drive: RawDrive, calibration: Calibration, options: DriveOptions
 ) -> Scene:
-    """The scene from LiDAR, else from depth images, else from guesses. used: frames not held out.
-    build: from sweeps, options, the sensor's highest elevation in degrees, and what was missing."""
-    lidar = read_lidar_drive(root, calibration, used)
-    if len(lidar) >= _MIN_RETURNS:
-        return build(lidar.sweeps, options, lidar.top_deg, lidar.problems)
-    sweeps, problems = depth_sweeps(root, used)
-    problems = lidar.problems + problems
-    if any(len(sweep) for sweep in sweeps):
-        start = (
-            f"{root / 'lidar'} holds {len(lidar) or 'no'} returns: the scene starts from the "
-            f"points of {len(sweeps)} depth images"
+    """The scene from LiDAR, else from depth images, else from guesses."""
+    count = sum(map(len, drive.sweeps))
+    if count >= _MIN_RETURNS:
+        return scene_of_drive(drive, options)
+    start = f"{root / 'lidar'} holds {count or 'no'} returns"
+    sweeps, problems = depth_sweeps(root, drive.used)
+    if any(map(len, sweeps)):
+        start += f": the scene starts from the points of {len(sweeps)} depth images"
+        problems = (*drive.problems, *problems, start)
+        seen = dataclasses.replace(
+            drive, sweeps=sweeps, lidar_top_deg=_DEPTH_TOP_DEG, problems=problems
         )
-        return build(sweeps, options, _DEPTH_TOP_DEG, (*problems, start))
-    start = (
-        f"{root / 'lidar'} holds {len(lidar) or 'no'} returns and {root / 'depth'} no depth: the "
-        f"scene starts from a flat ground {calibration.ego_above_ground_m:g} m below the ego "
-        f"origin, the labelled boxes, and splats guessed along the cameras' rays; reconstruct it "
-        f"before rendering it"
+        return scene_of_drive(seen, options)
+    start += (
+        f" and {root / 'depth'} no depth: the scene starts from a flat ground "
+        f"{calibration.ego_above_ground_m:g} m below the ego origin, the labelled boxes, and "
+        f"splats guessed along the cameras' rays; reconstruct it before rendering it"
     )
-    road = ground_heights(frames, calibration.ego_above_ground_m)
-    check_cameras_above(root / CALIBRATION, frames, road)
+    road = ground_heights(drive.frames, calibration.ego_above_ground_m)
+    check_cameras_above(root / CALIBRATION, drive.frames, road)
     budget = min(_MAX_GAUSSIANS, options.max_gaussians)
-    shells = guess_shells(views_of(used), road, round(budget * _SHELL_SHARE))
+    shells = guess_shells(views_of(drive.used), road, round(budget * _SHELL_SHARE))
     coarse = options.model_copy(
         update={"voxel_m": max(_VOXEL_M, options.voxel_m), "max_gaussians": budget - len(shells)}
     )
-    sweeps = guess_surfaces(road, objects.moving, objects.still)
+    objects = read_objects(root, drive.frames, drive.world_origin_m)
+    guessed = dataclasses.replace(
+        drive,
+        sweeps=guess_surfaces(road, objects.moving, objects.still),
+        lidar_top_deg=_SKY_ABOVE_DEG,
+        problems=(*drive.problems, *problems, start),
+    )
     # Whatever is found in the guessed surfaces is the height they were given.
     ground = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
-    return build(sweeps, coarse, _SKY_ABOVE_DEG, (*problems, start), added=shells, ground=ground)
+    return scene_of_drive(guessed, coarse, added=shells, ground=ground)
 
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:

@@ -27,16 +27,16 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import AfterValidator, BaseModel, Field
 
-from adapters.plain_files import LARGEST, array_of, number_of, read_image_size, read_json
-from adapters.raw_drive import NO_SURFACE, drive_origin
+from adapters.plain_files import Number, read_json, validated
+from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
@@ -45,7 +45,6 @@ from augment.jobs.manifest import MAX_SIDE_PX
 from augment.semantics import SemanticClass
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_READERS = 4  # threads that decode images to check them; decoding releases the interpreter
 CALIBRATION = "calibration.json"
 _IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
 _RIGID = 1e-4  # rotations written with six digits are off by a few millionths
@@ -96,22 +95,15 @@ def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...],
         for name in names
         if not files[name]
     ]
-    views = [(frame, name) for frame in frames for name in frame.cameras if files[name]]
-    with ThreadPoolExecutor(_READERS) as pool:
-        faults = pool.map(lambda v: _fault(files[v[1]].get(v[0].index), v[0].cameras[v[1]]), views)
-    usable: dict[int, dict[str, str]] = {frame.index: {} for frame in frames}
-    for (frame, name), fault in zip(views, faults, strict=True):
-        if fault:
-            problems.append(f"camera {name}, frame {frame.index}: {fault}")
-        else:
-            usable[frame.index][name] = str(files[name][frame.index])
-    if not any(usable.values()):
-        raise AdapterError(
-            f"{root / 'images'} holds no usable image of frames {frames[0].index} to "
-            f"{frames[-1].index}: " + "; ".join(problems[:3])
-        )
-    complete = tuple(dataclasses.replace(f, image_paths=usable[f.index]) for f in frames)
-    return complete, tuple(problems)
+    pictures = [
+        Picture(name, frame.index, files[name].get(frame.index), (camera.width, camera.height))
+        for name in names
+        for frame in frames
+        if files[name] and (camera := frame.cameras.get(name))
+    ]
+    images = usable_images(pictures, every_camera=False)
+    found = (dataclasses.replace(f, image_paths=images.paths.get(f.index, {})) for f in frames)
+    return tuple(found), (*problems, *images.problems)
 
 
 def unlisted_images(root: Path, frames: Sequence[Frame]) -> tuple[str, ...]:
@@ -137,19 +129,79 @@ def unlisted_images(root: Path, frames: Sequence[Frame]) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def _fault(path: Path | None, camera: Camera) -> str:
-    """What is wrong with an image, or nothing."""
-    if path is None:
-        return "its image is missing"
-    seen = read_image_size(path)
-    if isinstance(seen, str):
-        return f"image {path} {seen}"
-    if seen != (camera.width, camera.height):
-        return (
-            f"image {path} is {seen[0]}x{seen[1]} pixels, calibration.json says "
-            f"{camera.width}x{camera.height}; left out"
+# ---- Calibration ---------------------------------------------------------------------------------
+
+_Vector = tuple[Number, Number, Number]
+_Row = tuple[Number, Number, Number, Number]
+_Nanoseconds = Annotated[int, Field(strict=True, ge=-(2**62), le=2**62)]
+_Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_SIDE_PX)]
+
+
+def _rigid(rows: tuple[_Row, _Row, _Row, _Row]) -> torch.Tensor:
+    """float64 [4, 4]."""
+    matrix = np.array(rows, np.float64)
+    rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
+    error = max(
+        np.abs(rotation @ rotation.T - np.eye(3)).max(),
+        np.abs(matrix[3] - np.array([0.0, 0, 0, 1])).max(),
+    )
+    if error > _RIGID or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"must be a rotation and a translation, last row 0 0 0 1, determinant +1; it is off by "
+            f"{error:.3g}, determinant {np.linalg.det(rotation):.3g}"
         )
-    return ""
+    return torch.from_numpy(matrix)
+
+
+def _box(corners: tuple[_Vector, _Vector]) -> np.ndarray:
+    box = np.array(corners)
+    if not (box[0] < box[1]).all():
+        raise ValueError("must be [[x, y, z], [x, y, z]], the lowest and the highest corner")
+    return box
+
+
+def _classes(names: Mapping[str, str]) -> Mapping[int, int]:
+    meanings = {member.name.lower(): int(member) for member in SemanticClass}
+    meanings["none"] = NO_SURFACE
+    try:
+        return {int(number): meanings[name.lower()] for number, name in names.items()}
+    except (ValueError, KeyError) as error:
+        raise ValueError(
+            f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
+        ) from None
+
+
+_Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
+
+
+class _CameraEntry(BaseModel):
+    """timestamp_ns: the frame's where there is none."""
+
+    width: _Pixels
+    height: _Pixels
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    world_from_camera: _Pose
+    timestamp_ns: _Nanoseconds | None = None
+
+
+class _FrameEntry(BaseModel):
+    frame: Annotated[_Nanoseconds, Field(ge=0)]
+    timestamp_ns: _Nanoseconds
+    world_from_ego: _Pose
+    cameras: dict[str, _CameraEntry]
+
+
+class _Settings(BaseModel):
+    """All of a calibration but the frames themselves."""
+
+    frames: Annotated[list[Any], Field(min_length=1)]
+    has_metric_scale: Any = True
+    ego_above_ground_m: Number = 0.0
+    ego_box_m: Annotated[tuple[_Vector, _Vector], AfterValidator(_box)] | None = None
+    lidar_classes: Annotated[dict[str, str], AfterValidator(_classes)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,10 +224,8 @@ class Calibration:
 def read_calibration(root: Path) -> Calibration:
     """The calibration of the recording in a folder."""
     path, content = _content(root)
-    entries = content.get("frames")
-    if not isinstance(entries, list) or not entries:
-        raise AdapterError(f"{path} must hold a list 'frames' with at least one entry")
-    frames = sorted((_frame(path, entry) for entry in entries), key=lambda f: f.index)
+    settings = validated(_Settings, content, str(path))
+    frames = sorted((_frame(path, entry) for entry in settings.frames), key=lambda f: f.index)
     for before, after in itertools.pairwise(frames):
         if after.index == before.index:
             raise AdapterError(f"{path} lists frame {after.index} twice")
@@ -190,19 +240,17 @@ def read_calibration(root: Path) -> Calibration:
         name=_name(content, root),
         frames=tuple(_recentred(frame, origin) for frame in frames),
         world_origin_m=origin,
-        has_metric_scale=content.get("has_metric_scale") is not False,
-        ego_above_ground_m=number_of(
-            content.get("ego_above_ground_m", 0.0), f"{path}: ego_above_ground_m"
-        ),
-        ego_box_m=_ego_box(path, content.get("ego_box_m")),
-        lidar_classes=_lidar_classes(path, content.get("lidar_classes")),
+        has_metric_scale=settings.has_metric_scale is not False,
+        ego_above_ground_m=settings.ego_above_ground_m,
+        ego_box_m=settings.ego_box_m,
+        lidar_classes=settings.lidar_classes,
     )
 
 
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
     """The calibration's lidar_classes alone."""
     path, content = _content(root)
-    return _lidar_classes(path, content.get("lidar_classes"))
+    return validated(_Settings, content, str(path)).lidar_classes
 
 
 def _content(root: Path) -> tuple[Path, dict[str, Any]]:
@@ -232,80 +280,20 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
     return blocks[0].parent, parts[0] | {"frames": list(frames.values())}
 
 
-def _frame(path: Path, entry: Any) -> Frame:
-    index = entry.get("frame") if isinstance(entry, dict) else None
-    if type(index) is not int or not 0 <= index < 2**62:
-        raise AdapterError(
-            f"{path}: every entry of 'frames' needs a number 'frame', 0 or greater; got "
-            f"{index!r:.80}"
-        )
-    where = f"{path}, frame {index}"
-    timestamp_ns = _time(where, entry.get("timestamp_ns"))
-    world_from_ego = _rigid(where, "world_from_ego", entry.get("world_from_ego"))
-    cameras = entry.get("cameras")
-    if not isinstance(cameras, dict):
-        raise AdapterError(f"{where}: 'cameras' must map names to cameras; got {cameras!r}")
-    return Frame(
-        index=index,
-        timestamp_ns=timestamp_ns,
-        world_from_ego=world_from_ego,
-        cameras={
-            name: _camera(f"{where}, camera {name!r}", name, camera, timestamp_ns)
-            for name, camera in cameras.items()
-        },
-    )
-
-
-def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
-    if not isinstance(camera, dict):
-        raise AdapterError(f"{where}: must be an object with width, height, fx ...; got {camera!r}")
-    pose = _rigid(where, "world_from_camera", camera.get("world_from_camera"))
-    time_ns = _time(where, camera.get("timestamp_ns", frame_ns))
-    size = [camera.get(side) for side in ("width", "height")]
-    if any(type(side) is not int or not 1 <= side <= MAX_SIDE_PX for side in size):
-        raise AdapterError(
-            f"{where}: width and height must be whole pixels, 1 to {MAX_SIDE_PX}; got {size!r:.80}"
-        )
-    lens = {}
-    for key in ("fx", "fy", "cx", "cy"):
-        if key not in camera:
-            raise AdapterError(f"{where}: {key!r} is missing")
-        lens[key] = number_of(camera[key], f"{where}: {key} (pixels)")
-    try:
-        return Camera(
-            name, *size, **lens, camera_from_world=invert_rigid(pose), timestamp_ns=time_ns
-        )
-    except ValueError as error:
-        raise AdapterError(f"{where}: {error}") from None
-
-
-def _rigid(where: str, name: str, value: Any) -> torch.Tensor:
-    """A rigid transform, float64 [4, 4]."""
-    matrix = array_of(value)
-    if matrix is None or matrix.shape != (4, 4):
-        raise AdapterError(f"{where}: {name} must be 4 rows of 4 numbers; got {value!r:.200}")
-    if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > LARGEST:
-        raise AdapterError(
-            f"{where}: {name} must be finite, its place within {LARGEST:g} m; got "
-            f"{matrix.tolist()}. Leave the camera or the frame out where its pose is not known"
-        )
-    rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
-    error = max(
-        np.abs(rotation @ rotation.T - np.eye(3)).max(),
-        np.abs(matrix[3] - np.array([0.0, 0, 0, 1])).max(),
-    )
-    if error > _RIGID or np.linalg.det(rotation) < 0:
-        raise AdapterError(
-            f"{where}: {name} must be a rotation and a translation, last row 0 0 0 1, determinant "
-            f"+1; it is off by {error:.3g}, determinant {np.linalg.det(rotation):.3g}"
-        )
-    return torch.from_numpy(matrix)
-
-
-def _time(where: str, value: Any) -> int:
-    if type(value) is not int or abs(value) > 2**62:
-        raise AdapterError(f"{where}: timestamp_ns must be whole nanoseconds; got {value!r}")
-    return value
+def _frame(path: Path, content: Any) -> Frame:
+    number = content.get("frame") if isinstance(content, dict) else None
+    where = f"{path}, frame {number!r:.20}"
+    entry = validated(_FrameEntry, content, where)
+    cameras = {}
+    for name, camera in entry.cameras.items():
+        lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
+        pose = invert_rigid(camera.world_from_camera)
+        time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns
+        try:
+            cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
+        except ValueError as error:
+            raise AdapterError(f"{where}, camera {name!r}: {error}") from None
+    return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
 
 
 def _recentred(frame: Frame, origin: np.ndarray) -> Frame:
@@ -324,30 +312,3 @@ def _name(content: Mapping[str, Any], root: Path) -> str:
     parts = [content.get("scene"), content.get("variant")]
     given = [part for part in parts if isinstance(part, str) and part]
     return "-".join(given) if given else root.resolve().name
-
-
-def _ego_box(path: Path, value: Any) -> np.ndarray | None:
-    if value is None:
-        return None
-    box = array_of(value)
-    is_box = box is not None and box.shape == (2, 3) and np.isfinite(box).all()
-    if box is None or not is_box or not (box[0] < box[1]).all():
-        raise AdapterError(
-            f"{path}: ego_box_m must be [[x, y, z], [x, y, z]], the lowest and the highest corner "
-            f"in ego axes; got {value!r:.200}"
-        )
-    return box
-
-
-def _lidar_classes(path: Path, value: Any) -> Mapping[int, int] | None:
-    if value is None:
-        return None
-    meanings = {member.name.lower(): int(member) for member in SemanticClass}
-    meanings["none"] = NO_SURFACE
-    try:
-        return {int(number): meanings[str(name).lower()] for number, name in value.items()}
-    except (AttributeError, ValueError, KeyError) as error:
-        raise AdapterError(
-            f"{path}: lidar_classes must map class numbers to {', '.join(meanings)}; got "
-            f"{value!r:.200} ({error!r})"
-        ) from None

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from adapters.lidar_scene.depth import SparseDepth, depth_seen, nearest_of_each, read_returns
-from adapters.pandaset.files import PandaSetLabels
+from adapters.pandaset import PandaSetLabels
 from adapters.plain_files import decode_image
 from adapters.safe_pickle import read_array, read_array_dict
 from adapters.training_views.byte_cache import ByteCache

@@ -22,7 +22,7 @@ from adapters.detect_format import FILES, FOLDERS, looked_for, recognised
 from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
-from adapters.pandaset.files import PandaSetLabels
+from adapters.pandaset import PandaSetLabels
 from adapters.plain_files import inside, read_image_size, read_json, read_numbers, read_pose
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame

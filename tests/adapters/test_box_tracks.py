@@ -22,7 +22,7 @@ from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.lidar_scene.split import FLOOR_M, HALO_M, Motion, join_tracks, split_sweeps
 from adapters.nuscenes.adapter import nuscenes_labels
-from adapters.pandaset.files import PandaSetLabels
+from adapters.pandaset import PandaSetLabels
 from adapters.procedural import StreetLabels
 from adapters.raw_drive import BoxSample, Sweep
 from adapters.recording.adapter import RecordingLabels

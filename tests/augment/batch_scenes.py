@@ -9,6 +9,7 @@ import hashlib
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -264,6 +265,20 @@ def style_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) 
         maps = style_maps(scene, recipe.style)
         view.rgb[0, 1, 0] = round(100 * maps.picture[0, 3].item())
     return view
+
+
+@dataclass
+class FakePending:
+    """A view that has been begun, as on a GPU."""
+
+    finish: Callable[[], FakeView]
+
+    def result(self) -> FakeView:
+        return self.finish()
+
+
+def begin_fake(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakePending:
+    return FakePending(lambda: fake_render(scene, camera, recipe, backend=backend))
 
 
 def slow_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:

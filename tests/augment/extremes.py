@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +29,7 @@ from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view
 from recipes.schema import Recipe
-from recipes.template import FieldSpec, Kind, SectionSpec, root
-from tests.augment.examples import examples
+from tests.augment.hard_scenes import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
 
 SOAKING = examples(0) > 0  # asked for by the environment: kernels may take their time to compile
@@ -283,128 +281,110 @@ def cameras(draw: st.DrawFn, levels_m: Sequence[float] = ()) -> Camera:
     )
 
 
-def numbers_of(field: FieldSpec) -> list[float | int]:
-    """A number field's allowed values worth trying: its ends, 0, the smallest, its default."""
-    low, high = _ends(field)
-    values: list[float] = [low, high, 0, 1, -1, low + (high - low) / 2]
-    if field.kind is Kind.NUMBER:
-        values += [math.nextafter(low, high), math.nextafter(high, low), 1e-8, 5e-324, 0.3]
-    if isinstance(field.default, int | float):
-        values.append(field.default)
-    cast = float if field.kind is Kind.NUMBER else int
-    return list(dict.fromkeys(v for v in map(cast, values) if field.accepts(v)))
+Schema = Mapping[str, Any]
+SCHEMA: Schema = Recipe.model_json_schema()
 
 
-def ends_of(field: FieldSpec) -> list[float | int]:
-    """Its least and greatest allowed values, 0 where that is allowed, and the smallest above 0."""
-    low, high = _ends(field)
-    cast = float if field.kind is Kind.NUMBER else int
-    values = [low, high, 0, 5e-324 if field.kind is Kind.NUMBER else 1]
-    return list(dict.fromkeys(v for v in map(cast, values) if field.accepts(v)))
+def resolved(spec: Schema) -> tuple[Schema, bool]:
+    """What a reference or an alternative to null stands for, and whether it may be null."""
+    if "$ref" in spec:
+        return SCHEMA["$defs"][spec["$ref"].rpartition("/")[2]], False
+    given = [one for one in spec.get("anyOf", ()) if one.get("type") != "null"]
+    return (resolved(given[0])[0], True) if given else (spec, False)
 
 
-def numbers_beyond(field: FieldSpec) -> list[float | int]:
-    """Values that a number field must refuse: just past its ends, far past them, not finite."""
-    low, high = _ends(field)
-    values: list[float] = []
-    for sign, bound in field.limits:
-        if sign in (">", "<"):
-            values.append(bound)
-    if field.kind is Kind.NUMBER:
-        values += [math.nan, math.inf, -math.inf]
-        values += [math.nextafter(low, -math.inf), math.nextafter(high, math.inf), 1e308, -1e308]
-    else:
-        values += [int(low) - 1, int(high) + 1, 10**30, -(10**30)]
-    return values
-
-
-def _ends(field: FieldSpec) -> tuple[float, float]:
+def ends_of(number: Schema) -> tuple[float, float]:
     """The least and the greatest allowed value."""
-    whole = field.kind is Kind.WHOLE
-    low, high = -math.inf, math.inf
-    for sign, bound in field.limits:
-        step = 1 if whole else 0
-        if sign == ">=":
-            low = bound
-        elif sign == ">":
-            low = bound + step if whole else math.nextafter(bound, math.inf)
-        elif sign == "<=":
-            high = bound
-        else:
-            high = bound - step if whole else math.nextafter(bound, -math.inf)
+    is_whole = number["type"] == "integer"
+    low, high = number.get("minimum", -math.inf), number.get("maximum", math.inf)
+    if (above := number.get("exclusiveMinimum")) is not None:
+        low = above + 1 if is_whole else math.nextafter(above, math.inf)
+    if (below := number.get("exclusiveMaximum")) is not None:
+        high = below - 1 if is_whole else math.nextafter(below, -math.inf)
     return low, high
 
 
-def number_fields(section: SectionSpec | None = None) -> list[FieldSpec]:
-    """Every field of a recipe that holds numbers, colours' and rates' channels among them."""
-    fields = []
-    for spec in (section or root()).walk():
-        for field in spec.fields.values():
-            if field.kind in (Kind.NUMBER, Kind.WHOLE) or field.channel is not None:
-                fields.append(field)
-    return fields
+def numbers_of(number: Schema) -> list[float]:
+    """Allowed values worth trying: the ends, 0, the smallest, the default."""
+    low, high = ends_of(number)
+    values = [low, high, 0, 1, -1, low + (high - low) / 2, number.get("default", 0) or 0]
+    if number["type"] == "number":
+        values += [math.nextafter(low, high), math.nextafter(high, low), 1e-8, 5e-324, 0.3]
+    cast = float if number["type"] == "number" else int
+    return list(dict.fromkeys(v for v in map(cast, values) if low <= v <= high))
+
+
+def numbers_beyond(number: Schema) -> list[float]:
+    """Values that must be refused: just past the ends, far past them, not finite."""
+    low, high = ends_of(number)
+    if number["type"] == "integer":
+        return [int(low) - 1, int(high) + 1, 10**30, -(10**30)]
+    past = [math.nextafter(low, -math.inf), math.nextafter(high, math.inf), 1e308, -1e308]
+    return [math.nan, math.inf, -math.inf, *past]
+
+
+def number_fields(spec: Schema = SCHEMA, path: str = "") -> Iterator[tuple[str, Schema, bool]]:
+    """Every field of a recipe that holds numbers: its path, the number, whether there are three."""
+    for name, field in spec["properties"].items():
+        own, at = resolved(field)[0], f"{path}.{name}".lstrip(".")
+        if "properties" in own:
+            yield from number_fields(own, at)
+        elif "items" in own:
+            yield from number_fields(resolved(own["items"])[0], f"{at}[]")
+        elif "prefixItems" in own:
+            yield at, own["prefixItems"][0], True
+        elif own.get("type") in ("number", "integer") and at not in ("version", "variant"):
+            yield at, own, False
 
 
 # What is drawn as a rule, where the schema would allow what takes minutes or needs a file.
 _TAMED: dict[str, st.SearchStrategy[Any]] = {
     "version": st.just(1),
+    "variant": st.just(0),
     "name": st.just("extreme"),
     "render.scale": st.sampled_from((1.0, 5e-324, 0.3, 4.0)),
     "weather.snow.cell_m": st.just(CELL_M),
     "weather.snow.max_slope_deg": st.sampled_from(SLOPES_DEG),
-    "style.image": st.none(),
-    "style.mask": st.none(),
-    "style.checkpoint": st.none(),
-    "style.digest": st.none(),
     "style.method": st.sampled_from(("mkl", "reinhard")),
     "style.preset": st.sampled_from(("dusk", "night")),
+    **dict.fromkeys(("style.image", "style.mask", "style.checkpoint", "style.digest"), st.none()),
 }
-_NOT_OF_FRAMES = ("quality",)  # chooses settings, which a frame is then made with
-_ALTERNATIVES = (  # at most one of each is given
-    ("weather.smog.visibility_m", "weather.smog.extinction_per_m"),
-    ("weather.flood.turbidity_ntu", "weather.flood.absorption_per_m"),
-)
-
-
-def values_of(field: FieldSpec) -> st.SearchStrategy[Any]:
-    """Allowed values of a field, the extreme ones before others."""
-    tamed = _TAMED.get(field.path)
-    if tamed is not None:
-        return tamed
-    if field.channel is not None:
-        drawn: st.SearchStrategy[Any] = st.tuples(*[st.sampled_from(numbers_of(field.channel))] * 3)
-    elif field.kind is Kind.WORD:
-        drawn = st.sampled_from(field.words)
-    elif field.kind is Kind.FLAG:
-        drawn = st.booleans() | st.sampled_from(field.words or (False,))
-    elif field.kind in (Kind.NUMBER, Kind.WHOLE):
-        drawn = st.sampled_from(numbers_of(field))
-    else:
-        drawn = st.just(field.default)
-    return st.none() | drawn if field.nullable else drawn
+EFFECTS = ("smog", "flood", "snow", "style")
+_NOT_OF_FRAMES = ("quality", "output")  # chooses settings; drawn after the weather
 
 
 @st.composite
-def sections(draw: st.DrawFn, spec: SectionSpec, effects: frozenset[str]) -> dict[str, Any]:
-    """A section's mapping; of the effects below it, those that are asked for."""
-    found: dict[str, Any] = {}
-    absent = {a if draw(st.booleans()) else b for a, b in _ALTERNATIVES if spec.path in a}
-    for name, field in spec.fields.items():
-        if field.path in absent:
+def values(draw: st.DrawFn, own: Schema, path: str, effects: frozenset[str]) -> Any:
+    """An allowed value, the extreme ones before others."""
+    if path in _TAMED:
+        return draw(_TAMED[path])
+    if "properties" in own:
+        return draw(mappings(own, path, effects))
+    if "items" in own:
+        items = values(resolved(own["items"])[0], path, effects)
+        return tuple(draw(st.lists(items, max_size=3)))
+    if "prefixItems" in own:
+        return tuple(draw(st.sampled_from(numbers_of(one))) for one in own["prefixItems"])
+    if "enum" in own or own["type"] == "boolean":
+        return draw(st.sampled_from(own.get("enum", (False, True))))
+    return draw(st.sampled_from(numbers_of(own)))
+
+
+@st.composite
+def mappings(draw: st.DrawFn, spec: Schema, path: str, effects: frozenset[str]) -> dict[str, Any]:
+    """A section; of the effects below it, those that are asked for."""
+    found = {}
+    for name, field in spec["properties"].items():
+        own, may_be_null = resolved(field)
+        is_section = "properties" in own
+        if name in _NOT_OF_FRAMES or (is_section and name in EFFECTS and name not in effects):
             continue
-        if field.required or draw(st.integers(0, 2)) > 0:
-            found[name] = draw(values_of(field))
-    for name, below in spec.sections.items():
-        if below.max_items is not None:
-            if draw(st.integers(0, 3)) == 0:
-                found[name] = draw(st.lists(sections(below, effects), max_size=3).map(tuple))
-        elif name not in _NOT_OF_FRAMES and (not below.effect or name in effects):
-            found[name] = draw(sections(below, effects))
+        chance = 3 if is_section or name in spec.get("required", ()) else draw(st.integers(0, 3))
+        if chance:
+            given_null = may_be_null and not is_section and chance == 1
+            at = f"{path}.{name}".lstrip(".")
+            found[name] = None if given_null else draw(values(own, at, effects))
     return found
-
-
-EFFECTS = ("smog", "flood", "snow", "style")
-PAIRS = [frozenset(pair) for pair in itertools.combinations(EFFECTS, 2)]
 
 
 @st.composite
@@ -412,37 +392,29 @@ def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> Recipe:
     """A valid recipe of extreme numbers, with the given effects, or some of them."""
     if effects is None:
         effects = draw(st.frozensets(st.sampled_from(EFFECTS)))
-    data = draw(sections(root(), effects))
-    for name, spec in root().sections["weather"].sections.items():
-        for pair in _ALTERNATIVES:
-            if spec.path in pair[0] and name in data["weather"]:
-                _give_one(data["weather"][name], pair)
-    waves = data["weather"].get("flood", {}).get("waves", {})
-    for wave in waves.get("components", None) or ():
-        wave["amplitude_m"] = min(wave["amplitude_m"], wave["wavelength_m"] / 6.2832)
-        wave["steepness"] = min(wave.get("steepness", 0.0), 0.33)
-    if "style" in data:
-        data["style"].setdefault("preset", "dusk")
-        if data["style"].get("applied_to") == "picture":
-            data["style"]["per_region"] = False
+    data = draw(mappings(SCHEMA, "", effects))
+    weather = data["weather"]
+    if smog := weather.get("smog"):  # one of two densities; the visibility of the most allowed
+        extinction, seen_m = smog.pop("extinction_per_m", None), smog.pop("visibility_m", None)
+        if seen_m is not None and draw(st.booleans()):
+            smog["visibility_m"] = max(seen_m, 0.03913)
+        else:
+            smog["extinction_per_m"] = 0.1 if extinction is None else extinction
+    if flood := weather.get("flood"):
+        flood.pop("turbidity_ntu" if flood.get("absorption_per_m") else "absorption_per_m", None)
+        for wave in flood.get("waves", {}).get("components") or ():
+            wave["amplitude_m"] = min(wave["amplitude_m"], wave["wavelength_m"] / 6.2832)
+            wave["steepness"] = min(wave.get("steepness", 0.0), 0.33)
+    if style := data.get("style"):
+        style.setdefault("preset", "dusk")
+        if style.get("applied_to") == "picture":
+            style["per_region"] = False
     data["output"] = draw(outputs(data))
     try:
         return Recipe.model_validate(data)
     except ValidationError:  # a rule between fields that is younger than this file
         assume(False)
         raise
-
-
-def _give_one(section: dict[str, Any], pair: tuple[str, str]) -> None:
-    """A density where smog lacks one; of two alternatives the first that is given."""
-    first, second = (path.rpartition(".")[2] for path in pair)
-    if section.get(first) is not None:
-        section.pop(second, None)
-    elif section.get(second) is None and second == "extinction_per_m":
-        section[second] = 0.1
-        section.pop(first, None)
-    if first == "visibility_m" and section.get(first) is not None:
-        section[first] = max(section[first], 0.03913)  # what the most allowed extinction means
 
 
 @st.composite

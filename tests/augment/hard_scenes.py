@@ -1,16 +1,20 @@
-"""Gaussians and cameras at the limits of what files may hold. World: x ahead, z up.
+"""Gaussians and cameras at the limits of what files may hold, and how many examples tests draw.
 
-All are drawn from a seed, placed by angle and log of distance so that each camera sees most of
-them, however wide it looks.
+World: x ahead, z up. All are drawn from a seed, placed by angle and log of distance so that each
+camera sees most of them, however wide it looks. CLIMATEGS_EXAMPLES=2000 makes a long soak of the
+same tests: examples are drawn from a fixed seed and kept in no database, so that a run fails or
+passes whatever ran before it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import os
 
 import numpy as np
 import torch
+from hypothesis import HealthCheck, settings
 
 from augment.cameras import Camera
 from augment.geometry import rigid
@@ -140,3 +144,31 @@ def in_float64(parts: list[PosedGaussians]) -> list[PosedGaussians]:
         )
         for part in parts
     ]
+
+
+VARIABLE = "CLIMATEGS_EXAMPLES"
+
+
+def examples(default: int) -> int:
+    """The number of examples of one test: `default`, or what the environment asks for."""
+    text = os.environ.get(VARIABLE, "")
+    if not text:
+        return default
+    if not text.isdecimal() or int(text) < 1:
+        raise ValueError(f"{VARIABLE} must be a whole number of examples, >= 1; got {text!r}")
+    return int(text)
+
+
+def drawing(default: int) -> settings:
+    """Settings of a property: `default` examples, or the environment's number.
+
+    Frames take as long as they take, and the first waits for kernels: no deadline, and no
+    complaint that drawing is slow.
+    """
+    return settings(
+        max_examples=examples(default),
+        derandomize=True,
+        database=None,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+    )

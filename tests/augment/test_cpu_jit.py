@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numba import prange
 
-from augment.geometry import any_in_squares
 from augment.render import threads
 from augment.render.cpu import jit as cpu_jit
 from augment.render.cpu import simd as v8
@@ -219,37 +218,15 @@ def test_without_tbb_callers_take_turns():
     assert "install the package 'tbb'" in run(ONE_CALLER).stderr
 
 
-def test_a_layer_the_user_named_is_kept(monkeypatch):
-    named = "from augment.render.threads import select_thread_pool; print(select_thread_pool())"
-    monkeypatch.setenv("NUMBA_THREADING_LAYER", "workqueue")
-    result = subprocess.run(
-        [sys.executable, "-c", named], cwd=ROOT, capture_output=True, text=True, timeout=SECONDS
-    )
-    assert result.stdout == "workqueue\n", result.stderr
-
-
 def test_limits():
-    before = threads.thread_count()
-    try:
-        threads.limit_threads(1)
-        assert threads.thread_count() == 1
-        with threads.kernel_threads():
-            assert numba.get_num_threads() == 1
-        threads.limit_threads(10_000)
-        assert threads.thread_count() == numba.get_num_threads()
-    finally:
-        threads.limit_threads(None)
-    assert threads.thread_count() == before
+    threads.limit_threads(1)
+    assert threads.thread_count() == 1
+    with threads.kernel_threads():
+        assert numba.get_num_threads() == 1
+    threads.limit_threads(10_000)
+    assert threads.thread_count() == numba.get_num_threads()
     with pytest.raises(ValueError, match="count must be >= 1 thread, or None for no limit; got 0"):
         threads.limit_threads(0)
-
-
-def test_kernel_threads_leave_the_caller_s_setting():
-    before = numba.get_num_threads(), numba.get_parallel_chunksize()
-    with pytest.raises(RuntimeError, match="inside"), threads.kernel_threads(3):
-        assert numba.get_parallel_chunksize() == 3
-        raise RuntimeError("inside")
-    assert (numba.get_num_threads(), numba.get_parallel_chunksize()) == before
 
 
 @pytest.mark.parametrize(
@@ -275,14 +252,3 @@ def test_container_quota(files, cores, tmp_path, monkeypatch):
         assert 1 <= threads.usable_cores() <= (cores or 10_000)
     finally:
         threads._container_cores.cache_clear()
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (16, 16), (17, 31), (5, 40), (48, 7), (64, 96)])
-def test_squares_with_a_true_pixel(shape):
-    mask = np.random.default_rng(0).random(shape) < 0.01
-    mask[-1, -1] = True
-    expected = np.zeros((-(-shape[0] // 16), -(-shape[1] // 16)), bool)
-    for row, column in np.argwhere(mask):
-        expected[row // 16, column // 16] = True
-    assert np.array_equal(any_in_squares(mask, 16), expected)
-    assert not any_in_squares(np.zeros(shape, bool), 16).any()

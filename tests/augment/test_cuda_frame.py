@@ -1,4 +1,4 @@
-"""Passes over finished images on the GPU, and whole frames: the pictures of the other backends.
+"""Passes over images, whole frames and snow where all lies on a GPU, and what kernels compile into.
 
 Kernels are interpreted where there is no GPU, and a pretended one tells where a tensor lies on the
 wrong side.
@@ -7,17 +7,27 @@ wrong side.
 from __future__ import annotations
 
 import dataclasses
+import gc
+import os
+import subprocess
+import sys
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
 
+pytest.importorskip("triton")
+
 from augment.cameras import Camera
+from augment.effects.snow import placement
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import Boxes
-from augment.render.buffers import RenderOutput
+from augment.render.buffers import CUDA, RenderOutput, available_backends
 from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload
 from augment.render.fog import Fog, fog_raster
 from augment.render.rasterize import renormalise_alpha
@@ -29,8 +39,11 @@ from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
 from tests import snow_scenes
-from tests.augment import pretend_gpu
+from tests.augment import compiled_kernels as kernels
+from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
+from tests.augment.kernel_frames import views
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.snow_scenes import box_car, cameras_of, drive, sheet
 
 WIDTH, HEIGHT = 33, 21
 UNIFORM = Fog(0.03, (0.5, 0.6, 0.7))
@@ -95,7 +108,7 @@ def test_the_sky_behind_the_splats(away, name, smog):
         moved = on_gpu(seen)
         got = composite_sky(moved.rgb, moved.alpha, view, sky, fog=smog, backend="cuda")
         # Textures of noise, whose coordinates float32 rounds, and edges between faces: see
-        # test_composite.
+        # test_rasterize.
         difference = (got.cpu() - expected).abs().amax(-1)
         assert float(difference.quantile(0.99)) < 1e-4
         assert int((difference > 1e-3).sum()) <= 2
@@ -108,13 +121,6 @@ def test_smog_on_buffers(away, medium):
     expected = fog_raster(seen, view, medium)
     got = fog_raster(on_gpu(seen), view, medium)
     torch.testing.assert_close(got.cpu(), expected, atol=2e-6, rtol=0)
-
-
-def test_smog_without_density_is_the_identity_to_the_bit(away):
-    seen = images()
-    for height in (None, 20.0):
-        got = fog_raster(on_gpu(seen), camera(), Fog(0.0, (0.5, 0.6, 0.7), height))
-        assert torch.equal(got.cpu(), seen.rgb)
 
 
 def test_colour_maps(away):
@@ -180,7 +186,6 @@ def scene() -> Scene:
     )
 
 
-EVERYTHING = Recipe(output=Output(semantic=True, instance=True))
 SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
 LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
 RECIPES = {
@@ -247,27 +252,6 @@ def test_a_view_is_that_of_the_cpu(scene, away, name):
 
 
 @pytest.mark.long
-def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
-    """The host asks the GPU for one number a raster pass, and for finished images."""
-    asked = []
-    run = pretend_gpu._run
-
-    def watched(func, args, kwargs):
-        out = run(func, args, kwargs)
-        if isinstance(args[0], AwayTensor) and not isinstance(out, AwayTensor | tuple | list):
-            asked.append(args[0].numel())
-        return out
-
-    monkeypatch.setattr(pretend_gpu, "_run", watched)
-    camera = scene.frames[0].cameras["ahead"]
-    begun = begin_view(scene, camera, scaled(EVERYTHING), backend="cuda")
-    pixels = 16 * 9  # of three colours, depth, class and instance
-    assert asked[:1] == [1] and sorted(asked[1:]) == [pixels, pixels, pixels, 3 * pixels]
-    assert begun.result() is begun.result() and len(asked) == 5
-    check_same(begun.result(), view_of(scene, EVERYTHING, "cpu"))
-
-
-@pytest.mark.long
 def test_two_views_under_way_do_not_mix(scene, away):
     recipe = scaled(Recipe(output=Output(depth="none", labels=False)))
     cameras = [frame.cameras["ahead"] for frame in scene.frames]
@@ -276,3 +260,151 @@ def test_two_views_under_way_do_not_mix(scene, away):
     for view, expected in zip(reversed(begun), reversed(alone), strict=True):
         check_same(view.result(), expected)
     assert not np.array_equal(alone[0].rgb, alone[1].rgb)
+
+
+@pytest.mark.long
+def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
+    small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
+    ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)
+    scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
+    cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
+    settings = PlacementSettings(cell_m=8.0)
+    monkeypatch.setattr(placement, "_SQUARE_CELLS", 16)  # several, which threads work on
+    expected = place_snow_support(scene, cameras, settings)
+    assert len(expected.ground) > 5
+    with pretended_gpu(monkeypatch):
+        found = place_snow_support(scene, cameras, settings, backend="cuda")
+    assert_alike(found.ground, expected.ground)
+
+
+@pytest.mark.gpu
+def test_a_larger_bed_with_a_vehicle_is_the_cpus():
+    car = box_car(start=(6.0, 0.0))
+    scene = drive(sheet((-6.0, 20.0), (-8.0, 8.0)), actors=[car])
+    expected = place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.1))
+    found = place_snow_support(
+        scene, cameras_of(scene), PlacementSettings(cell_m=0.1), backend="cuda"
+    )
+    assert found.actors.keys() == expected.actors.keys() == {"car"}
+    for a, b in ((found.ground, expected.ground), (found.actors["car"], expected.actors["car"])):
+        assert len(a) == pytest.approx(len(b), rel=1e-3)  # cells at a threshold
+        assert float((a.sizes_m**2).sum()) == pytest.approx(float((b.sizes_m**2).sum()), rel=1e-3)
+
+
+def assert_alike(found, expected) -> None:
+    """The same cells; heights and colours within what float32 sums differ by."""
+    for field in dataclasses.fields(expected):
+        a, b = getattr(found, field.name), getattr(expected, field.name)
+        assert not isinstance(a, AwayTensor)
+        if a.dtype.is_floating_point:
+            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+        else:
+            assert torch.equal(a, b), field.name
+
+
+def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch):
+    gc.collect()  # what other tests have left
+    with pretended_gpu(monkeypatch):
+        before = len(gpu._copies)
+        tensor = torch.arange(6.0)
+        copy = gpu.resident(tensor)
+        assert isinstance(copy, AwayTensor) and gpu.resident(tensor) is copy
+        tensor[0] = 9
+        assert float(gpu.resident(tensor)[0]) == 9
+        del tensor, copy
+        gc.collect()
+        assert len(gpu._copies) == before
+
+
+def test_the_pretended_gpu_refuses_what_a_real_one_would(monkeypatch):
+    with pretended_gpu(monkeypatch):
+        away, here = torch.ones(3).to(gpu.gpu_device()), torch.ones(3)
+        assert (away + 1).device == gpu.gpu_device() and float((away + away).sum()) == 6
+        with pytest.raises(RuntimeError, match="one lies on the CPU"):
+            away + here
+        with pytest.raises(RuntimeError):
+            away.numpy()
+        assert torch.equal(away.cpu(), here) and torch.equal(away.to("cpu"), here)
+        made = torch.tensor([1.0, 2.0], device=away.device)
+        assert isinstance(made, AwayTensor) and isinstance(torch.zeros_like(made), AwayTensor)
+        away[1] = 5
+        assert away.inner.tolist() == [1, 5, 1]
+        with pytest.raises(AssertionError, match="a kernel was given a tensor of cpu"):
+            gpu._kernel_argument(here)
+        with pytest.raises(AssertionError, match="not contiguous"):
+            gpu._kernel_argument(torch.ones(3, 2).to(gpu.gpu_device()).T)
+        with pytest.raises(AssertionError, match="a kernel was given"):
+            gpu._kernel_argument(np.int64(3))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_kernels_are_interpreted_and_auto_does_not_take_them():
+    assert gpu.is_interpreted() and gpu.gpu_device() == torch.device("cpu")
+    assert available_backends()[CUDA] is None and not gpu.has_gpu()
+
+
+interpreted = pytest.mark.skipif(
+    not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"
+)
+
+
+def record_small_kernels() -> Counter[Launch]:
+    source, target = torch.ones(40), torch.zeros(40)
+    with recorded_launches() as counts:
+        for count in (1, 16, 39):
+            gpu.launch(kernels.scale, (3,), source, target, count, 2.5, BLOCK=16, num_warps=1)
+        assert target[:39].eq(1.25).all() and target[39] == 0  # they run all the same
+        gpu.launch(kernels.scale, (1,), source[1:], target, 3, 1.0, BLOCK=16, num_warps=2)
+        gpu.launch(kernels.add_wide, (1,), source, target, BLOCK=16, num_warps=1)
+        gpu.launch(kernels.scale, (0,), source, target, 0, 1.0, BLOCK=64)
+    return counts
+
+
+def record_views(*names: str) -> list[Launch]:
+    every = views()
+    with recorded_launches() as counts:
+        for name in names or every:
+            every[name]()
+    return [*counts]
+
+
+@pytest.mark.long
+@interpreted
+def test_what_is_wrong_with_a_kernel_is_seen():
+    with recorded_launches() as broken, pytest.raises(Exception, match="arange"):
+        gpu.launch(kernels.broken, (1,), torch.ones(40), BLOCK=16)
+    with recorded_launches() as crowded:
+        many = torch.ones(2048)
+        gpu.launch(kernels.crowd, (1,), many, many, BLOCK=2048, num_warps=1, maxnreg=32)
+    compiled = compile_launches([*(record_small_kernels() | broken | crowded)])
+    good = [each for each in compiled if each.kernel.endswith(":scale")]
+    assert len(good) == 2 and not complaints(good) and all(each.registers for each in good)
+    found = {each.kernel.partition(":")[2]: complaints([each]) for each in compiled}
+    assert "does not compile" in found["broken"][0] and "power of 2" in found["broken"][0]
+    assert "spills" in found["crowd"][0]
+    assert "float64" in found["add_wide"][0] and "atomics" in found["add_wide"][1]
+
+
+@interpreted
+@pytest.mark.long
+def test_kernels_of_views_compile_into_what_they_should():
+    """One of each kernel of a few views, since compiling takes seconds; all of them below."""
+    launches = {each.name: each for each in record_views("clean")}
+    assert launches.keys() >= {"project_gaussians", "count_tiles", "list_pairs", "blend_blocks"}
+    assert not complaints(compile_launches([*launches.values()]))
+
+
+@pytest.mark.gpu
+def test_kernels_of_all_views_compile_into_what_they_should():
+    """In a process in which they are interpreted, since here they run on the GPU."""
+    code = (
+        "from tests.augment.test_cuda_compiles import *\n"
+        "assert not (wrong := complaints(compile_launches(record_views()))), wrong"
+    )
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
+    )
+    if "only 0-dimensional arrays" in done.stderr:
+        pytest.skip("this Triton interprets loops with older numpy only (3.6 with less than 2.4)")
+    assert done.returncode == 0, done.stderr

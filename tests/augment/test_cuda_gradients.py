@@ -16,7 +16,7 @@ pytest.importorskip("triton")
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
 from augment.render import layout
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.backward import color_gradients
@@ -87,14 +87,14 @@ def small_scene(count: int = 90) -> list[PosedGaussians]:
     "settings",
     [
         DEFAULT,
-        RasterSettings(antialiased=True, sh_degree=1),
-        RasterSettings(transmittance_stop=0.1),
+        pytest.param(RasterSettings(antialiased=True, sh_degree=1), marks=pytest.mark.long),
+        pytest.param(RasterSettings(transmittance_stop=0.1), marks=pytest.mark.long),
     ],
     ids=["default", "antialiased-degree-1", "coarse-stop"],
 )
 def test_colours_gradients_are_those_of_the_definition(settings):
     # float32 against float64: 1e-6 of sums of pixels, and 3e-6 of alpha by exp2.
-    parts, camera = small_scene(60), camera_ahead(18, 11, 14.0)
+    parts, camera = small_scene(30), camera_ahead(17, 9, 13.0)
     expected = sh_gradients(parts, camera, "reference", settings)
     assert_close(sh_gradients(parts, camera, "cuda", settings), expected, 2e-5)
 
@@ -105,44 +105,12 @@ def test_a_colour_held_by_its_clamp_has_no_gradient():
     assert found[0, 0, 0] == 0 and found[0, 0, 1:].all()
 
 
+@pytest.mark.long
 def test_parallel_rays_see_every_splat_from_one_side():
     camera = dataclasses.replace(camera_ahead(9, 7, 2.0), is_orthographic=True)
     parts = [PosedGaussians(random_gaussians(40, seed=2))]
     expected = sh_gradients(parts, camera, "reference")
     assert_close(sh_gradients(parts, camera, "cuda"), expected, 2e-5)
-
-
-def test_other_buffers_beside_rgb_are_constants():
-    camera, part = camera_ahead(9, 8, 9.0), tracked(PosedGaussians(random_gaussians(20)), "sh")
-    names = (ALPHA, MEDIAN_DEPTH, RGB, SPLAT_IDS)
-    out = rasterize([part], camera, buffers=names, backend="cuda")
-    plain = rasterize([PosedGaussians(random_gaussians(20))], camera, buffers=names, backend="cuda")
-    assert out.rgb is not None and out.rgb.requires_grad
-    for name in names:
-        image = getattr(out, name)
-        assert image.requires_grad == (name == RGB)
-        assert torch.equal(image.detach(), getattr(plain, name))
-
-
-def test_only_what_asks_for_gradients_gets_them():
-    camera, own = camera_ahead(9, 8, 9.0), PosedGaussians(random_gaussians(20))
-    part = tracked(own, "sh")
-    out = rasterize([own, part], camera, buffers=(RGB, ALPHA), backend="cuda")
-    assert out.rgb is not None
-    out.rgb.sum().backward()
-    assert own.gaussians.sh.grad is None and part.gaussians.sh.grad is not None
-    out = rasterize([part], camera, buffers=(ALPHA,), backend="cuda")
-    assert out.alpha is not None and not out.alpha.requires_grad
-
-
-def test_splats_changed_before_backward_are_noticed():
-    part = tracked(PosedGaussians(one_gaussian()), "sh")
-    out = rasterize([part], camera_ahead(5, 5, 5.0), buffers=(RGB,), backend="cuda")
-    assert out.rgb is not None
-    if gpu.gpu_device().type == "cpu":  # elsewhere the GPU keeps a copy of what was rendered
-        part.gaussians.means.add_(1)
-        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-            out.rgb.sum().backward()
 
 
 # ---- the transposed blend alone ----------------------------------------------------------------
@@ -205,6 +173,7 @@ def crowded() -> list[PosedGaussians]:
     return [PosedGaussians(stack(broad, hidden)), PosedGaussians(wall)]
 
 
+@pytest.mark.long
 def test_every_tile_adds_its_share():
     parts, camera = crowded(), camera_ahead(37, 21, 28.0)
     d_rgb = weights_of(camera)
@@ -229,7 +198,7 @@ def test_many_splats_on_a_real_gpu():
 
 
 def test_all_stays_on_the_gpu(monkeypatch):
-    parts, camera = small_scene(30), camera_ahead(9, 8, 9.0)
+    parts, camera = small_scene(15), camera_ahead(9, 8, 9.0)
     expected = sh_gradients(parts, camera, "cuda")
     with pretended_gpu(monkeypatch):
         device = gpu.gpu_device()

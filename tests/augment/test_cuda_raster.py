@@ -1,17 +1,20 @@
-"""Tile lists and blending on the GPU, and the whole rasteriser: against stored renders, against the
-definition, against the CPU's kernels and against itself. Without a GPU the kernels are interpreted.
+"""The GPU's projection, tile lists and blend, and the whole rasteriser: against stored renders,
+against the definition, against the CPU's kernels. Without a GPU the kernels are interpreted.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 import torch
 
-from augment.geometry import rigid
+from augment.cameras import Camera
+from augment.render import layout
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -25,18 +28,27 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.constants import RasterSettings
+from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.cuda import runtime as gpu
-from augment.render.cuda.driver import blend, list_tiles
-from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles
-from augment.render.layout import UNCUT, HeightClip
+from augment.render.cuda.driver import blend, list_tiles, project
+from augment.render.cuda.splats import BLOCK, HIDDEN, TILE, CudaSplats, CudaTiles, gather_inputs
+from augment.render.fog import Fog
+from augment.render.layout import ABOVE, BELOW, CUT, UNCUT, HeightClip
 from augment.render.rasterize import rasterize
-from augment.render.reference import rasterize_reference
+from augment.render.reference import half_extents, project_parts, rasterize_reference
+from augment.render.shading import LINES
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.augment import hard_scenes
-from tests.augment.drawn_splats import drawn_splats
-from tests.augment.hard_scenes import colour_maps, hard_gaussians, in_float64, snow_light
+from tests.augment.hard_scenes import (
+    KINDS,
+    SMOGS,
+    colour_maps,
+    hard_gaussians,
+    in_float64,
+    snow_light,
+    wide_camera,
+)
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.scenes import (
     camera_ahead,
@@ -47,8 +59,271 @@ from tests.scenes import (
     stack,
 )
 
-ALL = frozenset(BUFFERS)
+_K = 0.5 * math.log2(math.e)
+
+
+def drawn_splats(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings | None = None,
+    clip: HeightClip | None = None,
+    smog: Fog | None = None,
+) -> CudaSplats:
+    """The splats of the parts, computed in their own precision; NaN in rows that nobody may read.
+
+    Lies on the CPU.
+    """
+    splats = project_parts(parts, camera, settings or RasterSettings(), smog, clip)
+    half, size = half_extents(splats), torch.tensor([camera.width, camera.height])
+    low = torch.ceil((splats.means2d - half - 0.5).clamp_min(0))
+    high = torch.floor(torch.minimum(splats.means2d + half - 0.5, size - 1))
+    drawn = (low <= high).all(1) & (splats.opacities >= ALPHA_MIN)
+    splats, half = splats.select(drawn), half[drawn]
+    first, last = (edge[drawn].int() // TILE for edge in (low, high))
+
+    count, rows = sum(len(part.gaussians) for part in parts), splats.ids
+    xx, xy, yy = splats.covs2d.unbind(1)
+    fields = {
+        layout.MEAN_X: splats.means2d[:, 0],
+        layout.MEAN_Y: splats.means2d[:, 1],
+        layout.LEAN_X: xy / yy,
+        layout.SHARP_X: torch.sqrt(_K * yy / splats.dets),
+        layout.FALL_Y: _K / yy,
+        layout.LOG_OPACITY: torch.log2(splats.opacities),
+        layout.RADIUS_Y: half[:, 1],
+        layout.FALL_X: _K / xx,
+        layout.LEAN_Y: xy / xx,
+        layout.BLUNT_Y: torch.sqrt(splats.dets / xx / _K),
+        layout.DEPTH: splats.depths,
+        layout.IS_OVERLAY: splats.overlay,
+    }
+    assert splats.colors is not None
+    fields |= {layout.RED + channel: splats.colors[:, channel] for channel in range(3)}
+    records = torch.full((count, layout.RECORD), math.nan)
+    for field, values in fields.items():
+        records[rows, field] = values.float()
+    records[rows, layout.SPLAT_ID] = rows.int().view(torch.float32)
+    keys = torch.full((count,), HIDDEN, dtype=torch.int32)
+    keys[rows] = splats.depths.float().view(torch.int32)
+    rects = torch.full((count, 2), -1, dtype=torch.int32)
+    for corner, tile in enumerate((first, last)):
+        rects[rows, corner] = tile[:, 0] + (tile[:, 1] << 16)
+    counts = torch.zeros(count, dtype=torch.int32)
+    counts[rows] = (last - first + 1).prod(1).int()
+    cuts = lights = None
+    if splats.cuts is not None:
+        cuts = torch.full((count, CUT), math.nan)
+        cuts[rows, : splats.cuts.shape[1]] = splats.cuts.float()
+    if splats.lights is not None:
+        lights = torch.full((count, LINES), math.nan)
+        lights[rows] = splats.lights.float()
+    return CudaSplats(records, keys, rects, counts, cuts, lights)
+
+
 DEFAULT = RasterSettings()
+WEATHERS = (*SMOGS, ABOVE, BELOW, "light", "maps")
+# Relative errors of float32 against float64: of what is far from 0, and, of slopes and centres
+# about 0, absolute. At least twice the worst of the scenes here.
+CLOSE, NEAR_ZERO = 1e-4, 2e-4
+FLIPS = 2  # splats on the other side of a threshold, or in one more tile
+
+
+def splats_of(parts, camera, settings=DEFAULT, smog=None, clip=None, *, with_color=True):
+    """What the GPU projects, on the CPU; NaN in rows that nobody may read."""
+    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=with_color)
+    splats = project(inputs)
+    fields = {f.name: getattr(splats, f.name) for f in dataclasses.fields(splats)}
+    fields = {name: None if v is None else v.cpu() for name, v in fields.items()}
+    for name in ("records", "cuts", "lights"):
+        if fields[name] is not None:
+            fields[name][fields["counts"] == 0] = math.nan
+    fields["rects"][fields["counts"] == 0] = -1
+    return CudaSplats(**fields)
+
+
+def bits(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.contiguous().view(torch.int32)
+
+
+def assert_close(actual: CudaSplats, expected: CudaSplats, flips: int = FLIPS) -> None:
+    """The same splats, but for rounding and for a few at a threshold."""
+    drawn = (actual.counts > 0) & (expected.counts > 0)
+    assert int(((actual.counts > 0) != (expected.counts > 0)).sum()) <= flips
+    assert bool((actual.keys[actual.counts == 0] == HIDDEN).all())
+    assert int((actual.rects[drawn] != expected.rects[drawn]).any(1).sum()) <= flips
+    same = drawn & (actual.rects == expected.rects).all(1)
+    assert torch.equal(actual.counts[same], expected.counts[same])
+    z = [splats.keys[drawn].view(torch.float32) for splats in (actual, expected)]
+    torch.testing.assert_close(*z, rtol=3e-7, atol=0)
+    ids = [bits(splats.records[drawn, layout.SPLAT_ID]) for splats in (actual, expected)]
+    assert torch.equal(*ids)
+    for name in ("records", "cuts", "lights"):
+        ours, theirs = getattr(actual, name), getattr(expected, name)
+        assert (ours is None) == (theirs is None), name
+        if ours is None:
+            continue
+        for column in range(ours.shape[1] if name != "cuts" else layout.C_REACH + 1):
+            if (name, column) != ("records", layout.SPLAT_ID):
+                torch.testing.assert_close(
+                    ours[drawn, column], theirs[drawn, column], rtol=CLOSE, atol=NEAR_ZERO,
+                    msg=lambda text, at=(name, column): f"{at}: {text}",
+                )  # fmt: skip
+
+
+# ---- against the definition ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "weather"), [*zip(itertools.cycle(KINDS), WEATHERS, strict=False)]
+)
+def test_splats_are_the_definitions(kind, weather):
+    seed = KINDS.index(kind) + 10 * WEATHERS.index(weather)
+    camera = wide_camera((60.0, 10.0, 120.0)[seed % 3], at=(3.1, -2.2, 0.4), turn=0.2 * seed)
+    gaussians = hard_gaussians(kind, camera, 100, seed=seed, sh_degree=3)
+    part = PosedGaussians(gaussians, is_overlay=bool(seed % 2))
+    level = 0.397 if kind == "near" else 0.3
+    clip = HeightClip(level, weather) if weather in (ABOVE, BELOW) else None
+    if weather == "light":
+        part = dataclasses.replace(part, shading=snow_light(100, seed))
+    if weather == "maps":
+        part = dataclasses.replace(part, color_maps=colour_maps(seed))
+    smog = SMOGS.get(weather)
+    actual = splats_of([part], camera, DEFAULT, smog, clip)
+    expected = drawn_splats(in_float64([part]), camera, DEFAULT, clip, smog)
+    assert int((actual.counts > 0).sum()) > 20
+    assert_close(actual, expected)
+
+
+@pytest.mark.parametrize(
+    ("degree", "settings"),
+    [
+        (0, RasterSettings(antialiased=True)),
+        (1, RasterSettings(near_m=3.0)),
+        (2, RasterSettings(sh_degree=1)),
+        (3, RasterSettings(sh_degree=0, radius_clip_px=2.5)),
+    ],
+    ids=["antialiased", "near", "degree 1 of 2", "large ones, degree 0 of 3"],
+)
+def test_settings_and_every_degree_of_spherical_harmonics(degree, settings):
+    camera = camera_ahead()
+    part = PosedGaussians(random_gaussians(60, seed=3, sh_degree=degree))
+    actual = splats_of([part], camera, settings)
+    assert int((actual.counts > 0).sum()) > 10
+    assert_close(actual, drawn_splats(in_float64([part]), camera, settings), flips=0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("weather", [ABOVE, "light"])
+def test_an_orthographic_camera(weather):
+    camera = dataclasses.replace(camera_ahead(focal=6.0), is_orthographic=True)
+    part = PosedGaussians(random_gaussians(80, seed=5), slight_pose())
+    if weather == "light":
+        part = dataclasses.replace(part, shading=snow_light(80))
+    clip = None if weather != ABOVE else HeightClip(0.2, ABOVE)
+    assert_close(
+        splats_of([part], camera, clip=clip), drawn_splats(in_float64([part]), camera, None, clip)
+    )
+
+
+@pytest.mark.parametrize("rows", ["rows", pytest.param("classes", marks=pytest.mark.long)])
+def test_maps_by_class_or_by_row(rows):
+    camera, gaussians = camera_ahead(), random_gaussians(70, seed=7)
+    # Rows that are none mean the first map.
+    numbers = torch.arange(70, dtype=torch.int16) % 9 - 2
+    maps = colour_maps(2)
+    part = PosedGaussians(dataclasses.replace(gaussians, semantic=numbers), color_maps=maps)
+    if rows == "rows":
+        part = dataclasses.replace(part, color_rows=numbers.flip(0))
+    assert_close(splats_of([part], camera), drawn_splats(in_float64([part]), camera))
+
+
+def street_of_parts() -> list[PosedGaussians]:
+    """Parts of all kinds: of every degree, posed, snow, empty, lit, mapped, larger than a block."""
+    one = random_gaussians(150, seed=1, sh_degree=3)
+    classes = torch.arange(150, dtype=torch.int16) % 6
+    few = [random_gaussians(40, seed=degree, sh_degree=degree) for degree in range(4)]
+    return [
+        PosedGaussians(dataclasses.replace(one, semantic=classes), color_maps=colour_maps()),
+        PosedGaussians(few[0], slight_pose(), instance_id=1),
+        PosedGaussians(Gaussians.empty(3), slight_pose(), instance_id=2),
+        PosedGaussians(
+            few[1], slight_pose((0.5, 0.1, 0.2)), is_overlay=True, shading=snow_light(40)
+        ),
+        PosedGaussians(few[2], color_maps=colour_maps(3)[1:2]),
+        PosedGaussians(few[3], slight_pose((1.0, 0.0, 0.0)), is_overlay=True),
+    ]
+
+
+@pytest.mark.parametrize("weather", ["layered", pytest.param(ABOVE, marks=pytest.mark.long)])
+def test_many_parts_in_one_launch(weather):
+    camera, parts = camera_ahead(), street_of_parts()
+    clip, smog = (HeightClip(0.1, ABOVE) if weather == ABOVE else None), SMOGS.get(weather)
+    actual = splats_of(parts, camera, smog=smog, clip=clip)
+    assert_close(actual, drawn_splats(in_float64(parts), camera, None, clip, smog))
+    assert len(actual.keys) == 310 > BLOCK
+    # Lights of splats of one colour are 0.
+    lit = torch.zeros(310, dtype=torch.bool)
+    lit[190:230] = True
+    drawn = actual.counts > 0
+    assert actual.lights is not None
+    assert bool((actual.lights[drawn & ~lit] == 0).all())
+    assert bool((actual.lights[drawn & lit][:, 6:].amax(1) > 0).all())
+
+
+# ---- what must not change a bit ------------------------------------------------------------------
+
+
+def test_ties_stay_ties():
+    """The same mean has the same z at any place of the list."""
+    one = one_gaussian((4.2, 0.3, -0.1))
+    gaussians = stack(
+        random_gaussians(37, seed=8, sh_degree=0),
+        one,
+        random_gaussians(150, seed=9, sh_degree=0),
+        one,
+    )
+    splats = splats_of([PosedGaussians(gaussians, slight_pose())], camera_ahead())
+    assert splats.keys[37] == splats.keys[-1] != HIDDEN
+    assert torch.equal(splats.rects[37], splats.rects[-1])
+
+
+# ---- on a GPU ------------------------------------------------------------------------------------
+
+
+def test_gaussians_within_a_larger_tensor_on_the_gpu(monkeypatch):
+    """As a trainer holds them: they need not begin at a multiple of 16 bytes, nor be contiguous."""
+    camera, gaussians = camera_ahead(), random_gaussians(50, seed=4)
+    expected = splats_of([PosedGaussians(gaussians)], camera)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    with pretended_gpu(monkeypatch):
+        given = {}
+        for name in names:
+            values = getattr(gaussians, name)
+            flat = torch.cat([torch.zeros(1), values.flatten()]).to(gpu.gpu_device())
+            given[name] = flat[1:].view(values.shape)
+        given["quats"] = given["quats"].t().contiguous().t()
+        splats = splats_of([PosedGaussians(Gaussians(**given))], camera)
+    assert torch.equal(bits(splats.records), bits(expected.records))
+
+
+@pytest.mark.gpu
+def test_a_large_scene_is_the_definitions_and_the_same_every_time():
+    camera = camera_ahead(1600, 1066, 1500.0)
+    many = random_gaussians(20_000, seed=1, size=0.05)
+    parts = [PosedGaussians(many), *street_of_parts()]
+    for weather in ("clear", "uniform", "layered", ABOVE):
+        clip, smog = (HeightClip(0.1, ABOVE) if weather == ABOVE else None), SMOGS.get(weather)
+        first, second = (splats_of(parts, camera, smog=smog, clip=clip) for _ in range(2))
+        for name in ("records", "cuts", "lights"):
+            one, other = getattr(first, name), getattr(second, name)
+            assert (one is None) == (other is None)
+            assert one is None or torch.equal(bits(one), bits(other))
+        # Of 20 000 splats, more lie at the edge of a tile.
+        expected = drawn_splats(in_float64(parts), camera, None, clip, smog)
+        assert_close(first, expected, flips=40)
+
+
+ALL = frozenset(BUFFERS)
 LONG = pytest.mark.long
 
 
@@ -165,7 +440,9 @@ def random_splats(count: int, columns: int, rows: int, seed: int = 0) -> CudaSpl
     )
 
 
-@pytest.mark.parametrize(("count", "columns", "rows"), [(300, 5, 3), (3, 200, 170), (0, 3, 2)])
+@pytest.mark.parametrize(
+    ("count", "columns", "rows"), [(300, 5, 3), pytest.param(3, 200, 170, marks=LONG), (0, 3, 2)]
+)
 def test_lists_hold_every_pair_once_in_order_of_depth(count, columns, rows):
     """34 000 tiles do not fit into 16 bits."""
     splats = random_splats(count, columns, rows)
@@ -191,23 +468,12 @@ def test_tiles_without_a_wanted_pixel_own_nothing():
 # ---- blending ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [(33, 21), (1, 1)], ids=lambda s: f"{s[0]}x{s[1]}")
+@pytest.mark.parametrize("size", [(17, 9), (1, 1)], ids=lambda s: f"{s[0]}x{s[1]}")
 def test_blending_random_splats(size):
     camera = camera_ahead(*size, 0.9 * max(size))
-    parts = [PosedGaussians(random_gaussians(60, seed=sum(size), size=0.4))]
+    parts = [PosedGaussians(random_gaussians(30, seed=sum(size), size=0.4))]
     expected = rasterize_reference(in_float64(parts), camera, ALL, DEFAULT, None)
     assert_agrees(blend_alone(in_float64(parts), camera), expected)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("stop", [0.25, 0.01, 1e-6])
-def test_a_pixel_is_finished_at_the_stop(stop):
-    """Layers over layers; ids, depths and sums end where the definition's do."""
-    layers = [one_gaussian((2 + 0.3 * i, 0.02 * i, 0), 0.5 + 0.05 * i, 0.6) for i in range(45)]
-    parts, camera = [PosedGaussians(stack(*layers))], camera_ahead(9, 7, 14.0)
-    settings = RasterSettings(transmittance_stop=stop, alpha_max=0.5)
-    expected = rasterize_reference(in_float64(parts), camera, ALL, settings, None)
-    assert_agrees(blend_alone(in_float64(parts), camera, settings=settings), expected)
 
 
 @pytest.mark.long
@@ -236,7 +502,7 @@ def blended():
     return parts, camera, blend_alone(parts, camera)
 
 
-@pytest.mark.parametrize("buffer", [RGB, MODE_DEPTH, SPLAT_IDS])
+@pytest.mark.parametrize("buffer", [RGB, SPLAT_IDS])
 def test_bits_do_not_depend_on_the_buffers_asked_for(blended, buffer):
     parts, camera, whole = blended
     alone = blend_alone(parts, camera, frozenset({buffer}))
@@ -375,9 +641,9 @@ def test_equal_depths_keep_the_order_of_indices():
 
 
 def test_wanted_pixels_have_the_bits_of_the_whole_image():
-    parts, camera = random_gaussians(50, size=0.3), camera_ahead(35, 19, 30.0)
-    wanted = torch.zeros(19, 35, dtype=torch.bool)
-    wanted[17, 30:34] = True
+    parts, camera = random_gaussians(20, size=0.3), camera_ahead(18, 18, 16.0)
+    wanted = torch.zeros(18, 18, dtype=torch.bool)
+    wanted[17, 16:] = True
     whole = render(parts, camera)
     partly = render(parts, camera, pixel_mask=wanted)
     for name in ALL:
@@ -443,10 +709,3 @@ def test_a_crowd_has_the_same_bits_every_time(crowd):
     first = render(*crowd)
     for _ in range(3):
         assert_same_bits(render(*crowd), first)
-
-
-@pytest.mark.gpu
-def test_kilometres_from_the_origin():
-    pose = rigid(torch.eye(3, dtype=torch.float64), torch.tensor([31e3, -17e3, 250.0]).double())
-    camera = camera_ahead(97, 61, 80.0, position=(31_000.1, -17_000.3, 250.2))
-    assert_matches_definition([PosedGaussians(random_gaussians(300), pose)], camera)

@@ -1,4 +1,4 @@
-"""The datasets over written files and over live scenes."""
+"""The datasets over files, here and in stores elsewhere, and over live scenes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pickle
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -14,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from batch_scenes import (
-    LEVEL_Z_M,
     ORIGIN_M,
     FakeLabels,
     fake_render,
@@ -23,10 +23,9 @@ from batch_scenes import (
     must_not_render,
     open_fake,
 )
-from dataset_folders import CLEAR, FOGGY, assert_same_sample, write_scene
+from dataset_folders import CLEAR, FLOODED, FOGGY, MemoryStore, assert_same_sample, write_scene
 from torch.utils.data import DataLoader
 
-from augment.boxes import PlacedBoxes
 from augment.dataset import (
     ClipDataset,
     MixedDataset,
@@ -35,14 +34,16 @@ from augment.dataset import (
     clean_frames,
     collate_frames,
 )
-from augment.effects.flood.effect import hidden_pixels, submerged_fraction
+from augment.dataset.weather_dataset import Rows
 from augment.errors import BackendUnavailable, OutputError, SceneError
+from augment.geometry import invert_rigid, rotmat_from_quat, transform_points
 from augment.jobs.files import box_tables
+from augment.jobs.layout import MANIFEST
+from augment.jobs.manifest import parse_manifest, publish_part
 from augment.jobs.render_job import RenderJob, run_job
-from recipes.flood import Flood
 from recipes.schema import Recipe
 
-FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
+FOLDER = Path("street") / "fog-000"
 RECIPES = [
     make_recipe(),
     make_recipe(variant=1, image="jpg"),
@@ -112,25 +113,6 @@ def test_a_sample_holds_what_it_says(written: Path) -> None:
     assert sample["paths"]["image"].endswith("000003.png") and sample["paths"]["lidar"] is None
     assert sample["recipe_hash"] == recipe.hash
     assert (sample["scene"], sample["variant"], sample["frame"]) == ("street", "fog-000", 3)
-
-
-def test_a_flooded_sample_holds_what_it_says(written: Path) -> None:
-    files = WeatherDataset(written, variants=["clear-009"], cameras=["front"], frames=[1])
-    sample = files[0]
-    camera, boxes = make_frame(1).cameras["front"], FakeLabels().boxes(1)
-    view = fake_render(open_fake("fake:street"), camera, FLOODED, backend="")
-    assert sample["water"].dtype == torch.bool
-    np.testing.assert_array_equal(sample["water"].numpy(), view.masks["water"] > 0)
-    assert sample["surface"] == "first"
-    placed = PlacedBoxes.of(boxes, ORIGIN_M)
-    submerged = submerged_fraction(placed, LEVEL_Z_M)
-    np.testing.assert_array_equal(sample["boxes"]["submerged_fraction"].numpy(), submerged)
-    counted = hidden_pixels(placed, camera, view.effects["flood"].depth_m, view.masks["water"])
-    assert counted.marked.sum() > 0
-    hidden = [h / p if p else np.nan for p, h in zip(counted.pixels, counted.marked, strict=True)]
-    np.testing.assert_array_equal(sample["boxes"]["hidden_fraction"].numpy(), hidden)
-    assert sample["paths"]["water"].endswith("water/front/000001.png")
-    assert sample["paths"]["box_water"].endswith("labels/water.parquet")
 
 
 def test_filters(written: Path) -> None:
@@ -236,38 +218,6 @@ def test_failed_images_are_left_out(tmp_path: Path) -> None:
     assert len(WeatherDataset(tmp_path / "failed")) == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "damage", "message"),
-    [
-        ("images/front/000001.png", None, "000001.png cannot be read.*run the job again"),
-        ("images/front/000001.png", 100, "000001.png is damaged: its SHA-256"),
-        ("depth/front/000001.png", None, "depth/front/000001.png cannot be read"),
-        ("depth/front/000001.png", 300, "depth/front/000001.png is damaged: not a complete PNG"),
-        ("semantic/front/000001.png", 0, "semantic/front/000001.png is damaged"),
-        ("calibration.json", 50, "calibration.json is missing or not"),
-        ("labels/boxes.parquet", 50, "boxes.parquet is missing or not a readable"),
-    ],
-)
-def test_damaged_files_are_named(one_image, name, damage, message) -> None:
-    path = one_image / "street" / "fog-000" / name
-    data = path.read_bytes()
-    path.unlink()
-    if damage is not None:
-        path.write_bytes(data[:damage])
-    files = WeatherDataset(one_image)
-    with pytest.raises(OutputError, match=message):
-        files[0]
-
-
-def test_images_of_another_kind_are_named(one_image: Path) -> None:
-    folder = one_image / "street" / "fog-000"
-    (folder / "depth" / "front" / "000001.png").write_bytes(
-        (folder / "semantic" / "front" / "000001.png").read_bytes()
-    )
-    with pytest.raises(OutputError, match=r"depth/front/000001.png is damaged: expected.*uint16"):
-        WeatherDataset(one_image)[0]
-
-
 @pytest.fixture
 def one_flooded_image(tmp_path: Path) -> Path:
     job = RenderJob("fake:street", [FLOODED], tmp_path, frames=[1], cameras=["front"])
@@ -293,26 +243,43 @@ def test_numbers_of_other_boxes_are_refused(one_flooded_image: Path, item, messa
         WeatherDataset(one_flooded_image)[0]
 
 
-def test_entries_missing_from_companions_are_named(one_image: Path) -> None:
-    path = one_image / "street" / "fog-000" / "calibration.json"
-    calibration = json.loads(path.read_text())
+def test_damaged_files_are_named(one_image: Path) -> None:
+    folder = one_image / FOLDER
+    calibration = json.loads((folder / "calibration.json").read_text())
     calibration["frames"][0]["cameras"] = {}
-    path.write_text(json.dumps(calibration))
-    with pytest.raises(OutputError, match=r"calibration.json is damaged: it lacks 'front'"):
-        WeatherDataset(one_image)[0]
+    for name, damage, message in (
+        ("images/front/000001.png", None, "000001.png cannot be read.*run the job again"),
+        ("images/front/000001.png", 100, "000001.png is damaged: its SHA-256"),
+        ("depth/front/000001.png", 300, "depth/front/000001.png is damaged: not a complete PNG"),
+        ("depth/front/000001.png", (folder / "semantic/front/000001.png").read_bytes(),
+         r"depth/front/000001.png is damaged: expected.*uint16"),
+        ("semantic/front/000001.png", 0, "semantic/front/000001.png is damaged"),
+        ("calibration.json", 50, "calibration.json is missing or not"),
+        ("calibration.json", json.dumps(calibration).encode(), r"damaged: it lacks 'front'"),
+        ("labels/boxes.parquet", 50, "boxes.parquet is missing or not a readable"),
+    ):  # fmt: skip
+        path, data = folder / name, (folder / name).read_bytes()
+        path.unlink()
+        if damage is not None:
+            path.write_bytes(data[:damage] if isinstance(damage, int) else damage)
+        with pytest.raises(OutputError, match=message):
+            WeatherDataset(one_image)[0]
+        path.write_bytes(data)
+    assert WeatherDataset(one_image)[0]["image"] is not None
 
 
-@pytest.mark.parametrize("path", ["../secret.png", "/etc/hostname", "way/out.png"])
-def test_a_manifest_cannot_name_files_outside(one_image: Path, path: str, tmp_path_factory) -> None:
+def test_a_manifest_cannot_name_files_outside(one_image: Path, tmp_path_factory) -> None:
     outside = tmp_path_factory.mktemp("outside")
     (outside / "out.png").write_bytes(b"secret")
     (one_image / "way").symlink_to(outside)
     manifest = one_image / "manifest.parquet"
     table = pq.read_table(manifest)
     place = table.column_names.index("image_path")
-    pq.write_table(table.set_column(place, "image_path", pa.array([path])), manifest)
-    with pytest.raises(OutputError, match=r"relative to|outside"):
-        WeatherDataset(one_image)[0]
+    for path in ("../secret.png", "/etc/hostname", "way/out.png", "street/..", "street/a\\b.png",
+                 "/", "street/fog-000/", ""):  # fmt: skip
+        pq.write_table(table.set_column(place, "image_path", pa.array([path])), manifest)
+        with pytest.raises(OutputError, match=r"relative to|outside|cannot be read"):
+            WeatherDataset(one_image)[0]
 
 
 def test_folders_that_hold_no_dataset(tmp_path: Path) -> None:
@@ -338,12 +305,6 @@ def test_live_rendering_by_the_library(tmp_path: Path) -> None:
     assert files[0]["image"].std() > 0
 
 
-def test_live_samples_take_no_gpu_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("augment.render.cuda.runtime.has_gpu", lambda: True)
-    live = SceneDataset(open_fake("fake:street"), make_recipe(), frames=[0])
-    assert live._backend == "cpu"
-
-
 def test_a_forked_worker_cannot_draw_on_the_gpu() -> None:
     live = SceneDataset(
         open_fake("fake:street"), make_recipe(), frames=[0], renderer=fake_render, backend="cuda"
@@ -357,3 +318,182 @@ def test_a_forked_worker_cannot_draw_on_the_gpu() -> None:
     with pytest.raises(BackendUnavailable, match="in a forked process"):
         live[0]
     assert pickle.loads(pickled)[0]["image"].shape == (3, 16, 24)
+
+
+# ---- What is read, and from where ---------------------------------------------------------------
+
+ALL = ("image", "depth", "semantic", "instance", "water", "snow", "boxes", "lidar")
+
+
+def same_tables(a: pa.Table, b: pa.Table) -> bool:
+    """Equal, where NaN equals NaN."""
+    return a.schema.equals(b.schema) and repr(a.to_pydict()) == repr(b.to_pydict())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("reading") / "out"
+    write_scene(out, [CLEAR, FOGGY, FLOODED])
+    return out
+
+
+@pytest.fixture
+def remote(folder: Path) -> MemoryStore:
+    return MemoryStore.of(folder)
+
+
+def test_a_remote_folder_reads_like_a_local_one(folder: Path, remote: MemoryStore) -> None:
+    here, there = WeatherDataset(folder, load=ALL), WeatherDataset(remote, load=ALL)
+    assert len(here) == len(there) == 24 and same_tables(here.table, there.table)
+    for index in range(24):
+        assert_same_sample(here[index], there[index], but=("paths",))
+    path = "street/clear-000/images/front/000000.png"
+    assert there[0]["paths"]["image"] == f"memory://bucket/out/{path}?region=here"
+    assert here[0]["paths"]["image"] == str(folder / path)
+
+
+def test_remote_samples_in_workers(folder: Path, remote: MemoryStore) -> None:
+    # Starts OpenCV's threads, which forked workers do not have.
+    cv2.GaussianBlur(np.zeros((1000, 1000, 3), np.uint8), (0, 0), 3)
+    dataset = WeatherDataset(remote, frames=[1])
+    expected = [dataset[index] for index in range(6)]
+    assert_same_sample(pickle.loads(pickle.dumps(dataset))[5], expected[5])  # as under spawn
+    loader = DataLoader(
+        dataset, batch_size=3, num_workers=2, collate_fn=collate_frames,
+        multiprocessing_context="fork", timeout=100,
+    )  # fmt: skip
+    batches = list(loader)
+    images = torch.cat([batch["image"] for batch in batches])
+    assert torch.equal(images, torch.stack([sample["image"] for sample in expected]))
+    assert batches[0]["camera"]["world_from_ego"].shape == (3, 4, 4)
+
+
+def test_blocks_of_running_jobs_are_seen(folder: Path, remote: MemoryStore) -> None:
+    table = parse_manifest(remote.read(MANIFEST), "here")
+    remote.delete([MANIFEST])
+    publish_part(remote, "block", table.slice(0, 8))
+    expected = WeatherDataset(folder).table.slice(0, 8)
+    assert same_tables(WeatherDataset(remote).table, expected)
+
+
+def test_options_that_there_are_not(folder: Path, unchecked) -> None:
+    for options, message in (
+        ({"load": "depth"}, r"load must be some of image, .*; got 'depth'"),
+        ({"load": ["flow"]}, r"load must be some of image, .*; got \['flow'\]"),
+        ({"box_frame": "car"}, "box_frame must be one of world, ego, camera; got 'car'"),
+        ({"image_type": "int8"}, "image_type must be one of float32, uint8; got 'int8'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            WeatherDataset(folder, **options)
+    with pytest.raises(ValueError, match="load must not have 'lidar' for a live scene"):
+        SceneDataset(open_fake("fake:street"), CLEAR, load=ALL, renderer=fake_render)
+
+
+def test_sweeps(folder: Path) -> None:
+    dataset = WeatherDataset(folder, variants=["clear-000"], cameras=["front"], load=["lidar"])
+    sweep = FakeLabels().lidar(1)
+    lidar = dataset[1]["lidar"]
+    assert lidar["points_m"].numpy().tobytes() == sweep.points_m.tobytes()
+    assert lidar["intensity"].dtype == torch.uint8 and lidar["timestamp_ns"][1] == 2**60 + 1
+    assert lidar["sensor"].tolist() == ["top", "front"] * 25 and "x" not in lidar
+    assert dataset[3]["lidar"] is None  # the source has no sweep of this frame
+
+
+@pytest.mark.parametrize("frame", ["ego", "camera"])
+def test_boxes_and_points_in_other_frames(folder: Path, frame) -> None:
+    asked = {"variants": ["clear-000"], "cameras": ["rear/left"], "load": ("boxes", "lidar")}
+    world = WeatherDataset(folder, **asked)[2]
+    moved = WeatherDataset(folder, box_frame=frame, **asked)[2]
+    assert (world["boxes"]["frame"], moved["boxes"]["frame"]) == ("world", frame)
+    frame_from_world = invert_rigid(moved["camera"][f"world_from_{frame}"])
+    for key, kind in (("centers_m", "boxes"), ("points_m", "lidar")):
+        expected = transform_points(frame_from_world, world[kind][key])
+        # The world's coordinates are 4e6 m: a unit in their last place is 1e-9 m.
+        np.testing.assert_allclose(moved[kind][key], expected, atol=1e-8)
+    rotations = frame_from_world[:3, :3] @ rotmat_from_quat(world["boxes"]["quats"])
+    np.testing.assert_allclose(rotmat_from_quat(moved["boxes"]["quats"]), rotations, atol=1e-12)
+    assert torch.equal(moved["boxes"]["sizes_m"], world["boxes"]["sizes_m"])
+    ego = moved["camera"]["world_from_ego"]
+    assert ego.dtype == torch.float64 and ego[0, 3] == world["camera"]["world_from_ego"][0, 3]
+
+
+def test_live_samples_have_the_same_options(folder: Path) -> None:
+    options = {"load": ("image", "boxes"), "box_frame": "camera", "transform": lambda s: [s]}
+    options |= {"image_type": "uint8"}
+    scene = open_fake("fake:street")
+    live = SceneDataset(scene, FLOODED, renderer=fake_render, **options)
+    files = WeatherDataset(folder, variants=["clear-009"], **options)
+    assert_same_sample(live[3][0], files[3][0], but=("paths",))
+    assert live[3][0]["depth"] is None and live[3][0]["boxes"]["frame"] == "camera"
+    assert live[3][0]["image"].dtype == torch.uint8
+
+
+def test_visibility_of_boxes(folder: Path) -> None:
+    clear = WeatherDataset(folder, variants=["clear-000"], frames=[3])[0]["boxes"]
+    assert clear["transmittance"] is None and clear["visibility"].tolist() == [1, 1, 1]
+    foggy = WeatherDataset(folder, variants=["fog-000"], frames=[3])[0]["boxes"]
+    assert torch.equal(foggy["visibility"], foggy["transmittance"])
+    assert 0 < foggy["visibility"].max() < 1
+    wet = WeatherDataset(folder, variants=["clear-009"], frames=[2])[0]["boxes"]
+    left = 1 - wet["hidden_fraction"].nan_to_num(0.0)
+    np.testing.assert_allclose(wet["visibility"], left)
+
+
+def test_links_may_lead_inside_only(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_scene(out, [CLEAR], frames=2)
+    image = out / "street/clear-000/images/front/000000.png"
+    image.rename(out / "elsewhere.png")
+    image.symlink_to(out / "elsewhere.png")
+    assert WeatherDataset(out)[0]["image"] is not None
+    (out / "elsewhere.png").rename(tmp_path / "outside.png")
+    image.unlink()
+    image.symlink_to(tmp_path / "outside.png")
+    dataset = WeatherDataset(out)
+    with pytest.raises(OutputError, match=r"leads through a link to .*outside"):
+        dataset[0]
+    assert dataset[2]["image"] is not None
+
+
+def test_only_what_is_asked_for_is_read(remote: MemoryStore) -> None:
+    whole = dict(remote.files)
+    folders = {"boxes": "labels", "image": "images"}
+    for kind in ALL:
+        kept = ("manifest", "calibration", f"/{folders.get(kind, kind)}/")
+        remote.files = {p: d for p, d in whole.items() if any(part in p for part in kept)}
+        variant = "clear-009" if kind in ("water", "snow") else "clear-000"
+        dataset = WeatherDataset(remote, variants=[variant], frames=[1], load=[kind])
+        there = {name for name in ALL if dataset[0][name] is not None}
+        assert there == ({kind} if kind != "snow" else set())
+        if kind not in ("boxes", "lidar"):
+            batch = collate_frames([dataset[0], dataset[1]])
+            assert (batch[kind] is None) == (kind == "snow")
+
+
+@pytest.mark.parametrize("checksum", ["ab" * 32, None, "x"])
+def test_columns_are_the_manifests(folder: Path, checksum: str | None) -> None:
+    """Also those with more values than 16 bits tell apart, or with other checksums."""
+    table = pq.read_table(folder / MANIFEST)
+    whole = WeatherDataset(folder).rows
+    chosen = whole.take(np.array([5, 3, -1]))
+    assert same_tables(whole.to_arrow(), table)
+    assert same_tables(chosen.to_arrow(), table.take([5, 3, 23]))
+    assert same_row(chosen.row(1), table, 3)
+
+    count = 66_000
+    columns = {
+        "checksum": pa.array(["ab" * 32, checksum] * (count // 2), pa.string()),
+        "image_path": pa.array(["a/b.png", None, "c\nd/e", "f"] * (count // 4), pa.string()),
+        "timestamp_ns": pa.array(range(count)),
+        "scene": pa.array([f"{k}" for k in range(count)]),
+        "snow_depth_m": pa.array([float("nan")] * count),
+    }
+    table = pa.concat_tables([pa.table(columns).slice(0, 9), pa.table(columns).slice(9)])
+    rows = pickle.loads(pickle.dumps(Rows.of(table)))
+    assert same_tables(rows.to_arrow(), table)
+    assert all(same_row(rows.row(k), table, k) for k in (0, 1, 2, count - 1))
+    assert same_tables(Rows.of(table.slice(0, 0)).to_arrow(), table.slice(0, 0))
+
+
+def same_row(row: dict, table: pa.Table, number: int) -> bool:
+    return same_tables(pa.Table.from_pylist([row], table.schema), table.slice(number, 1))

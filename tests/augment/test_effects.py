@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.base import open_scene
 from augment import effects
 from augment.dataset import WeatherDataset
 from augment.effects.lidar.codes import ATTENUATED, CODE_COLUMN, LOST, UNCHANGED
@@ -21,13 +20,13 @@ from recipes.json_schema import recipe_json_schema
 from recipes.load import load_recipe
 from recipes.schema import KNOBS, Recipe
 from tests.augment.dust import TINT, DustEffect
+from tests.streets import LABELLED_STREET, open_street
 from tools.explain import explain_recipe, explanation_text
 from tools.report import write_report
 
-URI = "procedural:street?seed=3&frames=2"
+URI = LABELLED_STREET
 HALF_M = 25.0
 TEXT = f"""weather: {{dust: {{half_m: {HALF_M}, color: [1, 0, 0]}}}}
-render: {{scale: 0.1}}
 output: {{lidar: weather, instance: true}}
 """
 
@@ -53,7 +52,7 @@ def job(tmp_path_factory, recipe_file):
     recipes = [load_recipe(str(recipe_file)).resolve(0)]
     run_job(
         RenderJob(URI, recipes, out, frames=[0], cameras=["front"], workers=1),
-        scene_loader=open_scene,
+        scene_loader=open_street,
         progress=False,
     )
     return out
@@ -86,7 +85,7 @@ def test_a_recipe_without_it_has_the_hash_it_had():
 
 
 def test_plans_and_explain_name_its_passes(recipe_file):
-    scene = open_scene(URI)
+    scene = open_street(URI)
     plan = make_plan(load_recipe(str(recipe_file)).resolve(0), scene)
     assert "expected_depth" in plan.buffers
     assert [s.runs for s in plan.steps if s.name == TINT] == [True]
@@ -96,7 +95,7 @@ def test_plans_and_explain_name_its_passes(recipe_file):
 
 
 def test_pictures_are_tinted_with_the_distance(recipe_file):
-    scene, dusty = open_scene(URI), load_recipe(str(recipe_file)).resolve(0)
+    scene, dusty = open_street(URI), load_recipe(str(recipe_file)).resolve(0)
     camera = scene.frames[0].cameras["front"]
     clear = render_view(scene, camera, dusty.model_copy(update={"weather": Recipe().weather}))
     view = render_view(scene, camera, dusty)
@@ -105,7 +104,7 @@ def test_pictures_are_tinted_with_the_distance(recipe_file):
     near = (view.depth_m > 0) & (view.depth_m < HALF_M / 4)
     assert (view.masks["dust"][sky] == 255).all() and not view.masks["dust"][near].any()
     green = view.rgb[..., 1] / np.maximum(clear.rgb[..., 1], 1.0)  # the dust has none
-    lengths = scene.frames[0].cameras["front"].scaled(0.1).ray_lengths().numpy()
+    lengths = scene.frames[0].cameras["front"].ray_lengths().numpy()
     expected = np.exp2(-view.depth_m * lengths / HALF_M)
     assert np.median(np.abs(green - expected)[~sky]) < 0.02  # of 8-bit colours
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 from typing import Any
@@ -19,26 +18,20 @@ from augment.effects.snow.cells import SnowCells
 from augment.effects.snow.layer import find_depths, profile_of, surface_heights
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import support_of
-from augment.errors import SceneError
 from augment.plan import make_plan
 from augment.rng import rng_for
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Track
 from augment.semantics import SemanticClass
 from augment.views import WeatheredView, render_buffers, render_view
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
 from recipes.snow import Snow
-from recipes.template import FieldSpec, Kind
-from tests.augment.examples import drawing
 from tests.augment.extremes import (
     CELL_M,
-    EFFECTS,
-    PAIRS,
     Place,
     camera_at,
     cameras,
-    ends_of,
     nothing,
     number_fields,
     numbers_beyond,
@@ -49,14 +42,9 @@ from tests.augment.extremes import (
     snow_model,
     street,
 )
+from tests.augment.hard_scenes import drawing
 from tests.scenes import one_gaussian
 from tests.snow_beds import cells_on_grid
-
-EVERYTHING = {
-    "smog": {"extinction_per_m": 0.1, "scale_height_m": 5.0},
-    "flood": {"level_m": 0.2, "reflection": "screen_space"},
-    "snow": {"depth_m": 0.3, "cell_m": 0.2, "sparkle": 1.0},
-}
 
 
 def weather(depth: str = "expected", **effects) -> Recipe:
@@ -69,15 +57,6 @@ def weather(depth: str = "expected", **effects) -> Recipe:
 @given(places(), cameras(levels_m=(0.2,)), recipes())
 def test_any_scene_from_anywhere_in_any_weather(place: Place, camera: Camera, recipe: Recipe):
     rendered(place.scene(), camera, recipe)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: "-".join(sorted(pair)))
-@drawing(4)
-@given(data=st.data())
-def test_every_pair_of_effects(pair: frozenset[str], data: st.DataObject):
-    place, camera = data.draw(places()), data.draw(cameras(levels_m=(0.2,)))
-    rendered(place.scene(), camera, data.draw(recipes(pair)))
 
 
 @pytest.mark.long
@@ -97,27 +76,12 @@ def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
 
 @pytest.mark.long
 @pytest.mark.parametrize("size", [(8192, 1), (1, 8192)])
-@pytest.mark.parametrize("effects", [("smog", "snow"), ("flood",)])
-def test_images_of_one_row_or_column(size: tuple[int, int], effects: tuple[str, ...]):
+def test_images_of_one_row_or_column(size: tuple[int, int]):
     scene = Place(nothing(), 3, on_street=True).scene()
     camera = camera_at((0.0, 0.0, 1.2), pitch_deg=-10, size=size, fov_deg=100)
-    chosen = {name: EVERYTHING[name] for name in effects}
-    if "flood" in chosen:
-        chosen["flood"] = {"level_m": 0.2, "reflection": "sky"}
-    rendered(scene, camera, weather(style={"preset": "dusk"}, **chosen))
-
-
-@pytest.mark.parametrize("opacity", [0.0, 1 / 255, 1.0])
-def test_one_gaussian(opacity: float):
-    """Of opacity 0 it is the sky that shows; at 1/255 and above, the Gaussian."""
-    one = dataclasses.replace(
-        one_gaussian(opacity=opacity), semantic=torch.ones(1, dtype=torch.int16)
-    )
-    place = Place(one, 1, on_street=False)
-    view = rendered(place.scene(), camera_at((0.0, 0.0, 0.0)), weather())
-    assert view.depth_m is not None
-    assert bool(view.depth_m.any()) == (opacity == 1.0)
-    assert np.unique(view.rgb).size == (1 if opacity == 0 else np.unique(view.rgb).size)
+    snow = {"depth_m": 0.3, "cell_m": 0.2}
+    for effects in ({"snow": snow, "smog": {"extinction_per_m": 0.1}}, {"flood": {"level_m": 0.2}}):
+        rendered(scene, camera, weather(style={"preset": "dusk"}, **effects))
 
 
 @pytest.mark.long
@@ -137,12 +101,11 @@ def test_two_million_gaussians():
         semantic=torch.ones(count, dtype=torch.int16),
     )
     scene = Place(many, 3, on_street=True).scene()
-    rendered(scene, camera_at((0.0, 0.0, 1.2), size=(48, 27)), weather(**EVERYTHING))
-
-
-def test_nothing_at_all_is_refused():
-    with pytest.raises(SceneError, match="holds no Gaussians"):
-        Place(nothing(), 0, on_street=False).scene()
+    rendered(
+        scene,
+        camera_at((0.0, 0.0, 1.2), size=(48, 27)),
+        weather(snow={"depth_m": 0.3, "cell_m": 0.2}, smog={"extinction_per_m": 0.1}),
+    )
 
 
 def test_actors_that_are_all_gone_leave_the_sky():
@@ -156,23 +119,6 @@ def test_actors_that_are_all_gone_leave_the_sky():
     assert view.semantic is not None and (view.semantic == SemanticClass.SKY).all()
     assert view.instance is not None and not view.instance.any()
     assert view.depth_m is not None and not view.depth_m.any()
-
-
-@pytest.mark.long
-@drawing(3)
-@given(places())
-def test_snow_is_placed_among_extreme_gaussians(place: Place):
-    """The placement itself, and not the street's, of the street and what else there is."""
-    base = place.scene()
-    frames = street().frames
-    scene: Scene = dataclasses.replace(base, frames=frames)  # another object: nothing remembered
-    snow = {"depth_m": 0.3, "cell_m": 0.5}
-    try:
-        support_of(scene, placement_settings(snow_model(cell_m=0.5)))
-    except SceneError as error:
-        assert "cell" in str(error)
-        return
-    rendered(scene, camera_at((0.0, 0.0, 1.2), pitch_deg=-20), weather(snow=snow))
 
 
 DENSITIES_PER_M = (0.0, 1e-8, 1e-3, 0.02, 0.1, 0.5, 3.0, 100.0)
@@ -193,6 +139,7 @@ def assert_never_grows(less: torch.Tensor, more: torch.Tensor) -> None:
     assert worst <= room, f"denser smog adds {worst} of contrast; rounding may add {room}"
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -210,6 +157,7 @@ def test_denser_smog_never_adds_contrast_to_a_black_airlight(
         assert_never_grows(less, more)
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -226,6 +174,7 @@ def test_denser_smog_on_buffers_never_adds_contrast_to_any_airlight(
         assert_never_grows(less, more)
 
 
+@pytest.mark.long
 @drawing(4)
 @given(
     places(),
@@ -264,6 +213,7 @@ def surface(cells: SnowCells, snow: Snow, seed: int) -> np.ndarray:
     return surface_heights(cells, depths.heights)
 
 
+@pytest.mark.long
 @drawing(20)
 @given(
     st.sampled_from((0.0, 0.003, 0.1, 3.0)) | st.none(),
@@ -291,24 +241,6 @@ def test_deeper_snow_never_lowers_the_surface(
         assert sunk <= 1e-6 * (1 + float(np.abs(low).max())), f"deeper snow sank by {sunk} m"
 
 
-@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
-def test_deeper_snow_comes_nearer_to_a_camera_above_it(shading: str):
-    """Depth along the rays of a frame, within what the discs of neighbouring cells blur."""
-    scene = Place(nothing(), sky=1, on_street=True).scene()
-    camera = camera_at((2.5, 0.0, 30.0), pitch_deg=-90, fov_deg=6, size=(12, 8))
-    before = None
-    for depth_m in (0.0, 0.05, 0.2, 0.5, 1.0, 5.0):
-        snow = {"depth_m": depth_m, "cell_m": 0.2, "shading": shading, "tracks": "never"}
-        data = {"weather": {"snow": snow}, "output": {"depth": "median"}}
-        view = render_view(scene, camera, Recipe.model_validate(data))
-        assert view.depth_m is not None and (view.depth_m > 0).all()
-        if before is not None:
-            assert (view.depth_m <= before + 0.01).all()
-            assert view.depth_m.mean() < before.mean()
-        before = view.depth_m
-
-
-NUMBERS = number_fields()
 # What a recipe needs besides the field in question, by section.
 BESIDE: dict[str, dict[str, Any]] = {
     "weather.smog": {"extinction_per_m": 0.1},
@@ -321,118 +253,59 @@ INSTEAD = {
     "weather.smog.visibility_m": "extinction_per_m",
     "weather.flood.absorption_per_m": "turbidity_ntu",
 }
-# Settings that are not of a frame, or that a job replaces before there is one.
-NOT_OF_FRAMES = ("quality", "output.jpeg_quality")
-PLACEMENT = ("weather.snow.cell_m", "weather.snow.max_slope_deg")
+NUMBERS = {path: (number, three) for path, number, three in number_fields()}
+# Settings that are not of a frame, or that would place the street's snow anew.
+OTHERS = ("quality", "output.jpeg", "weather.snow.cell_m", "weather.snow.max_slope_deg", "seed")
 
 
-def name_of(field: FieldSpec) -> str:
-    return field.path.rpartition(".")[2]
-
-
-def recipe_data(field: FieldSpec, value: Any) -> dict[str, Any]:
+def recipe_data(path: str, value: Any) -> dict[str, Any]:
     """The mapping of the smallest recipe that gives the field this value."""
     data: dict[str, Any] = {"output": {"depth": "expected", "labels": False}}
-    here, path = data, ""
-    *above, name = field.path.split(".")
+    here, at = data, ""
+    *above, name = path.split(".")
     for part in above:
-        path = f"{path}.{part}" if path else part
-        below = dict(BESIDE.get(path, {}))
+        at = f"{at}.{part}".lstrip(".")
+        below = dict(BESIDE.get(at, {}))
         if part.endswith("[]"):
-            here[part[:-2]] = [below]
+            here[part[:-2]] = (below,)
         else:
             below = here.setdefault(part, {}) | below
             here[part] = below
         here = below
-    here.pop(INSTEAD.get(field.path, ""), None)
-    here[name] = value
+    here.pop(INSTEAD.get(path, ""), None)
+    here[name] = (value,) * 3 if NUMBERS[path][1] else value
     return data
 
 
-def filled(field: FieldSpec, number: float) -> Any:
-    """What stands in a file: the number, or three of it."""
-    return number if field.channel is None else [number] * 3
-
-
-def by_path(field: FieldSpec) -> str:
-    return field.path
-
-
 def test_numbers_beyond_their_limits_are_refused_by_name():
-    cases = [(f, number) for f in NUMBERS for number in numbers_beyond(f.channel or f)]
-    assert {f.path for f, _ in cases} == {f.path for f in NUMBERS}
-    for field, number in cases:
-        data = recipe_data(field, filled(field, number))
-        with pytest.raises(ValidationError, match=name_of(field)):
-            Recipe.model_validate(_tuples(data))
-        with pytest.raises(RecipeError, match=name_of(field)):
-            parse_recipe(_yaml(data), source="beyond.yaml")
-
-
-def _tuples(data: Any) -> Any:
-    """Lists as the tuples that recipes in numbers hold."""
-    if isinstance(data, dict):
-        return {key: _tuples(value) for key, value in data.items()}
-    return tuple(map(_tuples, data)) if isinstance(data, list) else data
-
-
-def _yaml(data: dict[str, Any]) -> str:
-    text = json.dumps(data)
-    for name, sign in (("NaN", ".nan"), ("-Infinity", "-.inf"), ("Infinity", ".inf")):
-        text = text.replace(name, sign)
-    return text
-
-
-FRAMED = [f for f in NUMBERS if not f.path.startswith(NOT_OF_FRAMES) and f.path not in PLACEMENT]
+    assert len(NUMBERS) > 40
+    for path, (number, _) in NUMBERS.items():
+        for value in numbers_beyond(number):
+            data, name = recipe_data(path, value), path.rpartition(".")[2]
+            with pytest.raises(ValidationError, match=name):
+                Recipe.model_validate(data)
+            text = json.dumps(data)
+            for word, sign in (("NaN", ".nan"), ("-Infinity", "-.inf"), ("Infinity", ".inf")):
+                text = text.replace(word, sign)
+            with pytest.raises(RecipeError, match=name):
+                parse_recipe(text, source="beyond.yaml")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("field", FRAMED, ids=by_path)
-def test_each_number_at_its_ends_makes_a_frame_or_is_refused_in_words(field: FieldSpec):
+@pytest.mark.parametrize("path", [path for path in NUMBERS if not path.startswith(OTHERS)])
+def test_each_number_at_its_ends_makes_a_frame_or_is_refused_in_words(path: str):
     scene = Place(nothing(), sky=3, on_street=True).scene()
     camera = camera_at((0.0, 0.0, 1.2), pitch_deg=-20)
     made = 0
-    for number in ends_of(field.channel or field):
-        data = _tuples(recipe_data(field, filled(field, number)))
+    for value in numbers_of(NUMBERS[path][0])[:3]:  # the ends and 0
         try:
-            recipe = Recipe.model_validate(data)
-        except ValidationError as error:
-            # A rule between fields: each number is allowed for itself.
-            assert field.accepts(_tuples(filled(field, number)))
-            assert name_of(field) in str(error)
+            recipe = Recipe.model_validate(recipe_data(path, value))
+        except ValidationError as error:  # a rule between fields
+            assert path.rpartition(".")[2] in str(error)
             continue
         rendered(scene, camera, recipe)
         made += 1
     assert made
-
-
-@pytest.mark.long
-def test_all_numbers_at_their_lowest_and_all_at_their_highest_make_frames():
-    scene = Place(nothing(), sky=3, on_street=True).scene()
-    for end in (0, 1):
-        data: dict[str, Any] = {"style": {"preset": "dusk"}, "output": {"depth": "expected"}}
-        for field in NUMBERS:
-            if field.path.startswith(("quality", "weather.flood.waves.components")):
-                continue
-            if field.path in (*INSTEAD, *PLACEMENT) or field.kind is Kind.TEXT:
-                continue
-            *above, name = field.path.split(".")
-            here = data
-            for part in above:
-                here = here.setdefault(part, {})
-            here[name] = filled(field, numbers_of(field.channel or field)[end])
-        data["weather"]["snow"]["cell_m"] = CELL_M
-        recipe = Recipe.model_validate(_tuples(data))
-        rendered(scene, camera_at((0.0, 0.0, 1.2), pitch_deg=-20, size=(6, 4)), recipe)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("cell_m", [0.05, 10.0])
-@pytest.mark.parametrize("max_slope_deg", [0.0, 85.0])
-def test_snow_is_placed_at_extreme_settings(cell_m: float, max_slope_deg: float):
-    snow = {"depth_m": 0.1, "cell_m": cell_m, "max_slope_deg": max_slope_deg}
-    recipe = Recipe.model_validate({"weather": {"snow": snow}})
-    rendered(street(), camera_at((0.0, 0.0, 1.2), pitch_deg=-20), recipe)
 
 
 UNIT = st.sampled_from((0.0, 0.5, 1.0))
@@ -498,20 +371,6 @@ def test_effects_without_strength_change_no_bit(
     assert view.masks.get("snow") is None or not view.masks["snow"].any()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("effect", EFFECTS)
-@drawing(6)
-@given(data=st.data())
-def test_effects_without_strength_change_no_bit_of_another_effect(effect: str, data: st.DataObject):
-    """Each effect as drawn, with and without the others at no strength."""
-    place, camera = data.draw(places()), data.draw(cameras())
-    recipe = data.draw(recipes(frozenset({effect})))
-    others = sorted(set(ZEROS) - {effect})
-    zero = with_effects(recipe, {name: data.draw(ZEROS[name]) for name in others})
-    scene = place.scene()
-    assert_same_bits(render_view(scene, camera, zero), render_view(scene, camera, recipe))
-
-
 @pytest.mark.parametrize(
     "tier",
     ["sky", *(pytest.param(t, marks=pytest.mark.long) for t in ("screen_space", "mirrored"))],
@@ -529,16 +388,3 @@ def test_waves_without_height_are_still_water(tier: str):
     assert views[0].masks["water"].any()
     for view in views[1:]:
         assert_same_bits(view, views[0])
-
-
-def test_a_style_and_snow_without_strength_keep_a_recorded_exposure():
-    """What comes last, a camera's colour map, is not touched by effects that do nothing."""
-    import dataclasses
-
-    scene = Place(nothing(), sky=3, on_street=True).scene()
-    exposure = torch.tensor([[0.9, 0.1, 0.0, 0.02], [0, 1.1, 0, -0.3], [0, 0, 0.5, 0.4]])
-    scene = dataclasses.replace(scene, color_maps={"extreme": exposure})
-    camera = camera_at((0.0, 0.0, 1.2))
-    zero = {"snow": {"depth_m": 0.0}, "style": {"preset": "dusk", "strength": 0.0}}
-    view = render_view(scene, camera, with_effects(Recipe(), zero))
-    assert_same_bits(view, render_view(scene, camera, Recipe()))

@@ -1,8 +1,12 @@
-"""Dataset jobs in one process: what is rendered, what is left alone, what becomes of failures."""
+"""`climategs generate`: what is rendered, what is left alone, what becomes of failures and kills."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,14 +26,17 @@ from generate_jobs import (
     raising_render,
 )
 
-from augment.errors import ClimateGSError, OutputError
+from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
+from augment.jobs.block_worker import VARIANTS, enter_variant
 from augment.jobs.blocks import read_status, stored_plans
-from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
+from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
 from augment.jobs.layout import folder_name
-from augment.jobs.manifest import list_parts, read_finished, read_manifest
+from augment.jobs.manifest import Identity, list_parts, read_finished, read_manifest
+from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
+from augment.jobs.worker import shares_of
 from recipes.job import JobScene
 
 
@@ -155,16 +162,6 @@ def test_an_image_that_fails_costs_itself_and_is_tried_again(tmp_path: Path, who
     assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
 
 
-def test_a_frame_whose_labels_are_broken(tmp_path: Path) -> None:
-    scenes = ["fake:a?frames=4&unreadable=2", "fake:b?frames=3"]
-    result = run(make_job(tmp_path, scenes))
-    assert (result.written, result.failed) == (24, 4)
-    failed = {(r["scene"], r["frame"]) for r in rows_of(tmp_path, status="failed")}
-    assert failed == {("a", 2)}
-    assert all("cut short" in row["message"] for row in rows_of(tmp_path, status="failed"))
-    assert read_status(open_store(tmp_path))[0].total.in_failed_blocks == 8
-
-
 def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, whole: dict) -> None:
     result = run(make_job(tmp_path, opener=open_without_memory))
     assert (result.written, result.failed) == (16, 0)
@@ -185,28 +182,6 @@ def test_a_scene_that_could_be_opened_once(tmp_path: Path, whole: dict) -> None:
     assert all("memory ran out" in r["message"] for r in rows_of(tmp_path, status="failed"))
     assert run(make_job(tmp_path)).failed == 0
     assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
-
-
-def test_no_scene_at_all_can_be_opened(tmp_path: Path) -> None:
-    with pytest.raises(
-        ClimateGSError, match=r"none of its scenes can be used:\n  fake:b: memory ran"
-    ):
-        run(make_job(tmp_path, ["fake:b"], opener=open_without_memory))
-
-
-@pytest.mark.parametrize("name", ["../../etc", "x" * 300, "новый", ".hidden", "a\nb", "CON "])
-def test_hostile_names_stay_inside(tmp_path: Path, name: str) -> None:
-    def opener(uri: str):
-        return replace(open_fake("fake:x?frames=1"), name=name)
-
-    out = tmp_path / "out"
-    job = make_job(out, ["fake:x"], make_recipes(["dry"]), opener=opener)
-    assert run(job).written == 2
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-    assert (out / folder_name(name) / "dry-000" / "recipe.yaml").is_file()
-    assert {row["scene"] for row in rows_of(out)} == {name}
-    assert run(replace(job, setup=replace(job.setup, renderer=must_not_render))).skipped == 2
-    assert read_status(open_store(out))[0].total.published == 2
 
 
 def test_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -238,26 +213,6 @@ def test_status_in_every_state(tmp_path: Path) -> None:
     (status,) = read_status(store)
     assert (status.total.published, status.total.in_failed_blocks, status.staged) == (28, 4, 0)
     assert status.by_scene["a"].planned == 16 and status.by_recipe["wet"].published == 14
-
-
-BLOCK = b'{"key":"k","scene":"s","variant":"v","recipe":"r","images":"9"}'
-DAMAGES = [b"", b"{", b"[]", b"null", b'{"format":2}', b"\xff", b"[" * 100_000,
-           b'{"format":2,"job":"j","version":"1","blocks":[' + BLOCK + b'],"unusable":{}}',
-           b'{"format":2,"job":"j","version":"1","blocks":[["k"]],"unusable":{}}',
-           b'{"format":2,"job":"j","version":"1","blocks":[],"unusable":[]}',
-           b'{"format":2,"job":["j"],"version":"1","blocks":[],"unusable":{}}',
-           b'{"format":1,"job":"j","version":"1","blocks":[],"unusable":{}}']  # fmt: skip
-
-
-@pytest.mark.parametrize("data", DAMAGES, ids=lambda data: data[:12].decode("latin1"))
-@pytest.mark.usefixtures("unchecked")
-def test_a_damaged_plan_is_told_and_written_again(tmp_path: Path, data: bytes) -> None:
-    write_atomic(tmp_path / ".climategs" / "jobs" / "job.json", data)
-    with pytest.raises(OutputError, match=r"job\.json is damaged: .*Start the job again"):
-        read_status(open_store(tmp_path))
-    job = make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))
-    assert run(job).written == 2
-    assert read_status(open_store(tmp_path))[0].total.published == 2
 
 
 def test_a_damaged_record_of_a_scene_is_made_again(tmp_path: Path) -> None:
@@ -310,8 +265,6 @@ def test_a_render_job_into_the_same_folder(tmp_path: Path) -> None:
 @pytest.fixture(autouse=True)
 def no_threads_left() -> Iterator[None]:
     yield
-    import threading
-
     assert not [t for t in threading.enumerate() if t.name.startswith(("publish", "writer"))]
 
 
@@ -329,3 +282,126 @@ def test_sweeps_that_show_another_world_are_told_of_once(tmp_path: Path, caplog)
     caplog.clear()
     run(make_job(tmp_path / "without", scenes[1:], recipes))
     assert not [record for record in caplog.records if record.message.startswith("note: ")]
+
+
+# ---- Where a GPU renders, or seems to -----------------------------------------------------------
+
+SCENES = ["fake:a?frames=2"]
+
+
+def job_of(out: Path, backend: str, **options) -> GenerateJob:
+    job = make_job(out, SCENES, make_recipes(["fog"]), **options)
+    return replace(job, setup=replace(job.setup, backend=backend))
+
+
+def test_a_gpu_has_one_process_and_a_name_and_mixes_with_no_cpu(tmp_path, monkeypatch) -> None:
+    def slots_of(backend: str, workers: int = 0) -> int:
+        options = {"workers": workers} if workers else {}
+        found = Workers(job_of(tmp_path, backend, executor="processes", **options))
+        found.close()
+        return found.slots
+
+    def planned(backend: str) -> str:
+        return plan_job(job_of(tmp_path, backend, renderer=None), progress=False).backend
+
+    assert (slots_of("cuda"), slots_of("cuda", 3), slots_of("cpu")) == (1, 3, available_cores())
+    assert planned("auto") == "auto"
+    monkeypatch.setattr("augment.render.cuda.runtime.has_gpu", lambda: True)
+    assert slots_of("auto") == 1
+    assert (planned("auto"), planned("cuda"), planned("cpu")) == ("cuda", "cuda", "cpu")
+    for first, second in (("cuda", "auto"), ("auto", "cuda")):
+        out = tmp_path / first
+        run(job_of(out, first))
+        before = outputs(out)
+        with pytest.raises(OutputError, match=rf"backend there '{first}', here '{second}'"):
+            run(job_of(out, second))
+        assert outputs(out) == before
+
+
+def test_a_lost_gpu_fails_no_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_of(tmp_path, "cuda", renderer=raising_render)
+    with monkeypatch.context() as patch:
+        patch.setattr("augment.jobs.worker.gpu_is_lost", lambda backend: True)
+        with pytest.raises(GpuLost, match="since frame 1, camera front"):
+            run(job)
+    result = run(job_of(tmp_path, "cuda"))
+    assert result.failed == 0 and result.written + result.skipped == 4
+
+
+def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
+    result = run(job_of(tmp_path, "auto"))
+    timings = result.timings
+    assert 0 < timings["renderers"] < timings["workers"] <= timings["render_wall"]
+    assert timings["publish"] > 0
+    shares = shares_of(timings)
+    assert shares is not None
+    assert shares.rendering + shares.held + shares.beside == pytest.approx(1)
+    assert shares_of(run(job_of(tmp_path, "auto")).timings) is None
+
+
+FOG = Identity("fake:street", "0123456789abcdef", "recorded", "0.1.0", "auto")
+
+
+def test_the_same_may_come_again_and_another_may_not(tmp_path):
+    store = open_store(tmp_path)
+    enter_variant(store, "street/north", "fog-000", FOG)
+    enter_variant(store, "street/north", "fog-000", FOG)
+    enter_variant(store, "street/north", "fog-001", dataclasses.replace(FOG, recipe_hash="other"))
+    with pytest.raises(OutputError, match=r"fog-000 already holds .* recipe hash there '0123"):
+        changed = dataclasses.replace(FOG, recipe_hash="fedcba9876543210")
+        enter_variant(store, "street/north", "fog-000", changed)
+    assert len(store.list(VARIANTS)) == 2
+
+
+# ---- Names, damage, kills -----------------------------------------------------------------------
+
+
+def test_hostile_names_stay_inside(tmp_path: Path) -> None:
+    for number, name in enumerate(("../../etc", "x" * 300, "новый", "a\nb", "CON ")):
+        scene = replace(open_fake("fake:x?frames=1"), name=name)
+        out = tmp_path / str(number) / "out"
+        job = make_job(out, ["fake:x"], make_recipes(["dry"]), opener=lambda _uri, s=scene: s)
+        assert run(job).written == 2
+        assert [p.name for p in out.parent.iterdir()] == ["out"]
+        assert (out / folder_name(name) / "dry-000" / "recipe.yaml").is_file()
+        assert {row["scene"] for row in rows_of(out)} == {name}
+        assert run(replace(job, setup=replace(job.setup, renderer=must_not_render))).skipped == 2
+        assert read_status(open_store(out))[0].total.published == 2
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_damaged_plan_is_told_and_written_again(tmp_path: Path) -> None:
+    plan = {"format": 2, "job": "j", "version": "1", "blocks": [], "unusable": {}}
+    block = {"key": "k", "scene": "s", "variant": "v", "recipe": "r", "images": "9"}
+    changes = [{"blocks": [block]}, {"blocks": [["k"]]}, {"unusable": []}, {"job": ["j"]}]
+    wrong = [json.dumps(plan | change).encode() for change in [*changes, {"format": 1}]]
+    for data in (b"", b"[]", b'{"format":2}', b"\xff", b"[" * 100_000, *wrong):
+        write_atomic(tmp_path / ".climategs" / "jobs" / "job.json", data)
+        with pytest.raises(OutputError, match=r"job\.json is damaged: .*Start the job again"):
+            read_status(open_store(tmp_path))
+    assert run(make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))).written == 2
+    assert read_status(open_store(tmp_path))[0].total.published == 2
+
+
+def found_by(folder: Path, *scenarios: str) -> dict[str, dict]:
+    """What has to hold is in the script, which ends with a message where it does not."""
+    script = Path(__file__).with_name("job_crashes.py")
+    done = subprocess.run(
+        [sys.executable, script, folder, *scenarios], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
+    assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] >= 8
+
+
+@pytest.mark.long
+def test_jobs_that_are_killed_stopped_or_starved_of_disk_go_on(quick_folder: Path) -> None:
+    found = found_by(quick_folder)
+    assert found["kill_render_jobs"]["kills"] + found["kill_generate_jobs"]["kills"] >= 24
+    assert found["kill_while_overwriting"]["kills"] >= 4
+    assert found["fill_the_disk"]["failures"] >= 2 and found["kill_workers"]["kills"] >= 2
+    assert len(found["stop_jobs_with_workers"]["finished"]) == 6
+    assert {"run_several_drivers", "die_at_one_image", "die_while_opening"} <= found.keys()

@@ -12,21 +12,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from augment.effects.style.losses import (
-    GaussianColors,
-    color_distance,
-    picture_distance,
-    style_loss,
-    weighted_sum,
-)
-from augment.effects.style.network import Gscm
-from augment.effects.style.pairs import PAIR_WEIGHTS, PairBatch, pair_losses
-from augment.effects.style.statistics import WHOLE, ColorStatistics, closed_maps
 from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
 from augment.reconstruct.config import LearningRates, LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, MIN_ALPHA, MIN_SKY, ViewLoss, view_loss
-from augment.reconstruct.splats import CORRECTIONS, ColorAdam, DenseAdam, Splats, splat_rates
+from augment.reconstruct.splats import CORRECTIONS, Splats, splat_rates
 from augment.reconstruct.trainer import Knots, part_forces, splat_inputs
 from augment.reconstruct.view import RecordedView
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
@@ -37,10 +27,10 @@ from augment.render.part_views import part_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
-from tests.augment.examples import drawing
-from tests.augment.hard_scenes import KINDS, SMOGS, hard_gaussians, in_float64, wide_camera
+from tests.augment.hard_scenes import KINDS, SMOGS, drawing, hard_gaussians, in_float64, wide_camera
 from tests.augment.loss_definition import reference_loss
 
+pytestmark = pytest.mark.long
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 kinds, seeds = st.sampled_from(KINDS), st.integers(0, 2**31)
 fovs = st.sampled_from((1, 10, 60, 120, 170))
@@ -171,21 +161,6 @@ def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
 
 
 @drawing(5)
-@given(seeds, *views)
-def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
-    arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
-    faces, color_map = arguments["sky_faces"], arguments["color_map"].copy()
-    sky, colors = ColorAdam(faces.reshape(-1, 3)), DenseAdam(color_map)
-    for _ in range(3):
-        loss = view_loss(**(arguments | {"color_map": color_map}))
-        colors.update(loss.d_color_map, 0.1)
-        if loss.d_sky is not None:
-            sky.update(loss.d_sky.texels, loss.d_sky.grads, 0.1)
-    assert np.isfinite(color_map).all()
-    assert np.isfinite(faces).all() and faces.min() >= 0 and faces.max() <= 1
-
-
-@drawing(5)
 @given(kinds, seeds, fovs, st.sampled_from((0.0, 1e-30, 1.0, 1e10)))
 def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
     """Adam keeps logarithms of scales and logits of opacities within what can be drawn."""
@@ -221,73 +196,3 @@ def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
     assert splats.scales.min() > 0
     assert splats.opacities.min() >= 0 and splats.opacities.max() <= 1
     np.testing.assert_allclose(np.linalg.norm(splats.quats, axis=1), 1, atol=1e-5)
-
-
-# ---- styles --------------------------------------------------------------------------------------
-
-PLAIN = {
-    "black": (0.0, 0.0, 0.0),
-    "white": (1.0, 1.0, 1.0),
-    "red": (1.0, 0.0, 0.0),
-    "grey": (0.5, 0.5, 0.5),
-}
-
-
-def plain(name: str, px: int = 32, count: int = 2) -> torch.Tensor:
-    return torch.tensor(PLAIN[name])[None, :, None, None].expand(count, 3, px, px).clone()
-
-
-@pytest.mark.parametrize(
-    ("first", "second"), [("black", "white"), ("red", "red"), ("grey", "black")]
-)
-def test_of_the_style_losses_of_plain_pictures(first, second):
-    """Pictures, features and colours without any variance, and equal ones without a difference."""
-    one, other = plain(first).requires_grad_(), plain(second)
-    base, bands = plain(first)[0].flatten(1).T[None], torch.zeros(1, 32 * 32, 3, 3)
-    base.requires_grad_()
-    maps = torch.eye(3, 4)[None].clone().requires_grad_()
-    colors = GaussianColors(base, bands)
-    terms = {
-        "style": style_loss((one, 0 * one), (other, other)),
-        "colors": color_distance(colors.mapped(maps), colors),
-        "pictures": picture_distance(one, other),
-    }
-    weighted_sum(terms, dict.fromkeys(terms, 1.0)).backward()
-    assert_finite({"picture": one.grad, "base": base.grad, "maps": maps.grad})
-
-
-@pytest.fixture(scope="module")
-def network() -> Gscm:
-    torch.manual_seed(0)
-    return Gscm("small")
-
-
-@pytest.mark.parametrize(("first", "second"), [("black", "white"), ("red", "red"), ("grey", "red")])
-def test_of_the_style_network_of_plain_pictures(network, first, second):
-    batch = PairBatch(plain(first), plain(second), plain(second), plain(first))
-    network.zero_grad()
-    losses = pair_losses(network, batch)
-    assert_finite(losses)
-    weighted_sum(losses, PAIR_WEIGHTS | {"range": 4.0}).backward()
-    assert_finite({n: p.grad for n, p in network.named_parameters() if p.grad is not None})
-
-
-spreads = st.sampled_from((0.0, 1e-12, 1e-4, 0.08))
-colours = st.tuples(*[st.sampled_from((0.0, 1e-8, 0.5, 1.0))] * 3)
-
-
-@drawing(20)
-@given(colours, colours, spreads, spreads, st.sampled_from(("mkl", "reinhard")),
-       st.sampled_from((0.0, 1.0, 2.0)), st.booleans())  # fmt: skip
-def test_closed_forms_of_plain_pictures(one, other, narrow, wide, method, strength, is_flat):
-    """Of one colour, or spread along one line of colours only."""
-    shape = np.outer((1, 0.5, 0.2), (1, 0.5, 0.2)) if is_flat else np.eye(3)
-    content, style = (
-        {WHOLE: ColorStatistics(np.array(mean), spread * shape)}
-        for mean, spread in ((one, narrow), (other, wide))
-    )
-    maps = closed_maps(content, style, method=method, strength=strength, per_region=False)
-    for value in (maps.splats, maps.sky, maps.picture):
-        assert torch.isfinite(value).all()
-        # Of gains at most 3 (closed_form.Limits), and the least contrast beside them.
-        assert torch.linalg.matrix_norm(value[..., :3], 2).max() < 3.5

@@ -1,20 +1,20 @@
-"""Scores of pictures and depths, and whether views agree with each other, what moves included."""
+"""Scores of pictures and depths; whether views agree; LPIPS against torch's own layers."""
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from scenes import camera_ahead
 from scipy import ndimage
-from walls import BOARD_SIZE_M, FRAME_NS, board_boxes, board_centre, driving_camera, wall_view
+from torch import nn
+from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
-from augment.jobs.tables import FrameBoxes
-from augment.labels import Boxes
+from augment.errors import MetricError
 from augment.metrics.consistency import (
-    MAX_GAP_NS,
-    STILL_M,
     ActorPaths,
     DepthView,
     carry,
@@ -23,16 +23,9 @@ from augment.metrics.consistency import (
     warp_view,
     warped_consistency,
 )
-from augment.metrics.image import (
-    PIXELS_PER_DEGREE,
-    DepthErrors,
-    depth_errors,
-    flip,
-    flip_map,
-    psnr,
-    ssim,
-)
-from tests.augment.loss_definition import ssim_map
+from augment.metrics.image import DepthErrors, depth_errors, flip, psnr, ssim
+from augment.metrics.lpips import ALEX, VGG16, Conv, Lpips, expected_shapes, load_lpips
+from augment.metrics.lpips import picture_lpips as lpips_of
 
 
 def pictures(height=23, width=31, *, noise=0.1, seed=0):
@@ -86,32 +79,6 @@ def test_ssim_is_its_definition(size):
     assert ssim(a, b) == pytest.approx(ssim_by_definition(a, b), abs=1e-11)
 
 
-def test_ssim_is_that_of_3d_gaussian_splatting():
-    a, b = pictures(40, 52)
-    line = torch.exp(-((torch.arange(11).double() - 5) ** 2) / (2 * 1.5**2))
-    line /= line.sum()
-    window = (line[:, None] * line).expand(3, 1, 11, 11)
-
-    def blur(t):
-        return torch.nn.functional.conv2d(t, window, padding=5, groups=3)
-
-    x, y = (torch.from_numpy(i).permute(2, 0, 1)[None] for i in (a, b))
-    mx, my = blur(x), blur(y)
-    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    expected = ((2 * mx * my + c1) * (2 * cov + c2)) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
-    assert ssim(a, b) == pytest.approx(float(expected.mean()), abs=1e-11)  # as above
-
-
-def test_ssim_of_constant_pictures_is_the_luminance_term_away_from_the_border():
-    size = 211
-    a, b = np.full((size, size, 3), 0.4), np.full((size, size, 3), 0.6)
-    luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
-    border = 1 - (size - 10) ** 2 / size**2  # zeros beyond the border reach 5 pixels in
-    assert abs(ssim(a, b) - luminance) < border * 0.1
-    assert ssim(a, b) == ssim(b, a)
-
-
 def test_whatever_is_left_out_changes_nothing():
     a, b = pictures()
     weight = np.ones(a.shape[:2])
@@ -128,14 +95,6 @@ def test_whatever_is_left_out_changes_nothing():
     assert flip(wrong_inside, b, weight) == 0
 
 
-def test_weights_average():
-    b = np.zeros((2, 1, 3))
-    a = b.copy()
-    a[0] = 0.5
-    error = 0.25 * 3 / 4
-    assert psnr(a, b, np.array([[3.0], [1.0]])) == pytest.approx(-10 * math.log10(error))
-
-
 def test_8_bit_and_float_pictures_agree():
     rng = np.random.default_rng(1)
     a, b = rng.integers(0, 256, (2, 9, 13, 3), dtype=np.uint8)
@@ -147,17 +106,6 @@ def test_flip_of_black_and_white():
     black, white = np.zeros((8, 8, 3)), np.ones((8, 8, 3))
     # The package's own figure for it; the colour term of two greys does not reach 1.
     assert flip(white, black) == pytest.approx(0.9674, abs=1e-3)
-
-
-def test_flip_map_shows_where():
-    _, b = pictures(30, 60)
-    a = b.copy()
-    a[:, 40:] = 1 - a[:, 40:]
-    error = flip_map(a, b)
-    assert error.shape == (30, 60) and error.dtype == np.float32
-    assert error[:, :20].max() < 0.01 < error[:, 45:].mean()
-    screen = math.pi / 180 * 0.7 * 3840 / 0.7
-    assert abs(PIXELS_PER_DEGREE - screen) < 1e-3  # given to four places
 
 
 def test_flip_grows_with_noise_and_leaves_its_inputs_alone():
@@ -217,14 +165,6 @@ def test_depth_quantiles_are_those_of_repeated_values():
     assert plain.p90_m == np.quantile(error, 0.9, method="inverted_cdf")
 
 
-def test_depth_without_pixels_is_unknown():
-    for errors in (
-        depth_errors(np.zeros(0), np.zeros(0)),
-        depth_errors(np.full(3, np.nan), np.zeros(3), np.zeros(3)),
-    ):
-        assert errors.pixels == 0 and math.isnan(errors.median_m) and math.isnan(errors.within_5cm)
-
-
 def test_bad_depths_are_refused():
     with pytest.raises(ValueError, match="one shape"):
         depth_errors(np.ones(3), np.ones(4))
@@ -232,12 +172,6 @@ def test_bad_depths_are_refused():
         depth_errors(np.array([1, np.nan]), np.ones(2))
     with pytest.raises(ValueError, match="2 true depths"):
         depth_errors(np.ones(3), np.array([0, 1, np.inf]))
-
-
-def test_ssim_is_the_one_that_reconstruction_learns_with():
-    a, b = pictures(17, 40)
-    learnt = ssim_map(torch.from_numpy(a), torch.from_numpy(b))
-    assert ssim(a, b) == pytest.approx(float(learnt.mean()), abs=1e-11)  # both float64
 
 
 WALL_M = 8.0
@@ -292,15 +226,6 @@ def test_the_share_is_the_overlap():
     assert not columns[:8].any() and columns[8:].all()
 
 
-def test_linear_maps_scale_the_error_and_not_the_relative_one():
-    a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.4, 0)), shift=0.02)
-    one = warped_consistency(a, b)
-    paler = [dataclasses.replace(v, picture=0.3 + 0.5 * v.picture) for v in (a, b)]
-    other = warped_consistency(*paler)
-    assert other.rmse == pytest.approx(one.rmse / 2, rel=1e-9)
-    assert other.relative == pytest.approx(one.relative, rel=1e-9)
-
-
 def test_what_is_hidden_does_not_count():
     """A board before the wall hides a part of it from B only."""
     a = view_of_wall(moved())
@@ -316,15 +241,6 @@ def test_what_is_hidden_does_not_count():
         free.share - 21 * 21 / counts.size, abs=2 * 21 / counts.size
     )
     assert (warped[~counts] == 0).all()
-
-
-def test_a_board_in_a_does_not_count_where_b_sees_past_it():
-    a, b = view_of_wall(moved()), view_of_wall(moved(position=(0, 0.5, 0)))
-    a.depth_m[5:15, 5:25] = 3.0
-    a.picture[5:15, 5:25] = 0.0
-    _, counts = warp_view(a, b)
-    assert not counts[5:15, 5:25].any()
-    assert warped_consistency(a, b).rmse < 1e-12
 
 
 @pytest.mark.parametrize("side", ["a", "b"])
@@ -343,12 +259,6 @@ def test_nothing_in_common_gives_nan():
     assert found.share == 0 and math.isnan(found.rmse) and math.isnan(found.relative)
     b.depth_m[:] = math.nan
     assert warped_consistency(b, a).share == 0
-
-
-def test_sizes_must_fit():
-    view = view_of_wall(moved())
-    with pytest.raises(ValueError, match=r"alpha must be floats \[41, 61\].*\[61, 41\]"):
-        dataclasses.replace(view, alpha=view.alpha.T)
 
 
 FRAMES = 9
@@ -393,14 +303,6 @@ def test_the_surroundings_of_a_moving_board_do_not_count():
     assert carried.unclear_b[(b.picture == 0).all(-1)].all()
 
 
-def test_poses_are_interpolated_between_labels():
-    paths = ActorPaths(board_boxes(FRAMES))
-    pose = paths.at(FRAME_NS * 5 // 2)["board"]
-    assert pose.known
-    assert np.allclose(pose.world_from_box[:3, 3], board_centre(FRAME_NS * 5 // 2), atol=1e-9)
-    assert np.allclose(pose.size_m, BOARD_SIZE_M)
-
-
 def test_what_moves_and_whose_pose_is_not_known_does_not_count():
     """The second picture is taken half a frame after the last label."""
     late = dataclasses.replace(driving_camera(2), timestamp_ns=2 * FRAME_NS + FRAME_NS // 2)
@@ -411,37 +313,183 @@ def test_what_moves_and_whose_pose_is_not_known_does_not_count():
     assert np.isfinite(carried.points_m[:, :5]).all()
 
 
-def test_a_box_that_stands_is_the_worlds():
-    frames = {n: dataclasses.replace(f, timestamp_ns=n) for n, f in board_boxes(2).items()}
-    for frame in frames.values():
-        frame.boxes.centers_m[0] = board_centre(0)
-    frames[1].boxes.centers_m[0, 1] += 0.9 * STILL_M  # a label that trembles
-    frames = {n: FrameBoxes(n * FRAME_NS, f.boxes) for n, f in frames.items()}
-    a = wall_view(driving_camera(0))
-    b = wall_view(dataclasses.replace(driving_camera(1), timestamp_ns=0))
-    b = dataclasses.replace(b, camera=driving_camera(1))
-    carried = carry(ActorPaths(frames), a, b)
-    assert not carried.moved.any() and not carried.unclear_b.any()
-    assert np.isfinite(carried.points_m).all()
-    after = dataclasses.replace(b, camera=dataclasses.replace(b.camera, timestamp_ns=2 * FRAME_NS))
-    assert np.isfinite(carry(ActorPaths(frames), a, after).points_m).all()
+SIZE = 40
+# torchvision's `features` as its own lists have them: channels, and M for a pooling.
+VGG_LIST = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M"]
+BIAS = "net.slice3.6.bias"
+NARROW = 16  # times fewer channels of VGG-16 in tests
 
 
-def test_actors_outside_of_every_box_do_not_count():
-    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(1))
-    bonnet = np.zeros(a.depth_m.shape, bool)
-    bonnet[-4:] = True
-    is_actor = bonnet | (a.depth_m < 7)
-    carried = carry(ActorPaths(board_boxes(FRAMES)), a, b, is_actor)
-    assert np.isnan(carried.points_m[bonnet]).all() and carried.moved.any()
+def random_weights(architecture):
+    generator = torch.Generator().manual_seed(3)
+    return {
+        name: torch.randn(shape, generator=generator).abs() / 50
+        if name.startswith("lin")
+        else torch.randn(shape, generator=generator) / max(1, np.prod(shape[1:])) ** 0.5
+        for name, shape in expected_shapes(architecture).items()
+    }
 
 
-def test_labels_without_numbers_or_far_in_time_are_no_boxes():
-    frames = board_boxes(1)
-    broken = Boxes(("x",), ("Car",), np.full((1, 3), np.nan), np.ones((1, 3)), np.ones((1, 4)))
-    frames[1] = FrameBoxes(FRAME_NS, broken)
-    paths = ActorPaths(frames)
-    assert set(paths.at(0)) == {"board"}
-    assert paths.at(MAX_GAP_NS)["board"].known is False
-    assert paths.at(MAX_GAP_NS + 1) == {}
-    assert ActorPaths({}).at(0) == {}
+def picture_pairs(seed):
+    return torch.rand(2, 3, SIZE, SIZE + 6, generator=torch.Generator().manual_seed(seed))
+
+
+def torchvision_alexnet():
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1), nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1), nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(),
+    )  # fmt: skip
+
+
+def torchvision_vgg16(narrow):
+    layers, channels = [], 3
+    for width in VGG_LIST:
+        if width == "M":
+            layers.append(nn.MaxPool2d(2, 2))
+            continue
+        layers += [nn.Conv2d(channels, width // narrow, 3, padding=1), nn.ReLU()]
+        channels = width // narrow
+    return nn.Sequential(*layers)
+
+
+def plainly(layers, taken, heads, a, b):
+    """The metric as its definition says it, pixel by pixel."""
+    shift = torch.tensor([-0.030, -0.088, -0.188])[:, None, None]
+    scale = torch.tensor([0.458, 0.448, 0.450])[:, None, None]
+    total, one, other = 0.0, (2 * a - 1 - shift) / scale, (2 * b - 1 - shift) / scale
+    with torch.no_grad():
+        for number, layer in enumerate(layers):
+            one, other = layer(one), layer(other)
+            if number not in taken:
+                continue
+            head = heads[taken.index(number)].flatten()
+            f, g = one.flatten(1).T, other.flatten(1).T  # [pixels, channels]
+            f, g = (x / x.norm(dim=1, keepdim=True).clamp(min=1e-10) for x in (f, g))
+            total += float(((f - g).square() @ head).mean())
+    return total
+
+
+def heads_of(weights):
+    return {name: value for name, value in weights.items() if name.startswith("lin")}
+
+
+def as_torchvision(weights):
+    named = {re.sub(r"net\.slice\d\.", "features.", n): v for n, v in weights.items()}
+    rest = {"classifier.1.weight": torch.zeros(2, 2)}
+    return {n: v for n, v in named.items() if not n.startswith("lin")} | rest
+
+
+@pytest.fixture(scope="module")
+def alex():
+    return random_weights(ALEX)
+
+
+def test_alex_is_the_definition(alex):
+    layers = torchvision_alexnet()
+    state = {n.removeprefix("features."): v for n, v in as_torchvision(alex).items()}
+    del state["classifier.1.weight"]
+    layers.load_state_dict(state)
+    a, b = picture_pairs(1), picture_pairs(2)
+    found = Lpips(ALEX, alex)(a, b)
+    heads = list(heads_of(alex).values())
+    for number in range(2):
+        wanted = plainly(layers, [1, 4, 7, 9, 11], heads, a[number], b[number])
+        assert wanted > 0.01
+        assert float(found[number]) == pytest.approx(wanted, rel=1e-4)  # float32 sums
+
+
+def test_vgg_is_the_definition():
+    slices = tuple(
+        tuple(Conv(c.index, c.channels // NARROW) for c in convs) for convs in VGG16.slices
+    )
+    narrow = dataclasses.replace(VGG16, slices=slices)
+    weights = random_weights(narrow)
+    layers = torchvision_vgg16(NARROW)
+    names = {n.split(".", 2)[2]: v for n, v in weights.items() if n.startswith("net.")}
+    layers.load_state_dict(names)
+    a, b = picture_pairs(1), picture_pairs(2)
+    heads = list(heads_of(weights).values())
+    wanted = plainly(layers, [3, 8, 15, 22, 29], heads, a[0], b[0])
+    assert float(Lpips(narrow, weights)(a, b)[0]) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_equal_pictures_are_0_apart_and_order_does_not_matter(alex):
+    network = Lpips(ALEX, alex)
+    a, b = picture_pairs(1), picture_pairs(2)
+    assert (network(a, a) == 0).all()
+    assert torch.allclose(network(a, b), network(b, a), rtol=1e-6)
+    black = torch.zeros_like(a)  # biases alone: features without a length must not be NaN
+    assert torch.isfinite(network(black, a)).all()
+
+
+def test_what_does_not_count_is_the_reference(alex):
+    network = Lpips(ALEX, alex)
+    a, b = (p[0].permute(1, 2, 0).numpy() for p in (picture_pairs(1), picture_pairs(2)))
+    nothing = np.zeros(a.shape[:2], bool)
+    assert lpips_of(network, a, b, nothing) == 0
+    assert lpips_of(network, a, b, ~nothing) == lpips_of(network, a, b)
+    half = nothing.copy()
+    half[:, :20] = True
+    assert 0 < lpips_of(network, a, b, half) < lpips_of(network, a, b)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+def test_files_of_both_layouts(alex, tmp_path, suffix):
+    def written(name, tensors):
+        path = tmp_path / f"{name}{suffix}"
+        save = save_file if suffix == ".safetensors" else torch.save
+        save(tensors, path)
+        return path
+
+    scaling = {"scaling_layer.shift": torch.tensor([-0.030, -0.088, -0.188])[None, :, None, None]}
+    copies = {f"lins.{n[3]}.{n[5:]}": v.clone() for n, v in heads_of(alex).items()}
+    whole = load_lpips(written("whole", alex | scaling | copies))
+    parts = load_lpips(written("net", as_torchvision(alex)), written("heads", heads_of(alex)))
+    a, b = picture_pairs(1), picture_pairs(2)
+    wanted = Lpips(ALEX, alex)(a, b)
+    assert whole.name == parts.name == "alex"
+    assert torch.equal(whole(a, b), wanted) and torch.equal(parts(a, b), wanted)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"lin2.model.1.weight": None}, r"lacks lin2.model.1.weight, a tensor \[1, 384, .*own"),
+        ({BIAS: torch.zeros(3)}, r"net.slice3.6.bias must be floats \[384\]; .*\[3\]"),
+        ({BIAS: torch.zeros(384, dtype=torch.int8)}, r"floats \[384\]; got torch.int8"),
+        ({BIAS: torch.full((384,), torch.nan)}, "NaN or infinite"),
+        ({"net.slice1.0.weight": torch.zeros(64, 3, 7, 7)}, r"AlexNet .*it is \[64, 3, 7, 7\]"),
+        ({"net.slice1.0.weight": None}, "there is none. The file holds lin0.model.1.weight"),
+        ({"scaling_layer.shift": torch.zeros(1, 3, 1, 1)}, r"scaling_layer.shift is \[0.0"),
+    ],
+)  # fmt: skip
+def test_other_tensors_are_refused(alex, tmp_path, change, told):
+    tensors = {n: v for n, v in (alex | change).items() if v is not None}
+    save_file(tensors, tmp_path / "w.safetensors")
+    with pytest.raises(MetricError, match=told):
+        load_lpips(tmp_path / "w.safetensors")
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(MetricError, match="no such file"):
+        load_lpips(tmp_path / "none.pth")
+    (tmp_path / "text.pth").write_text("weights")
+    with pytest.raises(MetricError, match="cannot be read as weights"):
+        load_lpips(tmp_path / "text.pth")
+    torch.save(nn.Conv2d(3, 3, 3), tmp_path / "model.pth")  # a pickle: never unpickled
+    with pytest.raises(MetricError, match="cannot be read as weights"):
+        load_lpips(tmp_path / "model.pth")
+    torch.save([torch.zeros(1)], tmp_path / "list.pth")
+    with pytest.raises(MetricError, match="holds a list and not a state dict"):
+        load_lpips(tmp_path / "list.pth")
+
+
+def test_small_pictures_are_refused(alex):
+    network = Lpips(ALEX, alex)
+    small = torch.zeros(1, 3, 31, 31)
+    assert float(network(small, small)) == 0
+    with pytest.raises(ValueError, match="H, W >= 31 for alex"):
+        network(small[..., 1:], small[..., 1:])

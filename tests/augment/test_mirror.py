@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import itertools
 import json
@@ -21,8 +22,6 @@ from augment.jobs import mirror as mirror_module
 from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.files import decode_image
 from augment.jobs.mirror import dataset_format, mirror_folder, read_record, weathered_images
-
-STRIDE = 5  # odd, so that stops come before and after changes; 1 tries every point
 
 
 @pytest.fixture
@@ -121,58 +120,31 @@ def test_more_images_come_in(source, tmp_path):
     assert trees.snapshot(source) == before  # links were replaced, not what they led to
 
 
-def test_images_rendered_anew_replace_the_old(source, out):
-    done = trees.mirror(source, out)
-    image = image_of(out, "front", 0)
-    old = image.read_bytes()
-    image.unlink()
-    image.write_bytes(old + b"x")
-    assert (done.folder / "camera/front/00.png").read_bytes() == old
-    assert trees.mirror(source, out).changed == 1
-    assert (done.folder / "camera/front/00.png").samefile(image)
-
-
-def test_an_image_that_failed_stays_clear(source, tmp_path):
-    def broken(scene, camera, recipe, *, backend):
-        if camera.name == "front":
-            raise ValueError("no")
-        return batch_scenes.fake_render(scene, camera, recipe, backend=backend)
-
-    out = tmp_path / "out"
-    trees.render(source, out, frames=[0], renderer=broken)
-    done = trees.mirror(source, out)
-    assert set(done.record.replaced) == {"camera/rear/00.png"}
-    assert (done.folder / "camera/front/00.png").samefile(source / "camera/front/00.png")
-
-
+@pytest.mark.long
 def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
     """Stopped before or after each change of the disk: no half file, and the rest is done later."""
     source, out = trees.write_dataset(tmp_path / "drive", frames=1), tmp_path / "out"
     trees.render(source, out, frames=[0])
     (source / "camera" / "also").symlink_to("front")
     copy = out / "source/fog-000"
-    options = {"links": "copy"}
-    uninterrupted = trees.mirror(source, out, **options)
+    uninterrupted = trees.mirror(source, out, links="copy")
     whole, before = trees.contents(copy), trees.snapshot(source)
     assert uninterrupted.record.files["copied"] > 0
-    calls = 1 - STRIDE
-    while True:
-        calls += STRIDE
-        remove_tree(copy)
+    for calls in itertools.count(1, 5):  # odd, so that stops come before and after changes
+        shutil.rmtree(copy)
         stopped = False
         with monkeypatch.context() as patch:
             stop_at(patch, calls)
             try:
-                trees.mirror(source, out, **options)
+                trees.mirror(source, out, links="copy")
             except KeyboardInterrupt:
                 stopped = True
         if not stopped:
             break
         half = trees.contents(copy) if copy.is_dir() else {}
-        is_final = {n: n in whole for n in half if not n.endswith(TEMPORARY_SUFFIX)}
-        assert all(is_final.values()), is_final
-        assert all(half[name] == whole[name] for name in is_final), f"stopped at {calls}"
-        trees.mirror(source, out, **options)
+        final = {name: half[name] for name in half if not name.endswith(TEMPORARY_SUFFIX)}
+        assert all(whole.get(name) == final[name] for name in final), f"stopped at {calls}"
+        trees.mirror(source, out, links="copy")
         assert trees.contents(copy) == whole, f"stopped at {calls}"
         assert trees.snapshot(source) == before
     assert calls > 20
@@ -180,13 +152,11 @@ def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
 
 def stop_at(patch, wanted: int) -> None:
     """Raise around the given change of the disk: odd before it, even after it."""
-    met = 0
+    met = itertools.count(1)
 
     def watched(call):
         def wrapper(*arguments, **options):
-            nonlocal met
-            met += 1
-            mine = met
+            mine = next(met)
             if 2 * mine - 1 == wanted:
                 raise KeyboardInterrupt
             result = call(*arguments, **options)
@@ -200,20 +170,13 @@ def stop_at(patch, wanted: int) -> None:
         patch.setattr(os, name, watched(getattr(os, name)))
 
 
-def remove_tree(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
-
-
 def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, monkeypatch):
     out = tmp_path / "out"
     trees.render(source, out, frames=[0])
     trees.mirror(source, out)
     trees.render(source, out)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            mirror_module, "link_file", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
-        )
+        stop_at(patch, 3)
         with pytest.raises(KeyboardInterrupt):
             trees.mirror(source, out)
     record = out / "source/fog-000/climategs-mirror-drive.json"
@@ -226,15 +189,14 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
     assert len(json.loads(record.read_text())["replaced"]) == 8
 
 
-@pytest.mark.parametrize("call", ["sendfile", "fsync", "replace"])
-def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch, call):
+def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch):
     whole, before = trees.contents(source), trees.snapshot(source)
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, call, full)
+        patch.setattr(os, "sendfile", full)
         with pytest.raises(OutputError, match=r"cannot write .*free some space"):
             trees.mirror(source, out, links="copy")
     copy = out / "source/fog-000"
@@ -396,35 +358,41 @@ def test_what_a_copy_cannot_have_is_refused(source, out, tmp_path):
     assert not (out / "source/fog-000").exists()
 
 
-@pytest.mark.parametrize("place", ["", "drive", "drive/camera"])
-def test_nothing_is_written_through_a_link_in_the_output(source, out, place):
+def test_nothing_is_written_through_a_link_in_the_output(source, out):
     """A copy that somebody began with `ln -s` would lead into the source."""
     before = trees.snapshot(source)
-    folder = out / "source/fog-000" / place
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    folder.symlink_to(source / place.removeprefix("drive").lstrip("/"))
-    with pytest.raises(OutputError, match=r"is a link; the copy of the data|lies in the dataset"):
-        trees.mirror(source, out)
-    assert trees.snapshot(source) == before
-
-
-@pytest.mark.parametrize("links", ["hard", "copy"])
-def test_a_link_in_a_files_place_is_replaced_itself(source, out, links):
-    before = trees.snapshot(source)
-    folder = out / "source/fog-000/drive/camera/front"
-    folder.mkdir(parents=True)
-    (folder / "00.png").symlink_to(source / "camera/front/00.png")
-    (folder / "poses.json").symlink_to(source / "camera/front/poses.json")
-    trees.mirror(source, out, links=links)
-    assert not (folder / "00.png").is_symlink() and not (folder / "poses.json").is_symlink()
-    assert trees.snapshot(source) == before
-
-
-def test_a_folder_in_a_files_place_is_said(source, out):
-    (out / "source/fog-000/drive/README.md/mine").mkdir(parents=True)
+    copy = out / "source/fog-000"
+    for place in ("", "drive", "drive/camera"):
+        folder = copy / place
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.symlink_to(source / place.removeprefix("drive").lstrip("/"))
+        with pytest.raises(OutputError, match=r"is a link; the copy of the data|lies in the datas"):
+            trees.mirror(source, out)
+        folder.unlink()
+    folder = copy / "drive/camera/front"  # links in the places of files are replaced themselves
+    folder.mkdir(parents=True, exist_ok=True)
+    for links in ("hard", "copy"):
+        for name in ("00.png", "poses.json"):
+            (folder / name).unlink(missing_ok=True)
+            (folder / name).symlink_to(source / "camera/front" / name)
+        trees.mirror(source, out, links=links)
+        assert not any((folder / name).is_symlink() for name in ("00.png", "poses.json"))
+    (copy / "drive/README.md").unlink()
+    (copy / "drive/README.md/mine").mkdir(parents=True)
     with pytest.raises(OutputError, match=r"cannot write .*README\.md"):
         trees.mirror(source, out)
-    assert (out / "source/fog-000/drive/README.md/mine").is_dir()
+    assert (copy / "drive/README.md/mine").is_dir() and trees.snapshot(source) == before
+
+
+def test_only_what_belongs_to_the_dataset(source, out):
+    tree = trees.tree_of(source, entries=("camera", "README.md"))
+    done = trees.mirror(source, out, tree=tree)
+    assert sorted(path.name for path in done.folder.iterdir()) == ["README.md", "camera"]
+    for place in (".", "out", "lidar/out"):
+        with pytest.raises(OutputError, match="lies in the dataset's own folder"):
+            mirror_module.check_disjoint(trees.tree_of(source), source / place)
+    # Beside what belongs to it.
+    mirror_module.check_disjoint(trees.tree_of(source, entries=("camera",)), source / "out")
 
 
 def test_a_source_that_cannot_be_written(source, out):
@@ -440,21 +408,6 @@ def test_a_source_that_cannot_be_written(source, out):
     finally:
         for path in folders:
             path.chmod(0o755)
-
-
-def test_only_what_belongs_to_the_dataset(source, out):
-    tree = trees.tree_of(source, entries=("camera", "README.md"))
-    done = trees.mirror(source, out, tree=tree)
-    assert sorted(path.name for path in done.folder.iterdir()) == ["README.md", "camera"]
-
-
-@pytest.mark.parametrize("place", [".", "out", "lidar/out"])
-def test_an_output_folder_in_the_dataset_is_refused(source, place):
-    with pytest.raises(OutputError, match="lies in the dataset's own folder"):
-        mirror_module.check_disjoint(trees.tree_of(source), source / place)
-    tree = trees.tree_of(source, entries=("camera",))
-    if place == "out":  # beside what belongs to it
-        mirror_module.check_disjoint(tree, source / place)
 
 
 @pytest.mark.parametrize(
@@ -494,17 +447,6 @@ def test_resized_images_follow_what_they_were_made_from(source, tmp_path):
     assert cv2.imread(str(done.folder / "camera/front/01.png")).shape == (10, 14, 3)
 
 
-def test_images_of_another_format_are_encoded_anew(tmp_path):
-    source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
-    trees.render(source, out, image="png")
-    done = trees.mirror(source, out)
-    assert done.resized == [] and done.new == 8
-    file = done.folder / "camera/front/01.jpg"
-    assert file.read_bytes()[:2] == b"\xff\xd8"
-    image = decode_image(image_of(out, "front", 1).read_bytes()).astype(int)
-    assert np.abs(decode_image(file.read_bytes()) - image).mean() < 8
-
-
 def test_grey_images_stay_grey(source, tmp_path):
     path, out = source / "camera/front/00.png", tmp_path / "out"
     cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
@@ -537,9 +479,25 @@ def test_recorded_images_that_are_none_stay(source, out):
     assert (done.folder / "camera/front/00.png").read_bytes() == b"GIF89a"
 
 
-def test_a_rendered_image_that_is_gone_or_damaged_is_said(tmp_path):
+def test_images_of_another_format_are_encoded_anew(tmp_path):
     source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
-    trees.render(source, out, frames=[0], image="png")
+    frame = batch_scenes.make_frame(0)
+    for names, found in (
+        (("a.jpg", "b.JPEG"), "jpg"),
+        (("a.png",), "png"),
+        (("a.png", "b.jpg"), "png"),
+    ):
+        paths = {str(number): name for number, name in enumerate(names)}
+        assert dataset_format([dataclasses.replace(frame, image_paths=paths)]) == found
+    with pytest.raises(AdapterError, match="knows no recorded image"):
+        dataset_format([frame])
+    trees.render(source, out, image="png")
+    done = trees.mirror(source, out)
+    assert done.resized == [] and done.new == 8
+    file = done.folder / "camera/front/01.jpg"
+    assert file.read_bytes()[:2] == b"\xff\xd8"
+    image = decode_image(image_of(out, "front", 1).read_bytes()).astype(int)
+    assert np.abs(decode_image(file.read_bytes()) - image).mean() < 8
     image = image_of(out, "front", 0)
     image.write_bytes(image.read_bytes()[:30])
     with pytest.raises(OutputError, match=r"000000\.png is damaged .*render again"):
@@ -547,16 +505,3 @@ def test_a_rendered_image_that_is_gone_or_damaged_is_said(tmp_path):
     image.unlink()
     with pytest.raises(OutputError, match=r"000000\.png, which the manifest names, cannot be read"):
         trees.mirror(source, out)
-
-
-def test_the_format_to_render_in():
-    frame = batch_scenes.make_frame(0)
-    for names, found in (
-        (["a.jpg", "b.JPEG"], "jpg"),
-        (["a.png"], "png"),
-        (["a.png", "b.jpg"], "png"),
-    ):
-        paths = {str(number): name for number, name in enumerate(names)}
-        assert dataset_format([trees.dataclasses.replace(frame, image_paths=paths)]) == found
-    with pytest.raises(AdapterError, match="knows no recorded image"):
-        dataset_format([frame])

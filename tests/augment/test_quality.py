@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from batch_scenes import FakeView, make_camera, open_fake
@@ -75,14 +74,10 @@ def chosen_by_time(errors: dict, saved: dict, budget_ms: float) -> dict:
 def test_each_knob_takes_its_fastest_value_within_the_bound() -> None:
     errors = {("a", 1): 0.05, ("a", 2): 0.01, ("b", "fast"): 0.3, ("c", 0.5): 0.02}
     assert chosen_by_error(errors, 0.04) == {"a": 2, "b": "slow", "c": 0.5}
-
-
-def test_the_first_knobs_have_first_call_on_the_error() -> None:
+    # The first knobs have first call on the error.
     errors = {("a", 1): 0.03, ("a", 2): 0.02, ("b", "fast"): 0.025, ("c", 0.5): 0.01}
     assert chosen_by_error(errors, 0.04) == {"a": 1, "b": "slow", "c": 0.5}
-
-
-def test_errors_that_only_appear_together_lead_to_reference() -> None:
+    # Errors that only appear together lead to the reference.
     errors = dict.fromkeys(SINGLE, 0.01)
     assert chosen_by_error(errors, 0.04, synergy=9) == {"a": 3, "b": "slow", "c": 1.0}
 
@@ -94,21 +89,17 @@ def test_what_is_chosen_is_within_the_bound(errors, synergy: float, bound: float
     assert chosen_by_error(errors, bound, synergy) == chosen
 
 
-@pytest.mark.parametrize(
-    ("budget_ms", "chosen"),
-    [
+def test_a_budget_first_undoes_what_errs_most() -> None:
+    errors = {("a", 1): 0.2, ("a", 2): 0.05, ("b", "fast"): 0.01, ("c", 0.5): 0.1}
+    saved = {("a", 1): 40, ("a", 2): 15, ("b", "fast"): 10, ("c", 0.5): 50}
+    for budget_ms, chosen in (  # error undone: a to 2 0.15, c 0.1, a to 3 0.05, b 0.01
         (100, (3, "slow", 1.0)),
         (95, (3, "fast", 1.0)),
         (45, (3, "fast", 0.5)),
         (30, (2, "fast", 0.5)),
         (0, (1, "fast", 0.5)),
-    ],
-)
-def test_a_budget_first_undoes_what_errs_most(budget_ms: float, chosen) -> None:
-    errors = {("a", 1): 0.2, ("a", 2): 0.05, ("b", "fast"): 0.01, ("c", 0.5): 0.1}
-    saved = {("a", 1): 40, ("a", 2): 15, ("b", "fast"): 10, ("c", 0.5): 50}
-    # Error undone: a to 2 0.15, c 0.1, a to 3 0.05, b 0.01.
-    assert tuple(chosen_by_time(errors, saved, budget_ms).values()) == chosen
+    ):
+        assert tuple(chosen_by_time(errors, saved, budget_ms).values()) == chosen
 
 
 @given(ERRORS, TIMES, st.floats(0, 100))
@@ -419,13 +410,6 @@ def test_a_dataset_keeps_its_choices(bench: Workbench, tmp_path: Path) -> None:
     assert opened == ["fake:b?frames=2"]
 
 
-def test_a_plan_alone_chooses_and_keeps_nothing(bench: Workbench, tmp_path: Path) -> None:
-    recipes = make_recipes(["slow"], texts={"slow": f"quality: {{max_flip: 0.5}}\n{PLAIN}"})
-    job = make_job(tmp_path / "out", ["fake:a?frames=1"], recipes, renderer=bench.render)
-    (block,) = plan_job(job, progress=False).blocks
-    assert block.recipe.quality.settled and not (tmp_path / "out").exists()
-
-
 def test_a_scene_in_which_nothing_can_be_chosen_is_told(bench: Workbench, tmp_path: Path) -> None:
     def render(scene, camera, recipe, *, backend: str) -> FakeView:
         if scene.name == "b":
@@ -438,16 +422,3 @@ def test_a_scene_in_which_nothing_can_be_chosen_is_told(bench: Workbench, tmp_pa
     assert result.written == 4
     why = "recipe slow, variant 0: quality max_flip 0.5 cannot choose its settings: it has no road"
     assert result.unusable == {"fake:b?frames=2": why}
-
-
-def test_rows_from_before_qualities_have_none(bench: Workbench, tmp_path: Path) -> None:
-    recipe = open_recipe("max_flip: 0.5")
-    job = RenderJob("fake:street", [recipe], tmp_path)
-    run_job(job, scene_loader=open_fake, renderer=bench.render, progress=False)
-    path = tmp_path / "manifest.parquet"
-    columns = ["quality", "render_scale", "settings"]
-    pq.write_table(pq.read_table(path).drop_columns(columns), path)
-    table = read_manifest(tmp_path)
-    assert table.select(columns).to_pylist() == [dict.fromkeys(columns)] * 8
-    at = table.column_names.index("style_method")
-    assert table.column_names[at + 1 : at + 4] == columns

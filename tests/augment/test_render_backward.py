@@ -29,12 +29,6 @@ HARDLY_COVERED = 3e-3
 TOP = dataclasses.replace(camera_ahead(17, 9, 3.0), is_orthographic=True)
 
 
-@pytest.fixture
-def any_threads():
-    yield
-    limit_threads(None)
-
-
 # ---- comparing -------------------------------------------------------------------------------
 
 
@@ -177,7 +171,7 @@ def test_settings_that_leave_splats_out():
     assert 20 < (np.abs(small).reshape(300, -1).any(1)).sum() < 250
 
 
-@pytest.mark.parametrize(("degree", "limit"), [(0, None), (2, 1), (3, None)])
+@pytest.mark.parametrize(("degree", "limit"), [(2, 1), (3, None)])
 def test_every_sh_degree(degree, limit):
     gaussians = random_gaussians(60, seed=degree, sh_degree=degree, size=0.5)
     settings = RasterSettings(sh_degree=limit)
@@ -271,6 +265,7 @@ def test_tiles_that_close_long_before_their_list_ends():
     assert hidden.sum() > 300  # what closed tiles hide gets exactly nothing
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [32, 33])
 def test_lists_about_as_long_as_a_batch(count):
     """Faint splats that all cover both tiles: no pixel closes before the end of the list."""
@@ -317,7 +312,14 @@ def degenerate() -> dict[str, Gaussians]:
 
 @pytest.mark.parametrize(
     ("kind", "antialiased"),
-    [*((kind, False) for kind in degenerate()), ("needles", True), ("specks", True)],
+    [
+        *(("needles", False), ("huge", False), ("near", False), ("specks", True)),
+        *(
+            pytest.param(kind, kind == "needles", marks=pytest.mark.long)
+            for kind in degenerate()
+            if kind not in ("huge", "near")
+        ),
+    ],
 )
 def test_degenerate_gaussians(kind, antialiased):
     camera = camera_ahead(37, 21)
@@ -331,12 +333,11 @@ def test_degenerate_gaussians(kind, antialiased):
     assert shown == 0 if hidden else shown >= (10 if kind == "just drawn" else 30)
 
 
-@pytest.mark.parametrize("alpha_max", [0.5])
-def test_alphas_that_are_clamped_do_not_move(alpha_max):
+def test_alphas_that_are_clamped_do_not_move():
     """One splat wide enough that every pixel is clamped: only its colour has a gradient."""
     camera = camera_ahead(17, 9)
     wall = one_gaussian(scale=(1.0, 300.0, 300.0), opacity=0.9999)
-    settings = RasterSettings(alpha_max=alpha_max)
+    settings = RasterSettings(alpha_max=0.5)
     found = gradients(posed(wall), camera, weighting(camera, {RGB, ALPHA}), settings)[0]
     assert found["sh"].any()
     assert not any(found[name].any() for name in ("quats", "scales", "opacities", "means"))
@@ -385,7 +386,6 @@ def test_recording_gradients_changes_no_bit_of_the_image():
         assert torch.equal(getattr(tracked, name).detach(), getattr(plain, name)), name
 
 
-@pytest.mark.usefixtures("any_threads")
 def test_same_bits_for_any_number_of_threads_and_every_time():
     parts = [
         PosedGaussians(random_gaussians(3000, size=0.1)),
@@ -401,38 +401,6 @@ def test_same_bits_for_any_number_of_threads_and_every_time():
         for actual, expected in zip(run, runs[0], strict=True):
             for name in FIELDS:
                 assert np.array_equal(actual[name], expected[name]), name
-
-
-@pytest.mark.parametrize("field", ["means", "sh"])
-def test_one_tracked_tensor_of_one_part_is_enough(field):
-    camera = camera_ahead(21, 15)
-    parts = posed(random_gaussians(80), random_gaussians(60, seed=1))
-    weights = weighting(camera)
-    expected = gradients(parts, camera, weights)[1][field]
-    tensor = getattr(parts[1].gaussians, field).clone().requires_grad_()
-    parts[1] = PosedGaussians(dataclasses.replace(parts[1].gaussians, **{field: tensor}))
-    out = rasterize(parts, camera, buffers=DIFFERENTIABLE, backend="cpu")
-    sum((getattr(out, name) * weight).sum() for name, weight in weights.items()).backward()
-    assert np.array_equal(tensor.grad.double().numpy(), expected)
-
-
-def test_tensors_that_are_views_of_others():
-    """Slices and transposes: the kernels read copies, gradients find their way back."""
-    camera = camera_ahead(21, 15)
-    gaussians = random_gaussians(80, sh_degree=1)
-    weights = weighting(camera)
-    expected = gradients(posed(gaussians), camera, weights)[0]
-    columns = torch.cat([gaussians.means, gaussians.scales], 1).T.contiguous().requires_grad_()
-    every = gaussians.sh.repeat_interleave(2, 0).requires_grad_()
-    changed = dataclasses.replace(
-        gaussians, means=columns[:3].T, scales=columns[3:].T, sh=every[::2]
-    )
-    out = rasterize(posed(changed), camera, buffers=DIFFERENTIABLE, backend="cpu")
-    sum((getattr(out, name) * weight).sum() for name, weight in weights.items()).backward()
-    assert np.array_equal(columns.grad[:3].T.double().numpy(), expected["means"])
-    assert np.array_equal(columns.grad[3:].T.double().numpy(), expected["scales"])
-    assert np.array_equal(every.grad[::2].double().numpy(), expected["sh"])
-    assert not every.grad[1::2].any()
 
 
 def test_two_renders_in_one_loss_keep_apart():
@@ -454,37 +422,6 @@ def test_two_renders_in_one_loss_keep_apart():
     first = tracked[0].gaussians.means.grad.clone()
     total.backward()
     assert torch.equal(tracked[0].gaussians.means.grad, 2 * first)  # the record can be used again
-
-
-def test_images_may_be_changed_in_place_before_the_gradients():
-    camera = camera_ahead(21, 15)
-    parts, weights = posed(random_gaussians(100)), weighting(camera, {RGB, ALPHA})
-    expected = gradients(parts, camera, weights)[0]
-    tracked = leaves(parts)
-    out = rasterize(tracked, camera, backend="cpu")
-    rgb = out.rgb.mul_(2.0)
-    ((rgb * weights[RGB]).sum() / 2 + (out.alpha * weights[ALPHA]).sum()).backward()
-    for name in FIELDS:
-        actual = getattr(tracked[0].gaussians, name).grad.double().numpy()
-        assert np.array_equal(actual, expected[name]), name  # by 2 and 1/2: exact
-
-
-def test_changing_a_tensor_before_its_gradients_raises():
-    tracked = leaves(posed(random_gaussians(50)))
-    total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.sum()
-    with torch.no_grad():
-        tracked[0].gaussians.sh.mul_(1.5)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        total.backward()
-
-
-def test_second_derivatives_are_refused():
-    tracked = leaves(posed(random_gaussians(50)))
-    total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.square().sum()
-    means = tracked[0].gaussians.means
-    (first,) = torch.autograd.grad(total, means, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        first.sum().backward()
 
 
 LIGHT = SplatShading(torch.ones(60, 3), (0.0, 0.0, 1.0), 0.5)

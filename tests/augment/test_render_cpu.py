@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
@@ -21,10 +20,9 @@ from augment.render.buffers import (
 )
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
-from augment.render.cpu import driver as cpu_scratch
-from augment.render.cpu.driver import gather_inputs, rasterize_cpu
+from augment.render.cpu.driver import rasterize_cpu
 from augment.render.fog import Fog
-from augment.render.reference import project_parts, rasterize_reference
+from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.scenes import (
@@ -38,10 +36,7 @@ from tests.scenes import (
 )
 
 ALL = frozenset(BUFFERS)
-COLOR = frozenset({RGB, ALPHA})
 DEFAULT = RasterSettings()
-UNIFORM = Fog(0.15, (0.8, 0.7, 0.5))
-LAYERED = Fog(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0)
 GOLDEN_MODES = (
     *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
     *(f"a99_classic_sh{degree}" for degree in range(4)),
@@ -120,9 +115,7 @@ def test_stored_renders(shared_dir, name, mode):
 # ---- the definition ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("size", "seed"), [((97, 61), 0), ((17, 33), 1), ((16, 16), 0), ((1, 1), 0)], ids=str
-)
+@pytest.mark.parametrize(("size", "seed"), [((61, 43), 0), ((17, 33), 1), ((1, 1), 0)], ids=str)
 def test_random_scenes(size, seed):
     width, height = size
     camera = camera_ahead(width, height, 0.9 * max(size))
@@ -145,41 +138,12 @@ def test_settings(settings):
     assert_matches_definition(parts, camera_ahead(97, 61, 80.0), settings)
 
 
-@pytest.mark.parametrize(("clip_px", "antialiased"), [(1e-4, True), (1.0, False), (8.0, True)])
-def test_ranking_keeps_every_splat_that_is_larger_than_the_clip(clip_px, antialiased):
-    """Its bound on the radius is generous, and what it drops would pay no further."""
-    settings = RasterSettings(radius_clip_px=clip_px, antialiased=antialiased)
-    parts = [PosedGaussians(random_gaussians(3000, size=0.3, sh_degree=0), slight_pose())]
-    camera = camera_ahead(37, 21, 9.0)  # wide, so that bounds at the image's edge matter
-    with cpu_scratch.borrowed_scratch() as scratch:
-        inputs = gather_inputs(parts, camera, settings, None, with_color=True)
-        kept = cpu.rank(inputs, camera, scratch)[0][:3000].copy() > 0
-        plain = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
-        seen = cpu.rank(plain, camera, scratch)[0][:3000].copy() > 0
-    exact = np.zeros(3000, bool)
-    exact[project_parts(in_float64(parts), camera, settings).ids] = True
-    assert not (seen & exact & ~kept).any()
-    if clip_px >= 2:
-        assert (seen & ~kept).sum() > 0.2 * (seen & ~exact).sum()
-
-
-@pytest.mark.parametrize(
-    ("scale_height_m", "base_z_m"), [(0.05, -3000.0), (0.05, 3000.0), (1e6, -3000.0)]
-)
+@pytest.mark.parametrize(("scale_height_m", "base_z_m"), [(0.05, -3000.0), (0.05, 3000.0)])
 def test_smog_far_below_and_above_its_layer(scale_height_m, base_z_m):
     smog = Fog(0.2, (0.8, 0.7, 0.5), scale_height_m, base_z_m)
     assert_matches_definition(
         [PosedGaussians(random_gaussians(200))], camera_ahead(position=(0.0, 0.0, 0.4)), smog=smog
     )
-
-
-@pytest.mark.parametrize("smog", [UNIFORM, LAYERED], ids=["uniform", "layered"])
-def test_smog_without_end_shows_its_own_colour(smog):
-    camera = camera_ahead()
-    output = render(random_gaussians(400), camera, smog=dataclasses.replace(smog, sigma_per_m=1e30))
-    expected = output.alpha[..., None] * torch.tensor(smog.rgb)
-    # Weights sum to alpha but for the rounding of forty additions.
-    torch.testing.assert_close(output.rgb, expected, rtol=0, atol=1e-5)
 
 
 def test_poses():
@@ -259,18 +223,6 @@ def test_bits_do_not_depend_on_slices_and_lists(crowd, monkeypatch):
     assert_same_bits(render(*crowd), whole)
 
 
-def test_pixels_beyond_the_image_keep_no_tile_open(monkeypatch):
-    """The screen covers the image of 3x3 pixels and not its one tile; what is behind is hidden."""
-    monkeypatch.setattr(cpu, "_MIN_SLICE", 1)
-    monkeypatch.setattr(cpu, "_SLICE_COVER", 20.0)
-    screen = stack(*[one_gaussian(mean=(1.0, 0, 0), scale=2 / 30, opacity=0.99)] * 20)
-    behind = stack(*[one_gaussian(mean=(5.0, 0, 0), scale=1.0)] * 50)
-    times: dict[str, float] = {}
-    parts = [PosedGaussians(screen), PosedGaussians(behind)]
-    rasterize_cpu(parts, camera_ahead(3, 3, 30.0), COLOR, DEFAULT, None, stage_times=times)
-    assert times["visible"] == 20
-
-
 def test_a_quarter_turn_of_the_world_turns_nothing():
     """Camera and scene moved together: the same picture, its view-dependent colours included."""
     scene, camera = random_gaussians(300), camera_ahead(97, 61, 80.0)
@@ -290,25 +242,3 @@ def test_threads_that_render_at_once(crowd):
     with ThreadPoolExecutor(4) as pool:
         for output in pool.map(lambda _: render(*crowd), range(8)):
             assert_same_bits(output, expected)
-
-
-# ---- input and work space ----------------------------------------------------------------------
-
-
-def test_strided_and_float64_input():
-    scene, camera = random_gaussians(100), camera_ahead()
-    strided = dataclasses.replace(
-        scene, means=torch.cat([scene.means, scene.means], 1)[:, :3], sh=scene.sh.flip(1).flip(1)
-    )
-    assert not strided.means.is_contiguous()
-    assert_same_bits(render(strided, camera), render(scene, camera))
-    assert_same_bits(render(in_float64([PosedGaussians(scene)]), camera), render(scene, camera))
-
-
-def test_outputs_outlive_the_work_space():
-    scene, camera = random_gaussians(200), camera_ahead()
-    first = render(scene, camera)
-    copies = {name: getattr(first, name).clone() for name in ALL}
-    render(random_gaussians(200, seed=5), camera)
-    for name, copy in copies.items():
-        assert torch.equal(getattr(first, name), copy)

@@ -1,3 +1,5 @@
+"""The definition: against loops, stored renders, known cases and finite differences."""
+
 import dataclasses
 import math
 
@@ -6,19 +8,26 @@ import pytest
 import torch
 
 from augment.geometry import multiply_quats, quat_from_rotmat, transform_points
-from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
-from augment.render.constants import MAX_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import RasterSettings
 from augment.render.fog import Fog
 from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
-from tests.assertions import assert_images_close, assert_labels_equal
-from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, stack
+from tests.assertions import assert_images_close
+from tests.scenes import (
+    camera_ahead,
+    golden_view,
+    one_gaussian,
+    random_gaussians,
+    random_pose,
+    slight_pose,
+    smooth_gaussians,
+    stack,
+)
 
 ALL = frozenset(BUFFERS)
 DEFAULT = RasterSettings()
-OPPOSITES = ((3.0, 1 / 3), (2.0, 0.25))  # depth, opacity: 0.25 of the light each, in float64
 
 
 def render(gaussians, camera, buffers=ALL, settings=DEFAULT, smog=None):
@@ -99,28 +108,10 @@ def test_against_loops_over_pixels_and_splats(settings):
         assert stopped < 13 * 19  # both kinds of pixel occur
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 1), (3, 50)])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 1), (3, 50)])
 def test_any_size_against_loops(width, height):
     gaussians = random_gaussians(80, dtype=torch.float64, size=0.5, sh_degree=0)
     assert_equals_loops(gaussians, camera_ahead(width, height, 20.0))
-
-
-def test_small_blocks_and_stopped_tiles_change_nothing(monkeypatch):
-    gaussians, camera = random_gaussians(400, dtype=torch.float64), camera_ahead()
-    whole = render(gaussians, camera)
-    monkeypatch.setattr(reference, "BLOCK", 7)
-    assert_outputs_close(render(gaussians, camera), whole, 1e-9)  # sums in another order
-
-
-def test_float32_follows_float64():
-    camera = camera_ahead(61, 43, 55.0)
-    single = render(random_gaussians(800), camera)
-    double = render(random_gaussians(800, dtype=torch.float64), camera)
-    assert single.rgb.dtype == torch.float32 and double.rgb.dtype == torch.float64
-    for name in (RGB, ALPHA):
-        # float32 rounding of sums of tens of weights; flips at 1/255 weigh up to 4e-3
-        assert_images_close(getattr(single, name), getattr(double, name), p999=1e-4, max_flips=3)
-    assert_labels_equal(single.splat_ids, double.splat_ids, max_flips=5)  # near-equal weights
 
 
 # ---- single splats ----------------------------------------------------------------------------
@@ -141,19 +132,6 @@ def test_one_ball_on_the_axis():
     np.testing.assert_allclose(output.expected_depth, np.where(alpha > 0, 5.0, 0.0), atol=1e-12)
     np.testing.assert_allclose(output.median_depth, np.where(alpha > 0.5, 5.0, 0.0), atol=1e-12)
     np.testing.assert_array_equal(output.splat_ids, np.where(alpha > 0, 0, -1))
-
-
-def test_antialiasing_thins_small_splats_only():
-    camera = camera_ahead(41, 31, 40.0)
-    settings = RasterSettings(antialiased=True)
-    for scale in (0.01, 0.4):
-        gaussian = one_gaussian((5.0, 0.0, 0.0), scale, 0.8, dtype=torch.float64)
-        ratio = render(gaussian, camera, settings=settings).alpha.max() / (
-            render(gaussian, camera).alpha.max()
-        )
-        var_x, var_y = (camera.fx * scale / 5) ** 2, (camera.fy * scale / 5) ** 2
-        expected = math.sqrt(var_x * var_y / ((var_x + 0.3) * (var_y + 0.3)))
-        assert float(ratio) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -244,14 +222,6 @@ def test_a_greater_stop_blends_the_splat_that_reaches_it():
     assert float(output.alpha.max()) == pytest.approx(0.999, abs=1e-5)
 
 
-@pytest.mark.parametrize("stop", [1e-6, 0.01, MAX_TRANSMITTANCE_STOP])
-def test_no_stop_moves_the_median_depth(stop):
-    gaussians, camera = random_gaussians(400, dtype=torch.float64, size=0.7), camera_ahead(19, 13)
-    settings = RasterSettings(transmittance_stop=stop)
-    expected = render(gaussians, camera).median_depth
-    assert torch.equal(render(gaussians, camera, settings=settings).median_depth, expected)
-
-
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_splats_no_larger_than_the_radius_clip_are_left_out(orthographic):
     """An upright ellipsoid on the axis: 3 px right and 6 px down at one sigma, before the blur."""
@@ -284,17 +254,6 @@ def test_splat_ids_name_the_heaviest_splat_through_the_parts():
     assert bool((render(parts, camera).splat_ids == 0).all())  # 0.3 beats 0.28
 
 
-def test_the_first_of_equal_weights_wins():
-    camera = dataclasses.replace(camera_ahead(9, 9), cx=4.5, cy=4.5)
-    far, near = (one_gaussian((z, 0, 0), 1.0, o, dtype=torch.float64) for z, o in OPPOSITES)
-    parts = [PosedGaussians(stack(far, near))]
-    splats = order_by_depth(project_parts(parts, camera, DEFAULT))
-    centre, clear = torch.full((2, 1), 4.5).double(), torch.ones(1).double()
-    weights = reference.blend_weights(splats, centre, clear, DEFAULT)[0]
-    assert weights.tolist() == [[0.25], [0.25]]
-    assert int(render(parts, camera).splat_ids[4, 4]) == 1  # the nearer one, though later in order
-
-
 # ---- parts, sizes, buffers --------------------------------------------------------------------
 
 
@@ -325,12 +284,13 @@ def test_no_gaussians(parts):
     assert float(output.expected_depth.max()) == 0 and bool((output.splat_ids == -1).all())
 
 
-@pytest.mark.parametrize("name", BUFFERS)
-def test_each_buffer_alone_equals_itself_among_all(name):
+def test_each_buffer_alone_equals_itself_among_all():
     gaussians, camera = random_gaussians(), camera_ahead()
-    alone = render(gaussians, camera, [name])
-    assert torch.equal(getattr(alone, name), getattr(render(gaussians, camera), name))
-    assert all(getattr(alone, other) is None for other in BUFFERS if other != name)
+    together = render(gaussians, camera)
+    for name in BUFFERS:
+        alone = render(gaussians, camera, [name])
+        assert torch.equal(getattr(alone, name), getattr(together, name))
+        assert all(getattr(alone, other) is None for other in BUFFERS if other != name)
 
 
 def test_a_scene_far_from_the_origin_keeps_its_detail_in_float32():
@@ -348,14 +308,6 @@ def test_a_scene_far_from_the_origin_keeps_its_detail_in_float32():
 
 
 # ---- smog -------------------------------------------------------------------------------------
-
-
-def test_smog_without_density_is_the_clear_image_to_the_bit():
-    gaussians, camera = random_gaussians(), camera_ahead()
-    clear = render(gaussians, camera)
-    for height in (None, 30.0):
-        output = render(gaussians, camera, smog=Fog(0.0, (0.7, 0.6, 0.5), height))
-        assert all(torch.equal(getattr(output, n), getattr(clear, n)) for n in BUFFERS)
 
 
 def test_smog_fades_by_euclidean_distance():
@@ -381,9 +333,112 @@ def test_smog_with_a_scale_height_uses_world_heights():
     assert float(ratio) == pytest.approx(1 - math.exp(-tau), rel=1e-6)  # midpoint rule
 
 
-def test_dense_smog_is_pure_airlight():
-    gaussians, camera = random_gaussians(), camera_ahead()
-    output = render(gaussians, camera, smog=Fog(1e6, (0.25, 0.5, 0.75)))
-    airlight = torch.tensor([0.25, 0.5, 0.75])
-    expected = output.alpha[..., None] * airlight
-    torch.testing.assert_close(output.rgb, expected, rtol=0, atol=1e-6)  # float32 sums
+GOLDEN = ("edge", "garden_small", "opaque")
+MODES = (
+    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
+    *(f"a99_classic_sh{degree}" for degree in range(4)),
+)
+STORED = {"rgb": RGB, "alpha": ALPHA, "ED": EXPECTED_DEPTH}
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", GOLDEN)
+def test_stored_renders(shared_dir, name, mode, dtype):
+    with_sh = mode[-3:-1] == "sh"
+    path = shared_dir / "golden" / f"{name}.npz"
+    parts, camera, arrays = golden_view(path, with_sh=with_sh, dtype=dtype)
+    settings = RasterSettings(
+        alpha_max=0.999 if mode.startswith("a999") else 0.99,
+        antialiased="_aa" in mode,
+        sh_degree=int(mode[-1]) if with_sh else None,
+    )
+    output = rasterize_reference(parts, camera, frozenset(STORED.values()), settings, None)
+    # The files hold float32, so float64 agrees to its rounding of depths up to 4 m, and no pixel
+    # flips. In float32 a handful of 17 010 pixels may land on the other side of a threshold.
+    exact = dtype == torch.float64
+    tolerance = {"p999": 5e-7, "flip": 1e-6} if exact else {"p999": 1e-4, "max_flips": 5}
+    compared = 0
+    for key, buffer in STORED.items():
+        if f"{mode}_{key}" in arrays:
+            expected = arrays[f"{mode}_{key}"]
+            assert_images_close(getattr(output, buffer), expected, **tolerance)
+            compared += 1
+    assert compared == (1 if with_sh else 3)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_stored_projections(shared_dir, name):
+    path = shared_dir / "golden" / f"{name}.npz"
+    parts, camera, arrays = golden_view(path, with_sh=False, dtype=torch.float64)
+    splats = project_parts(parts, camera, RasterSettings())
+    # The file's arrays are zero where its renderer culled; this one culls by the image later.
+    seen = (arrays["radii"] > 0).all(1)
+    shared = torch.from_numpy(seen)[splats.ids]
+    assert set(np.flatnonzero(seen)) <= set(splats.ids.tolist())
+    splats = splats.select(shared)
+    ids = splats.ids.numpy()
+    xx, xy, yy = splats.covs2d.unbind(1)
+    conics = torch.stack([yy, -xy, xx], 1) / splats.dets[:, None]
+    # Same float64 arithmetic in another order.
+    np.testing.assert_allclose(splats.means2d, arrays["means2d"][ids], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(conics, arrays["conics"][ids], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(splats.depths, arrays["depths"][ids], rtol=1e-12, atol=1e-12)
+
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def render_posed(gaussians, camera, settings=None, smog=None, pose=None):
+    parts, settings = [PosedGaussians(gaussians, pose)], settings or RasterSettings()
+    return rasterize_reference(parts, camera, frozenset(BUFFERS), settings, smog)
+
+
+@pytest.mark.parametrize("variant", ["classic", "antialiased", "smog"])
+def test_gradients_of_every_tensor(variant):
+    camera = camera_ahead(4, 3, 7.0)
+    gaussians = smooth_gaussians(3, sh_degree=1 if variant == "classic" else 0)
+    pose = slight_pose((0.1, 0.2, -0.1))
+    smog = Fog(0.1, (0.7, 0.6, 0.5), 3.0) if variant == "smog" else None
+    settings = RasterSettings(antialiased=variant == "antialiased")
+
+    def image(*tensors):
+        values = Gaussians(**dict(zip(FIELDS, tensors, strict=True)))
+        output = render_posed(values, camera, settings, smog, pose)
+        return output.rgb, output.alpha, output.expected_depth, output.median_depth
+
+    tensors = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
+    assert bool((image(*tensors)[3] > 0).any())  # the median depth is exercised too
+    # 6 decimal steps in float64: central differences are good to about 1e-8
+    assert torch.autograd.gradcheck(image, tensors, eps=1e-6, atol=1e-6, fast_mode=False)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_stay_finite_at_every_cut_off(dtype):
+    gaussians = random_gaussians(400, seed=8, dtype=dtype)
+    opacities = gaussians.opacities.clone()
+    opacities[:40] = 1.0
+    opacities[40:80] = 0.0
+    opacities[80:120] = 1 / 255
+    scales = gaussians.scales.clone()
+    scales[120:160] = 1e-12  # the determinant of their covariance underflows in float32
+    scales[160:200] = scales[160:200] * torch.tensor([100.0, 1e-4, 1e-4]).to(dtype)
+    sh = gaussians.sh.clone()
+    sh[200:240, 0] = -5.0  # colours clamped to 0
+    fields = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": scales,
+        "opacities": opacities,
+        "sh": sh,
+    }
+    tensors = {name: value.clone().requires_grad_() for name, value in fields.items()}
+    smog = Fog(0.05, (0.5, 0.6, 0.7), 10.0)
+    settings = RasterSettings(antialiased=True)
+    output = render_posed(Gaussians(**tensors), camera_ahead(), settings, smog)
+    total = output.rgb.sum() + output.alpha.sum() + output.expected_depth.sum()
+    (total + output.median_depth.sum() + output.mode_depth.sum()).backward()
+    for name, tensor in tensors.items():
+        assert tensor.grad is not None
+        assert bool(torch.isfinite(tensor.grad).all()), name
+        assert float(tensor.grad.abs().max()) > 0, name

@@ -1,11 +1,23 @@
-import dataclasses
+"""Scenes, tracks and actors' colours, and what is worked out once for an owner."""
 
+from __future__ import annotations
+
+import dataclasses
+import gc
+import pickle
+import threading
+import weakref
+from dataclasses import dataclass
+from time import sleep
+
+import numpy as np
 import pytest
 import torch
 
 from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.memo import SceneMemo, memo_of
 from augment.render.sh import evaluate_sh
 from augment.scene import (
     Actor,
@@ -181,18 +193,6 @@ def test_empty_scenes_repeated_tracks_and_missing_frames_are_errors():
         scene().frame(7)
 
 
-def test_colour_maps_are_checked_and_none_where_they_change_nothing(unchecked):
-    with pytest.raises(ValueError, match=r"'front' must be float32 \[3, 4\]; got .*\[3, 3\]"):
-        dataclasses.replace(scene(), color_maps={"front": torch.eye(3)})
-    with pytest.raises(ValueError, match="'front' must be finite"):
-        dataclasses.replace(scene(), color_maps={"front": torch.full((3, 4), torch.nan)})
-    maps = {"front": torch.eye(3, 4) * 0.5, "rear": torch.eye(3, 4)}
-    s = dataclasses.replace(scene(), color_maps=maps)
-    front, rear, left = (named(name) for name in ("front", "rear", "left"))
-    assert s.color_map(front) is maps["front"]
-    assert s.color_map(rear) is None and s.color_map(left) is None
-
-
 def test_a_colour_map_of_an_image_goes_before_that_of_its_camera():
     own, common = torch.eye(3, 4) * 0.5, torch.eye(3, 4) * 0.7
     s = dataclasses.replace(
@@ -219,12 +219,6 @@ def test_an_actors_colours_follow_its_waves():
     assert torch.equal(part.gaussians.sh[:, 1:], actor.gaussians.sh[:, 1:])
     with pytest.raises(ValueError, match="row for each of its 3 Gaussians; got 2"):
         dataclasses.replace(actor, color_waves=waves(2))
-
-
-def test_colour_waves_are_held_beyond_their_times():
-    assert [waves().phase_at(t) for t in (0, 1_000, 1_500, 2_000, 9_000)] == [0, 0, 0.5, 1, 1]
-    with pytest.raises(ValueError, match="strictly increasing"):
-        dataclasses.replace(waves(), timestamps_ns=torch.tensor([2, 2]))
 
 
 def test_colours_in_the_world_stand_still_while_an_actor_turns():
@@ -268,16 +262,6 @@ def test_an_actor_is_absent_in_a_gap_of_its_track():
     assert dataclasses.replace(whole, max_gap_ns=1_000).pose_at(1_500) is not None
 
 
-def test_all_gaussians_are_changed_and_nothing_else():
-    whole = scene((Actor("a", "car", some(3), track(), (4.0, 2.0, 1.5)),), some(5))
-    background, own = whole.all_gaussians
-    assert background is whole.background and own is whole.actors[0].gaussians
-    half = whole.with_gaussians(lambda g: dataclasses.replace(g, opacities=g.opacities / 2))
-    for before, after in zip(whole.all_gaussians, half.all_gaussians, strict=True):
-        assert torch.equal(after.opacities, before.opacities / 2) and after.means is before.means
-    assert half.actors[0].track is whole.actors[0].track and half.sky is whole.sky
-
-
 def test_datasets_names_for_objects_have_classes():
     names = {
         "vehicle.bus.rigid": SemanticClass.VEHICLE,
@@ -289,3 +273,78 @@ def test_datasets_names_for_objects_have_classes():
         "carrot": SemanticClass.UNKNOWN,
     }
     assert {name: class_of_label(name) for name in names} == names
+
+
+class Owner:
+    """Hashed by identity."""
+
+
+@dataclass(frozen=True)
+class InFile:
+    number: int
+
+    def load(self) -> list[int]:
+        return [self.number]
+
+
+def test_a_value_is_made_once_and_forgotten_when_too_many_bytes_came_after_it():
+    memo, made = SceneMemo(max_bytes=400), []  # for one more beside the largest
+
+    def get(key: str) -> np.ndarray:
+        return memo.get((key,), lambda: made.append(key) or np.zeros(100, np.float32))
+
+    assert get("a") is get("a")
+    get("b")
+    get("a")  # used again: "b" is the one unused for longest
+    get("c")
+    get("a"), get("c")
+    assert made == ["a", "b", "c"]
+    get("b")
+    assert made == ["a", "b", "c", "b"]
+
+
+def test_threads_wait_for_the_one_that_makes_a_value():
+    memo, made = SceneMemo(), []
+
+    def make() -> object:
+        sleep(0.05)
+        made.append(1)
+        return object()
+
+    found = []
+    threads = [
+        threading.Thread(target=lambda: found.append(memo.get(("slow",), make))) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 1 and len({id(value) for value in found}) == 1
+
+
+def test_what_is_shared_is_found_by_another_process_memo():
+    here, there = SceneMemo(), SceneMemo(max_bytes=1)
+    here.put(("own",), 1)
+    here.put(("plain",), 2, shared=True)
+    here.put(("stored",), InFile(3), shared=True)
+    there.update(pickle.loads(pickle.dumps(here.shared())))
+    assert there.known(("plain",)) and not there.known(("own",))
+
+    def refuse() -> None:
+        raise AssertionError("it was handed over")
+
+    assert there.get(("plain",), refuse) == 2
+    first = there.get(("stored",), refuse)
+    assert first == [3] and here.get(("stored",), refuse) == [3]
+    there.get(("other",), lambda: torch.zeros(1000))  # what is shared is found again
+    assert there.get(("stored",), refuse) == [3]
+
+
+def test_a_memo_goes_with_its_owner():
+    owner = Owner()
+    memo_of(owner).put(("value",), 1)
+    assert memo_of(owner) is memo_of(owner)
+    gone = weakref.ref(memo_of(owner))
+    del owner
+    gc.collect()
+    assert gone() is None

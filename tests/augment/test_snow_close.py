@@ -22,7 +22,6 @@ from augment.effects.snow.near_camera import (
     Layer,
     SnowLayers,
     finest_split,
-    near_rows,
     shift_m,
     split_discs,
     split_near,
@@ -135,37 +134,6 @@ def test_grain_belongs_to_the_place():
     assert float(colors(one).std()) > 0.005
     other = split_near(snow, None, here, SUN, Grain(0.5, 0.4, seed=6)).fine
     assert not torch.allclose(colors(one), colors(other), atol=2e-3)
-
-
-def test_the_light_that_is_added_per_pixel_has_the_same_grain():
-    snow, view = sheet(), camera()
-    slopes = torch.full((len(snow), 3), 0.2)
-    near = split_near(snow, slopes, view, SUN, GRAIN)
-    factor = colors(near.fine) / 0.7
-    assert torch.allclose(near.fine_slopes, 0.2 * factor, atol=1e-5)
-
-
-def test_grain_fades_out_with_the_distance_and_smooth_snow_has_none():
-    snow, view = sheet(1.0, 9.9, half_m=0.6), camera(f=1500.0, width=960, height=720)
-    near = split_near(snow, None, view, SUN, GRAIN)
-    off = (colors(near.fine)[:, 0] - 0.7).abs()
-    distance = (near.fine.means - view.centre.float()).norm(dim=1)
-    assert float(distance.max()) > 6
-    assert float(off[distance > 6].mean()) < 0.4 * float(off[distance < 4].mean())
-    smooth = split_near(snow, None, view, SUN, Grain(0.0, 0.4, 5)).fine
-    assert torch.allclose(colors(smooth), torch.tensor(0.7), atol=1e-6)
-
-
-def test_the_side_towards_the_sun_is_brighter_than_the_other():
-    """Where the noise falls towards the sun, snow faces it: reversed light reverses the relief."""
-    snow, view = sheet(), camera()
-    grain = Grain(0.5, 1.0, 5)
-    lit = colors(split_near(snow, None, view, SUN, grain).fine)[:, 0]
-    back = colors(split_near(snow, None, view, SUN * torch.tensor([-1.0, 1, 1]), grain).fine)[:, 0]
-    flat = colors(split_near(snow, None, view, SUN, Grain(0.5, 0.0, 5)).fine)[:, 0]
-    relief, reverse = (lit - flat).numpy(), (back - flat).numpy()
-    assert float(lit.std()) > 1.2 * float(flat.std())
-    assert np.abs(relief + reverse).max() < 1e-5
 
 
 # ---- Against definitions, and on a GPU -----------------------------------------------------------
@@ -281,22 +249,6 @@ def test_the_kernel_splits_discs_as_its_definition_does(lit, shift):
         torch.testing.assert_close(*pair, rtol=2e-7, atol=1e-7)
     if lit:
         torch.testing.assert_close(found.fine_slopes, expected.fine_slopes, rtol=2e-7, atol=1e-7)
-
-
-def test_no_point_near_the_eye_is_left_out_and_few_others_are_looked_at():
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-30, 5, -1), (30, 40, 2), (5000, 3)).astype(np.float32)
-    points = points[np.argsort(np.floor(points[:, 1] / 5) * 100 + points[:, 0])]  # in strips
-    owner = discs(1, 0)
-    for eye in ((3.0, 10.0, 1.0), (90.0, 0.0, 1.0), (-31.0, 41.0, 0.0)):
-        gaps = np.linalg.norm(points.astype(np.float64) - eye, axis=1)
-        for reach in (1.0, 12.0, 200.0):
-            near = near_rows(owner, points, np.array(eye), reach)
-            assert (np.diff(near) > 0).all()
-            assert set(np.flatnonzero(gaps < reach)) <= set(near.tolist())
-        assert len(near) == 5000
-    assert len(near_rows(owner, points, np.array([3.0, 10.0, 1.0]), 5.0)) < 2000
-    assert len(near_rows(owner, points[:0], np.zeros(3), 9.0)) == 0
 
 
 def yawed(angle: float, x: float, y: float) -> torch.Tensor:

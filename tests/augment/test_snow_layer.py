@@ -1,16 +1,18 @@
-"""Snow laid on beds made by hand: how deep, where, how closed, what colour, and what it buries."""
+"""Snow laid on beds made by hand: how deep, where, how closed, what it buries, in which light."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
 
+from augment.cameras import Camera, Frame
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.kernels import BARE_M, FILM_M
+from augment.effects.snow.kernels import BARE_M
 from augment.effects.snow.layer import (
     OPACITY,
     PRESSED,
@@ -25,16 +27,23 @@ from augment.effects.snow.layer import (
     share_covered,
     threshold_of,
 )
-from augment.effects.snow.light import Illumination
+from augment.effects.snow.light import (
+    Illumination,
+    display_from_linear,
+    illumination_of,
+    light_of,
+    linear_from_display,
+)
 from augment.effects.snow.near_camera import SnowLayers
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
-from augment.scene import Actor, Track
+from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
-from recipes.snow import Snow
+from augment.sky import ConstantSky, LatLongSky, Sky
+from recipes.snow import Snow, SnowLight
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
 
 CELL_M = 0.05
@@ -76,16 +85,6 @@ def test_median_depth_on_open_ground_is_the_recipes(depth_m, drift):
     assert heights.min() >= depth_m / 4.1 and heights.max() <= depth_m * 4.1
 
 
-def test_drifts_grow_with_the_wind_and_stay_gentle_in_deep_snow():
-    ground = level_bed(30.0, 0.1).ground
-    calm, breezy, stormy = (
-        _depths(ground, depth_m=0.2, wind={"drift": d}, grain=0) for d in (0, 0.3, 1)
-    )
-    assert calm.std() < 0.5 * breezy.std() < 0.4 * stormy.std()
-    deep = _depths(ground, depth_m=3.0, wind={"drift": 0.3}).reshape(300, 300)
-    assert np.abs(np.diff(deep, axis=0) / 0.1).mean() < 0.15  # a rise of 15 % would be choppy
-
-
 def test_wind_piles_snow_up_before_obstacles_and_takes_it_from_their_lee():
     options = {"depth_m": 0.1, "wind": {"drift": 0.5, "direction_deg": 90}}
     before, beside, behind = (
@@ -122,19 +121,6 @@ def test_share_of_level_ground_that_carries_snow(depth_m, coverage):
     assert (heights[heights > 0] >= BARE_M).all()
 
 
-def test_patches_are_metres_wide_and_thin_out_at_their_rims():
-    heights = _depths(level_bed(40.0, CELL_M).ground, depth_m=0.1, coverage=0.5, **CALM)
-    covered = heights.reshape(800, 800) > 0
-    ends = np.diff(covered.astype(np.int8), axis=0) != 0
-    mean_run_m = 40.0 * 800 / (ends.sum() + 800)
-    assert 0.3 < mean_run_m < 3
-    beside_bare = np.zeros_like(covered)
-    beside_bare[:-1] |= ends
-    beside_bare[1:] |= ends
-    rims = heights.reshape(800, 800)[beside_bare & covered]
-    assert np.median(rims) < 0.03 < 0.08 < np.median(heights[heights > 0])
-
-
 # --- tracks and water -----------------------------------------------------------------------------
 
 
@@ -156,21 +142,6 @@ def test_tracks_are_pressed_where_the_recipe_says():
         heights = _depths(cells, depth_m=depth_m, tracks=tracks)
         ratio = np.median(heights[rut]) / np.median(heights[~rut])
         assert abs(ratio - (1 - PRESSED if shown else 1)) < 0.1
-
-
-def test_tracks_keep_a_film_and_are_dark():
-    cells = _rutted()
-    cover = _lay(bed_of_cells(cells), depth_m=0.02, coverage=1.0)
-    heights = _depths(cells, depth_m=0.02)
-    rut = cells.tracks.numpy() == 1
-    assert np.quantile(heights[rut & (heights > 0)], 0.2) >= 0.9 * FILM_M
-    means = cover.ground.gaussians.means
-    colors = _colors(cover.ground.gaussians)
-    inside = (means[:, 1] > 1.07) & (means[:, 1] < 1.23)
-    dark, bright = colors[inside].mean(0), colors[~inside].mean(0)
-    assert 0.5 < dark.mean() / bright.mean() < 0.85
-    left = dark / bright
-    assert left.max() - left.min() < 0.02, "tracks have the tint of the light"
 
 
 def test_no_snow_below_the_waters_edge():
@@ -221,6 +192,7 @@ def test_edge_is_as_sharp_as_a_cell():
     assert abs(np.median(middles)) < 0.4 * CELL_M  # from the bed's border
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("depth_m", [0.2, 2.0])
 def test_sides_of_a_deep_layer_are_closed(depth_m):
     cover = _lay(level_bed(3.0, border=OPEN_EDGE), depth_m=depth_m)
@@ -233,24 +205,6 @@ def test_sides_of_a_deep_layer_are_closed(depth_m):
     inside &= (hit[..., 2] > 0.03) & (hit[..., 2] < 0.45 * depth_m)
     assert inside.sum() > 50
     assert _alpha(cover, camera)[inside].min() > 0.97
-
-
-def test_thin_snow_hangs_no_curtain_over_a_step_of_the_ground():
-    z = np.zeros((40, 40))
-    z[20:] = 0.5
-    gaussians = _lay(bed_of_cells(cells_on_grid(z, CELL_M)), depth_m=0.05).ground.gaussians
-    assert len(gaussians) == 1600
-    assert ((gaussians.means[:, 2] < 0.15) | (gaussians.means[:, 2] > 0.5)).all()
-
-
-def test_deep_snow_evens_out_the_grounds_relief():
-    rough = np.random.default_rng(1).normal(0, 0.02, (100, 100))
-    bed = bed_of_cells(cells_on_grid(rough, CELL_M))
-    steps = []
-    for depth_m in (0.05, 0.4):
-        z = _lay(bed, depth_m=depth_m, **CALM).ground.gaussians.means[:, 2].reshape(100, 100)
-        steps.append(z.diff(dim=0)[10:-10, 10:-10].std())
-    assert steps[1] < 0.35 * steps[0] and steps[0] < 0.03
 
 
 def test_discs_lie_in_the_surface_of_a_slope():
@@ -296,14 +250,6 @@ def test_shadows_of_the_recording_are_bluish_snow_not_dirt():
     lit = _colors(gaussians)[gaussians.means[:, 0] > 1.3].mean(0)
     assert (shaded - torch.tensor(LIGHT.shadow_rgb)).abs().max() < 0.03
     assert lit[0] - shaded[0] > lit[2] - shaded[2] + 0.05
-
-
-def test_grain_shows_in_sizes_and_colours():
-    smooth, coarse = (
-        _lay(level_bed(4.0), depth_m=0.1, grain=g, tracks="never").ground.gaussians for g in (0, 1)
-    )
-    assert coarse.scales[:, 1].std() > smooth.scales[:, 1].std() + 0.02 * CELL_M
-    assert 0.005 < _colors(smooth).std(0).mean() < 0.5 * _colors(coarse).std(0).mean()
 
 
 def test_two_shadings_agree_where_normals_do():
@@ -384,18 +330,6 @@ def test_snow_on_a_vehicle_is_carried_along_and_lit_where_it_stands(shading):
         assert brightness[0] > brightness[1] + 0.1
 
 
-def test_snow_on_vehicles_has_no_ruts_and_is_each_ones_own():
-    tracks = np.ones((60, 60))
-    cells = cells_on_grid(np.zeros((60, 60)), CELL_M, tracks=tracks)
-    scene, bed = _driving_scene(0.0, cells)
-    cover = _lay(bed, scene, depth_m=0.1, water=100.0)
-    car = cover.actors["car"]
-    assert not len(cover.ground.gaussians)  # under water, which the vehicle's is not asked about
-    assert abs(car.gaussians.means[:, 2].median() - 0.1) < 0.02
-    ground = _lay(bed_of_cells(cells), depth_m=0.1, tracks="never").ground
-    assert not torch.equal(ground.gaussians.means, car.gaussians.means)
-
-
 # --- glints ---------------------------------------------------------------------------------------
 
 
@@ -459,10 +393,7 @@ def test_same_bits_for_any_number_of_threads_and_another_seed_is_another_snow():
     layers = []
     for count in (1, 2):
         limit_threads(count)
-        try:
-            layers.append(_lay(bed, depth_m=0.3, coverage=0.7).ground.gaussians)
-        finally:
-            limit_threads(None)
+        layers.append(_lay(bed, depth_m=0.3, coverage=0.7).ground.gaussians)
     for name in ("means", "quats", "scales", "sh"):
         assert torch.equal(getattr(layers[0], name), getattr(layers[1], name))
     other = _lay(bed, depth_m=0.3, coverage=0.7, seed=4).ground.gaussians
@@ -484,31 +415,6 @@ def test_noise_has_unit_deviation_and_median_zero():
     assert abs(np.median(noise)) < 0.01
 
 
-def test_noise_is_continuous_also_across_the_lattice():
-    u, v = _points(20_000, far=50)
-    u[:5000] = np.round(u[:5000])
-    step = 1e-6
-    for du, dv in ((step, 0), (-step, 0), (0, step), (0, -step)):
-        change = gradient_noise(u + du, v + dv, SEED) - gradient_noise(u, v, SEED)
-        assert np.abs(change).max() < 40 * step  # its steepest rise is about 15
-
-
-def test_noise_is_zero_on_the_lattice_and_not_mirrored_at_the_origin():
-    whole = np.arange(-3.0, 4.0)
-    assert np.array_equal(gradient_noise(whole, whole[::-1], SEED), np.zeros(7))
-    u, v = (np.abs(p) for p in _points(1000, far=20))
-    here, mirrored = gradient_noise(u, v, SEED), gradient_noise(-u, v, SEED)
-    assert abs(np.corrcoef(here, mirrored)[0, 1]) < 0.1
-
-
-def test_noise_of_other_seeds_and_far_places_is_unrelated():
-    u, v = _points(20_000, far=100)
-    here = gradient_noise(u, v, SEED)
-    for other in (gradient_noise(u, v, np.uint64(78)), gradient_noise(u + 1e6, v - 1e6, SEED)):
-        assert abs(np.corrcoef(here, other)[0, 1]) < 0.04  # 5.6 standard errors
-        assert abs(other.std() - 1) < 0.03
-
-
 def test_threshold_leaves_the_share_it_was_asked_for():
     octaves = octaves_of(((2.6, 1.0), (1.1, 0.5), (0.45, 0.3)), np.random.default_rng(5))
     field = field_of(octaves, *_points(200_000, seed=3))
@@ -516,25 +422,6 @@ def test_threshold_leaves_the_share_it_was_asked_for():
         got = (field > threshold_of(octaves, share)).mean()
         assert abs(got - share) < 0.005  # standard errors 0.0011 here and 0.0014 of the threshold
     assert threshold_of(octaves, 0.0) == math.inf and threshold_of(octaves, 1.0) == -math.inf
-
-
-def test_stretched_noise_changes_faster_along_the_wind():
-    octaves = octaves_of(((2.0, 1.0),), np.random.default_rng(1), along=0.7, stretch=2.0)
-    x, y = _points(20_000, far=1000)
-    here = field_of(octaves, x, y)
-    cos, sin = 0.1 * math.cos(0.7), 0.1 * math.sin(0.7)
-    along = np.abs(field_of(octaves, x + cos, y + sin) - here).mean()
-    across = np.abs(field_of(octaves, x - sin, y + cos) - here).mean()
-    assert 3.4 < along / across < 4.6  # 2 over 1/2
-
-
-def test_octaves_fade_before_cells_are_too_large_to_show_them():
-    octaves = octaves_of(((0.4, 1.0),), np.random.default_rng(1))
-    x, y = _points(2000)
-    whole = field_of(octaves, x, y, 0.1)
-    assert np.array_equal(whole, field_of(octaves, x, y))
-    np.testing.assert_allclose(field_of(octaves, x, y, 0.15), 0.5 * whole, rtol=1e-12)
-    assert not field_of(octaves, x, y, 0.2).any()
 
 
 def _rugged_cells(corner_m=(0.0, 0.0)):
@@ -575,10 +462,190 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     )
 
 
-def test_random_bits_hang_on_the_place_and_differ_between_cells():
-    cells = cells_on_grid(np.zeros((60, 50)), 0.05)
-    profile = profile_of(Snow(depth_m=0.1), np.random.default_rng(0), on_ground=True)
-    draws = find_depths(cells, profile, SEED).draws
-    assert len(np.unique(draws)) == len(cells)
-    some = cells_on_grid(np.zeros((30, 50)), 0.05, corner_m=(1.5, 0.0))
-    assert np.array_equal(find_depths(some, profile, SEED).draws, draws[1500:])
+HEIGHT = 180  # a row a degree
+GREY = (0.35, 0.35, 0.35)
+BLUE_SKY = (0.30, 0.45, 0.75)
+
+
+def sky_with_sun(
+    azimuth_deg: float, elevation_deg: float, *, radius_deg: float = 1.5, rgb: object = BLUE_SKY
+) -> LatLongSky:
+    """An even sky, a dark land, and a disc of sun."""
+    elevations = np.radians(90 - (np.arange(HEIGHT) + 0.5))
+    azimuths = np.radians((np.arange(2 * HEIGHT) + 0.5) - 180)
+    e, a = np.meshgrid(elevations, azimuths, indexing="ij")
+    directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    image = np.where(e[..., None] > 0, np.asarray(rgb), 0.2)
+    image[directions @ unit(azimuth_deg, elevation_deg) > np.cos(np.radians(radius_deg))] = 1.0
+    return LatLongSky(torch.from_numpy(image.astype(np.float32)))
+
+
+def unit(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
+    return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+
+
+def discs(rgb: object, semantic: SemanticClass | None, *, count: int = 30, z: float = 0.0):
+    """Level discs of one colour."""
+    sh = torch.as_tensor(np.asarray(rgb, np.float32) - 0.5).expand(count, 1, 3) / SH_C0
+    return Gaussians(
+        means=torch.tensor([0.0, 0.0, z])
+        + torch.arange(count)[:, None] * torch.tensor([1.0, 0, 0]),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous(),
+        scales=torch.tensor([0.3, 0.3, 0.01]).expand(count, 3).contiguous(),
+        opacities=torch.full((count,), 0.9),
+        sh=sh.contiguous(),
+        semantic=None if semantic is None else torch.full((count,), int(semantic)).short(),
+    )
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh", "semantic")
+    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def scene(sky: Sky, ground: Gaussians, frames: tuple[Frame, ...] = ()) -> Scene:
+    return Scene("s", "test:s", ground, (), sky, frames)
+
+
+def street(sky: Sky, rgb: object = GREY) -> Scene:
+    return scene(sky, discs(rgb, SemanticClass.ROAD))
+
+
+def snow(*, albedo: float = 0.85, **light: float) -> Snow:
+    return Snow(depth_m=0.1, albedo=albedo, light=SnowLight(**light))
+
+
+def level(light: Illumination) -> np.ndarray:
+    """Linear colour of level snow that sees the sun."""
+    lit, shadow = (linear_from_display(np.array(c)) for c in (light.lit_rgb, light.shadow_rgb))
+    return shadow + (lit - shadow) * (light.sun[2] + light.wrap) / (1 + light.wrap)
+
+
+def luminance(rgb: object) -> float:
+    return float(linear_from_display(np.asarray(rgb)) @ [0.2126, 0.7152, 0.0722])
+
+
+def degrees_between(a: object, b: object) -> float:
+    return math.degrees(math.acos(min(1.0, float(np.dot(np.asarray(a), np.asarray(b))))))
+
+
+def check(light: Illumination) -> None:
+    values = (*light.sun, *light.lit_rgb, *light.shadow_rgb, light.wrap)
+    assert all(type(value) is float and math.isfinite(value) for value in values)
+    assert math.hypot(*light.sun) == pytest.approx(1, abs=1e-12)
+    pairs = zip(light.shadow_rgb, light.lit_rgb, strict=True)
+    assert all(0 <= shadow <= lit <= 1 for shadow, lit in pairs)
+    assert 0 <= light.wrap <= 1
+
+
+def test_encoding_is_srgb_and_inverts() -> None:
+    values = np.linspace(0, 1, 1001)
+    # both halves of the standard are given to four digits
+    assert display_from_linear(linear_from_display(values)) == pytest.approx(values, abs=1e-6)
+    assert float(linear_from_display(np.array(0.5))) == pytest.approx(0.214041, abs=1e-6)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(-170, 12), (64, 45), (179, 85)])
+def test_the_sun_is_found(azimuth_deg: float, elevation_deg: float) -> None:
+    light = illumination_of(street(sky_with_sun(azimuth_deg, elevation_deg)), snow())
+    # samples are 1.1 degrees apart and are averaged over 8
+    assert degrees_between(light.sun, unit(azimuth_deg, elevation_deg)) < 1.5
+    check(light)
+
+
+def test_an_even_sky_is_overcast() -> None:
+    for rgb in ((0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (0.2, 0.3, 0.6)):
+        light = illumination_of(street(ConstantSky(torch.tensor(rgb))), snow())
+        assert light.sun == pytest.approx(unit(135, 45), abs=1e-9)
+        # soft shadows: 8 to 10 % darker than what faces the light
+        assert 0.90 < luminance(light.shadow_rgb) / luminance(light.lit_rgb) < 0.92
+        assert light.wrap > 0.8
+        check(light)
+
+
+def test_a_clear_sky_makes_blue_shadows_half_as_bright_and_warm_light() -> None:
+    found = light_of(street(sky_with_sun(0, 45, radius_deg=4)))
+    assert found.sun_share == pytest.approx(0.9)
+    light = illumination_of(street(sky_with_sun(0, 45, radius_deg=4)), snow())
+    assert 0.45 < luminance(light.shadow_rgb) / luminance(light.lit_rgb) < 0.6
+    red, green, blue = light.shadow_rgb
+    assert red < green < blue and blue - red < 0.2
+    assert light.lit_rgb[0] > light.lit_rgb[2] and light.lit_rgb[0] - light.lit_rgb[2] < 0.05
+    assert light.wrap == pytest.approx(0.54)
+
+
+def test_level_snow_gets_the_light_of_the_road() -> None:
+    """Where nothing nears white: linear radiance is the road's times the ratio of the albedos."""
+    for sky in (sky_with_sun(0, 30, radius_deg=4), ConstantSky(torch.tensor([0.2, 0.2, 0.2]))):
+        for rgb in ((0.05, 0.05, 0.05), (0.2, 0.2, 0.2)):
+            light = illumination_of(street(sky, rgb), snow(albedo=0.8))
+            shown = float(level(light) @ [0.2126, 0.7152, 0.0722])
+            # sRGB's two halves are given to four digits
+            assert shown == pytest.approx(luminance(rgb) * 0.8 / 0.10, rel=1e-4)
+
+
+def test_what_the_recipe_says_holds() -> None:
+    place = street(sky_with_sun(50, 40))
+    found = light_of(place)
+    azimuth = illumination_of(place, snow(sun_azimuth_deg=-100))
+    assert azimuth.sun == pytest.approx(unit(-100, found.elevation_deg), abs=1e-9)
+    elevation = illumination_of(place, snow(sun_elevation_deg=0))
+    assert elevation.sun == pytest.approx(unit(found.azimuth_deg, 0), abs=1e-9)
+    both = illumination_of(place, snow(sun_azimuth_deg=90, sun_elevation_deg=90))
+    assert both.sun == pytest.approx((0, 0, 1), abs=1e-9)
+    ratios = []
+    for share in (0.0, 0.5, 1.0):
+        light = illumination_of(place, snow(sun=share))
+        ratios.append(luminance(light.shadow_rgb) / luminance(light.lit_rgb))
+        check(light)
+    assert ratios[0] > ratios[1] > ratios[2] and ratios[2] == pytest.approx(0.5, abs=0.01)
+    bright = illumination_of(place, snow(brightness=0.8))
+    assert luminance(bright.lit_rgb) == pytest.approx(luminance((0.8, 0.8, 0.8)), rel=1e-6)
+    check(illumination_of(place, snow(brightness=1.0, albedo=1.0)))
+
+
+def test_the_road_is_asked_first_and_by_area() -> None:
+    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
+    road = discs((0.3, 0.3, 0.3), SemanticClass.ROAD)
+    walls = discs((0.9, 0.1, 0.1), SemanticClass.BUILDING, count=300)
+    pavement = discs((0.6, 0.6, 0.6), SemanticClass.SIDEWALK, count=300)
+    alone = light_of(scene(sky, road))
+    assert alone.ground_albedo == 0.10
+    assert alone.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
+    assert light_of(scene(sky, joined(walls, pavement, road))) == alone
+    few = discs((0.3, 0.3, 0.3), SemanticClass.ROAD, count=5)
+    assert light_of(scene(sky, joined(few, pavement))).ground_albedo == 0.22
+    # a layer of many small dark splats beneath, which nothing sees
+    beneath = discs((0.0, 0.0, 0.0), SemanticClass.ROAD, count=100)
+    small = dataclasses.replace(beneath, scales=0.3 * beneath.scales)
+    faint = dataclasses.replace(beneath, opacities=0.1 * beneath.opacities)
+    for layer in (small, faint):
+        assert light_of(scene(sky, joined(road, layer))) == alone
+
+
+def test_without_classes_level_splats_below_the_cameras_are_ground() -> None:
+    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
+    pose[1, 3] = 1.5  # the eye stands at z = 1.5 m
+    camera = Camera("front", 8, 6, 5.0, 5.0, 4.0, 3.0, pose)
+    frames = (Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": camera}),)
+    below, above = discs((0.3, 0.3, 0.3), None), discs((0.9, 0.9, 0.9), None, count=90, z=4.0)
+    turned = math.sqrt(0.5) * torch.tensor([1.0, 1.0, 0, 0]).repeat(90, 1)
+    upright = dataclasses.replace(discs((0.9, 0.1, 0.1), None, count=90), quats=turned)
+    parts = [below, above, upright]
+    names = ("means", "quats", "scales", "opacities", "sh")
+    everything = Gaussians(*(torch.cat([getattr(p, name) for p in parts]) for name in names))
+    found = light_of(scene(sky, everything, frames))
+    assert found.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
+    assert not found.ground_is_grey
+
+
+def test_any_scene_gives_colours() -> None:
+    numbers = ((0.0, 0.0), (0.0, math.nan), (1e-4, 40.0), (7.0, 1.0), (math.nan, 0.5))
+    for (sky, road), semantic in itertools.product(numbers, (SemanticClass.ROAD, None)):
+        count = 1 if road == 0.5 else 30
+        place = scene(ConstantSky(torch.full((3,), sky)), discs((road,) * 3, semantic, count=count))
+        for recipe in (snow(), snow(albedo=1.0, sun=1.0), snow(brightness=0.0)):
+            check(illumination_of(place, recipe))

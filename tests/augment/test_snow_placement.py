@@ -1,37 +1,39 @@
-"""Where snow can lie: cells over scenes whose surfaces are known."""
+"""Where snow can lie: cells over scenes whose surfaces are known, and the files that keep them."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
-from augment.cameras import Camera
-from augment.effects.snow import placement, surface_kernels
+from augment.effects.snow import height_map as in_threads
+from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
+from augment.effects.snow.height_map import in_order
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
-    RINGS_M,
     WHEEL_SHARE,
-    CellNumbers,
     PlacementSettings,
     place_snow_support,
-    plan_tiles,
-    views_along,
 )
-from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, is_vehicle
-from augment.effects.snow.surface_kernels import LINK, OPEN
-from augment.errors import SceneError
-from augment.geometry import quat_from_rotmat, rotmat_from_quat
+from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
+from augment.effects.snow.surface import is_vehicle
+from augment.effects.snow.surface_kernels import OPEN
+from augment.errors import OutputError, SceneError
 from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, Scene, Track
 from augment.semantics import SemanticClass
-from tests.scenes import camera_ahead, one_gaussian, stack
-from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, stack_all, wall
+from tests.scenes import one_gaussian, stack
+from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
 
 COARSE = PlacementSettings(cell_m=0.1)
 GROUND = sheet((-6, 20), (-8, 8))
@@ -116,63 +118,11 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
 
 
-def test_cells_grow_with_the_distance_from_the_path(flat_ground) -> None:
-    cells = flat_ground[1].ground
-    x, y = cells.centers_m[:, 0].double(), cells.centers_m[:, 1].double()
-    path = torch.hypot((x - x.clamp(0, 1)).abs(), y)
-    for distance, size in zip(path.tolist(), cells.sizes_m.tolist(), strict=True):
-        ring = sum(distance >= limit + 3.2 * math.sqrt(2) for limit in RINGS_M)  # a tile's diagonal
-        ring_at_most = sum(distance >= limit for limit in RINGS_M)
-        assert 0.1 * 2 ** min(ring, 3) <= size * 1.001
-        assert size <= 0.1 * 2 ** min(ring_at_most, 3) * 1.001
-    assert len(cells.sizes_m.unique()) >= 2
-
-
-def test_only_what_a_camera_sees_has_cells(flat_ground) -> None:
-    scene, bed = flat_ground
-    camera, last = cameras_of(scene)
-    points = bed.ground.centers_m.double()
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for view in (camera, last):
-        ahead = points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3]
-        u = ahead[:, 0] / ahead[:, 2] * view.fx + view.cx
-        v = (ahead[:, 1] - 1.0) / ahead[:, 2] * view.fy + view.cy  # a metre of snow on it
-        near = 10 + 3 * 0.2 * view.fx / ahead[:, 2].clamp(min=0.2)  # grown by two cells
-        inside = (u > -near) & (u < view.width + near) & (v < view.height + near)
-        seen |= (ahead[:, 2] > 0) & inside
-    assert bool(seen.all())
-    assert float(points[:, 0].min()) > 0.5
-
-
 def test_bits_do_not_depend_on_threads(flat_ground) -> None:
     scene, bed = flat_ground
-    limit_threads(1)
-    try:
-        alone = place_snow_support(scene, cameras_of(scene), COARSE)
-    finally:
-        limit_threads(None)
-    assert_equal_cells(alone.ground, bed.ground)
-
-
-def test_squares_drawn_at_once_make_no_difference(monkeypatch) -> None:
-    platform = sheet((8, 10), (-2, 0), 0.6)
-    scene = drive(GROUND, platform, wall(8, (-2, 0), (0, 0.6)))
-    whole = place(scene).ground
-    monkeypatch.setattr(placement, "_SQUARE_CELLS", 64)
-    parts = place(scene).ground
-    assert len(whole) == len(parts)
-    orders = [np.lexsort(cells.centers_m[:, :2].numpy().T) for cells in (whole, parts)]
-    for name in ("centers_m", "normals", "sizes_m", "edge_m", "tracks", "banks", "light"):
-        a, b = (
-            getattr(cells, name)[order] for cells, order in zip((whole, parts), orders, strict=True)
-        )
-        # Splats are projected from another eye, so heights and colours differ by roundings.
-        np.testing.assert_allclose(a, b, atol=2e-3, err_msg=name)
-    codes = [
-        cells.neighbours[order].clamp(max=0)
-        for cells, order in zip((whole, parts), orders, strict=True)
-    ]
-    assert torch.equal(*codes)
+    limit_threads(2)
+    together = place_snow_support(scene, cameras_of(scene), COARSE)
+    assert_equal_cells(together.ground, bed.ground)
 
 
 def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
@@ -223,34 +173,10 @@ def test_nothing_lies_under_a_canopy() -> None:
     assert bool(within(cells, (10, 13), (-1, 1)).any())
 
 
-def test_what_a_wall_hides_has_no_cells() -> None:
-    cells = place(drive(GROUND, wall(8, (-7.9, 7.9), (0, 5)))).ground
-    assert bool(within(cells, (5, 7), (-2, 2)).any())
-    assert not bool(within(cells, (11, 19), (-5, 5)).any())
-
-
-def test_a_single_gaussian_and_faint_ones() -> None:
-    place(drive(one_gaussian(mean=(6.0, 0.0, 0.0))))
-    faint = sheet((-6, 20), (-8, 8), opacity=0.01)
-    assert len(place(drive(faint)).ground) == 0
-    alone = place(drive(one_gaussian(mean=(6, 0, 0), scale=(0.5, 0.5, 0.01), opacity=0.99)))
-    assert len(alone.ground) > 10 and float(alone.ground.centers_m[:, 2].abs().max()) < 0.05
-
-
 def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
     scene = drive(GROUND)
     with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
         place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
-
-
-def test_far_from_the_origin_nothing_breaks() -> None:
-    shift = torch.tensor([1e6, -1e6, 50.0])
-    ground = dataclasses.replace(GROUND, means=GROUND.means + shift)
-    start = tuple(shift.tolist())
-    places = [(start[0] + x, start[1], start[2] + 1.5) for x in (0.0, 1.0)]
-    cells = place(drive(ground, places=places), PlacementSettings(cell_m=0.2)).ground
-    assert len(cells) > 100
-    np.testing.assert_allclose(cells.centers_m[:, 2], 50, atol=0.02)
 
 
 def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> None:
@@ -264,14 +190,7 @@ def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> N
             PlacementSettings(**{name: value})
 
 
-def test_a_faint_floater_does_not_lift_the_bed() -> None:
-    floater = one_gaussian(mean=(7.0, 0.0, 4.0), scale=(1.0, 1.0, 0.3), opacity=0.3)
-    cells = place(drive(GROUND, floater)).ground
-    chosen = within(cells, (6, 8), (-1, 1))
-    assert int(chosen.sum()) > 300
-    assert float(cells.centers_m[chosen, 2].abs().max()) < 0.02
-
-
+@pytest.mark.long
 def test_small_gaps_are_bridged_and_posts_stand_out() -> None:
     ground = sheet((-6, 20), (-8, 8))
     gap = (ground.means[:, :2] - torch.tensor([5.1, 0.1])).abs().amax(1) < 0.11
@@ -316,12 +235,6 @@ def test_holes_under_the_path_and_small_ones_are_closed(
         np.testing.assert_allclose(cells.light[inside], 1, atol=0.1)
 
 
-def test_a_hole_between_two_levels_stays_open() -> None:
-    levels = [sheet((-6, 6), (-8, 8)), sheet((6, 20), (-8, 8), 0.7)]
-    cells = place(drive(hole_at(stack_all(levels), 6.0, 0.0, 1.2))).ground
-    assert not bool(within(cells, (5.3, 6.7), (-0.7, 0.7)).any())
-
-
 @pytest.mark.parametrize(("height_m", "expected"), [(0.15, False), (0.6, True)])
 def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
     pavement = [sheet((-6, 20), (1.5, 8), height_m), side_wall(1.5, (-6, 20), (0, height_m))]
@@ -332,6 +245,7 @@ def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
     assert expected or area > 2.9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell_m", [0.05, 0.4])
 def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     x = torch.linspace(6, 9, 40)
@@ -341,20 +255,6 @@ def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     cells = place(drive(GROUND, wire, *board), PlacementSettings(cell_m=cell_m)).ground
     assert float(cells.centers_m[:, 2].max()) < 0.1
     assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
-
-
-def test_bins_carry_snow_and_blobs_before_walls_do_not() -> None:
-    bin_top = sheet((5, 5.5), (1.0, 1.5), 0.9)
-    sides = [side_wall(y, (5, 5.5), (0, 0.9)) for y in (1.0, 1.5)]
-    fronts = [wall(v, (1.0, 1.5), (0, 0.9)) for v in (5, 5.5)]
-    blob = one_gaussian(mean=(7.0, -1.0, 2.5), scale=(0.15, 0.25, 0.05), opacity=0.99)
-    scene = drive(
-        GROUND, bin_top, *sides, *fronts, blob, places=[(x, 0.0, 3.5) for x in (0.0, 1.0)]
-    )
-    cells = place(scene, PlacementSettings(cell_m=0.05)).ground
-    top = within(cells, (5, 5.5), (1.0, 1.5)) & (cells.centers_m[:, 2] > 0.8)
-    assert float((cells.sizes_m[top] ** 2).sum()) > 0.15
-    assert float(cells.centers_m[:, 2].max()) < 1.0
 
 
 def test_the_ground_is_buried_and_walls_are_not() -> None:
@@ -376,31 +276,6 @@ def test_the_ground_is_buried_and_walls_are_not() -> None:
     assert not bool(hidden[inner & (means[:, 2] < 0.05)].any())  # the ground below is deeper
 
 
-def test_what_reaches_beyond_the_cells_is_not_buried() -> None:
-    far = sheet((2, 12), (-0.2, 0.2), -0.01)
-    wide = dataclasses.replace(far, scales=far.scales * torch.tensor([1.0, 60.0, 1.0]))
-    cells = place(drive(sheet((2, 12), (-2, 2)), wide)).ground
-    assert len(cells.buried) > 0
-    assert int(cells.buried.max()) < len(sheet((2, 12), (-2, 2)))
-
-
-def test_cells_over_a_buried_gaussian_are_those_it_lies_under() -> None:
-    ground = sheet((-6, 20), (-8, 8))
-    turn = rotmat_from_quat(torch.tensor([[math.cos(0.3), 0.0, 0.0, math.sin(0.3)]]))
-    ground = dataclasses.replace(
-        ground,
-        scales=ground.scales * torch.tensor([3.0, 1.0, 1.0]),
-        quats=quat_from_rotmat(turn).expand(len(ground), 4).contiguous(),
-    )
-    cells = place(drive(ground)).ground
-    offsets = torch.tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]).float() * 1.5
-    axes = turn[0, :2, :2]  # columns: the long axis, then the short one
-    ends = (offsets * ground.scales[0, :2]) @ axes.T
-    points = ground.means[cells.buried.long(), None, :2] + ends
-    gap = (cells.centers_m[cells.buried_by.long(), :2] - points).abs().amax(-1)
-    assert bool((gap <= cells.sizes_m[cells.buried_by.long()] / 2 + 1e-4).all())
-
-
 def test_wheels_leave_tracks_beside_the_path() -> None:
     scene = drive(sheet((-6, 30), (-8, 8)), places=[(x, 0.0, 1.5) for x in (0.0, 2.0, 4.0)])
     cells = place(scene, PlacementSettings(cell_m=0.05)).ground
@@ -411,15 +286,6 @@ def test_wheels_leave_tracks_beside_the_path() -> None:
         for y in (0.0, 0.4, 1.3, -1.3):
             assert float(cells.tracks[under(cells, x, y)]) < 0.05
     assert float(cells.tracks.max()) > 0.95
-
-
-def test_tracks_stay_on_the_road() -> None:
-    road = sheet((-6, 8), (-8, 8), semantic=SemanticClass.ROAD)
-    grass = sheet((8, 20), (-8, 8), semantic=SemanticClass.TERRAIN)
-    cells = place(drive(road, grass)).ground
-    assert float(cells.tracks[within(cells, (3, 7.5), (-2, 2))].max()) > 0.5
-    assert float(cells.tracks[within(cells, (8.5, 16), (-2, 2))].max()) == 0
-    assert set(cells.semantic.unique().tolist()) == {SemanticClass.ROAD, SemanticClass.TERRAIN}
 
 
 def test_shade_on_the_ground_is_kept_and_markings_are_no_light() -> None:
@@ -456,25 +322,6 @@ def test_vehicles_carry_their_own_cells() -> None:
     assert bool(within(bed.ground, (4, 8), (2.5, 3.5)).any())  # it drives on: ground is ground
 
 
-def test_windscreens_of_those_that_drive_stay_clear() -> None:
-    slope = DRIVEN_MAX_SLOPE_DEG + 10
-    found = []
-    for moved_m in (5.0, 0.0):
-        car = box_car(moved_m=moved_m)
-        tilted = sheet((-2, -0.5), (-0.9, 0.9), 0.0, slope_deg=slope)
-        car = dataclasses.replace(car, gaussians=tilted)
-        found.append("car" in place(drive(GROUND, actors=[car])).actors)
-    assert found == [False, True]
-
-
-def test_parked_cars_keep_the_ground_below_them_bare() -> None:
-    parked = box_car(start=(7.0, 0.0), moved_m=0.0, with_shadow=False)
-    bed = place(drive(GROUND, actors=[parked]))
-    assert not bool(within(bed.ground, (5.3, 8.7), (-0.7, 0.7)).any())
-    assert "car" in bed.actors
-    assert float(bed.ground.tracks[within(bed.ground, (3, 4.7), (-2, 2))].max()) > 0.5  # the ego's
-
-
 def test_which_actors_are_vehicles() -> None:
     cases = [
         ("Car", None, True),
@@ -489,35 +336,6 @@ def test_which_actors_are_vehicles() -> None:
         assert is_vehicle(box_car(label=label, semantic=semantic)) is expected, label
     walker = drive(GROUND, actors=[box_car(label="Pedestrian")])
     assert place(walker, PlacementSettings(cell_m=0.2)).actors == {}
-
-
-def test_views_along_a_drive_are_spread_and_hold_both_ends() -> None:
-    cameras = [camera_ahead(position=(0.5 * i, 0, 1.5), timestamp_ns=i) for i in range(20)]
-    times = [camera.timestamp_ns for camera in views_along(cameras[::-1])]
-    assert times == [0, 4, 8, 12, 16, 19]
-    turning = [camera_ahead(yaw=0.1 * i, timestamp_ns=i) for i in range(5)]
-    assert [camera.timestamp_ns for camera in views_along(turning)] == [0, 2, 4]
-
-
-def test_numbers_of_cells_are_found_by_place() -> None:
-    plan = plan_tiles([camera_ahead(position=(3.0, 5.0, 1.5))], 0.1, (-1.0, 2.0))
-    numbers = CellNumbers(plan)
-    rng = np.random.default_rng(0)
-    expected, points = [], []
-    for level in range(4):
-        tiles = np.argwhere(plan.levels == level)
-        side = plan.cells_per_side(level)
-        picked = tiles[rng.integers(len(tiles), size=50)]
-        cells = np.unique(picked[:, ::-1] * side + rng.integers(side, size=(50, 2)), axis=0)
-        put = np.arange(len(cells), dtype=np.int32) + 1000 * level
-        numbers.put(level, cells[:, 0], cells[:, 1], put)
-        points.append(
-            plan.origin_m + (cells + rng.uniform(0.1, 0.9, cells.shape)) * plan.size_m(level)
-        )
-        expected.append(put)
-    assert numbers.at(np.concatenate(points)).tolist() == np.concatenate(expected).tolist()
-    outside = np.array([[1e9, 0.0], [-1e9, 5.0], [np.nan, 0.0], [3.0, 1e4]])
-    assert (numbers.at(outside) == -1).all()
 
 
 def test_medians_of_heights() -> None:
@@ -570,35 +388,198 @@ def test_edge_distances_are_those_to_the_nearest_edge() -> None:
         assert out[i, j] == pytest.approx(nearest, abs=0.1)  # a sweep may miss the very nearest
 
 
-def test_steps_part_surfaces_but_not_their_low_sides() -> None:
-    height = np.zeros((5, 8), np.float32)
-    height[:, 4:] = 0.15
-    everywhere = np.ones(height.shape, bool)
-    sides = np.empty((*height.shape, 4), np.int8)
-    surface_kernels.compare_sides(height, height, everywhere, everywhere, 0.1, sides)
-    assert (sides[:, 4, LEFT] == OPEN).all()
-    assert (sides[:, 3, RIGHT] == surface_kernels.RISES).all()
-    out = np.empty(height.shape, np.float32)
-    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
-    np.testing.assert_allclose(out[:, 4:], np.tile([0.5, 1.5, 2.5, 3.5], (5, 1)))
-    assert (out[:, :4] == 40).all()
-    sides[:] = LINK
-    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
-    assert (out == 40).all()
-
-
 def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
     for field in dataclasses.fields(SnowCells):
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
-def test_a_map_camera_sees_what_is_below_it() -> None:
-    scene = drive(sheet((-6, 20), (-8, 8)))
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[1, 1] = pose[2, 2] = -1.0
-    pose[2, 3] = 30.0
-    above = Camera("map", 60, 40, 10.0, 10.0, 30.0, 20.0, pose, is_orthographic=True)
-    cells = place_snow_support(scene, [above], PlacementSettings(cell_m=0.2)).ground
-    check_cells(cells, len(scene.background))
-    area = float((cells.sizes_m**2).sum())
-    assert area == pytest.approx(7.4 * 5.4, rel=0.15)  # 6 m x 4 m, and what is grown at its border
+SETTINGS = PlacementSettings(cell_m=0.2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    cars = [box_car(), box_car(start=(9.0, -3.0), track_id="täxi/2")]
+    return drive(sheet((-2, 14), (-6, 6), semantic=1), actors=cars)
+
+
+@pytest.fixture(scope="module")
+def support(scene: Scene) -> SnowSupport:
+    found = place_snow_support(scene, cameras_of(scene), SETTINGS)
+    assert len(found.ground) > 500 and set(found.actors) == {"car", "täxi/2"}
+    return found
+
+
+def assert_equal(a: SnowSupport, b: SnowSupport) -> None:
+    assert list(a.actors) == list(b.actors)
+    for one, other in ((a.ground, b.ground), *((a.actors[k], b.actors[k]) for k in a.actors)):
+        for field in dataclasses.fields(SnowCells):
+            x, y = getattr(one, field.name), getattr(other, field.name)
+            assert x.dtype == y.dtype and torch.equal(x, y), field.name
+
+
+def test_a_file_gives_back_the_support_to_the_bit(support: SnowSupport, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "snow.safetensors"
+    save_support(path, support, "a key")
+    assert_equal(load_support(path, "a key"), support)
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    save_support(path, dataclasses.replace(support, actors={}), "another")
+    assert load_support(path, "another").actors == {}
+
+
+def test_the_same_support_is_the_same_bytes(support: SnowSupport, tmp_path: Path) -> None:
+    for name in "ab":
+        save_support(tmp_path / name, support, "k")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    ground = dataclasses.replace(support.ground, light=support.ground.tracks)
+    shared = SnowSupport(ground, {"a": support.actors["car"], "b": support.actors["car"]})
+    save_support(tmp_path / "support", shared, "k")
+    assert_equal(load_support(tmp_path / "support", "k"), shared)
+    empty = place_snow_support(drive(sheet((-2, 14), (-6, 6))), [], SETTINGS)
+    save_support(tmp_path / "b", empty, "k")
+    assert_equal(load_support(tmp_path / "b", "k"), empty)
+
+
+def changed(scene: Scene) -> dict[str, Scene]:
+    """The scene with one thing different at a time."""
+    ground, car, frame = scene.background, scene.actors[0], scene.frames[0]
+
+    def with_actor(**changes) -> Scene:
+        return dataclasses.replace(
+            scene, actors=(dataclasses.replace(car, **changes), *scene.actors[1:])
+        )
+
+    def with_ground(**changes) -> Scene:
+        return dataclasses.replace(scene, background=dataclasses.replace(ground, **changes))
+
+    moved = ground.means.clone()
+    moved[7, 2] += 1e-3
+    track = Track(car.track.timestamps_ns, car.track.world_from_actor + 0)
+    track.world_from_actor[1, 0, 3] += 0.1
+    ego = frame.world_from_ego.clone()
+    ego[1, 3] += 0.5
+    return {
+        "means": with_ground(means=moved),
+        "opacities": with_ground(opacities=ground.opacities * 0.9),
+        "colours": with_ground(sh=ground.sh * 0.9),
+        "no classes": with_ground(semantic=None),
+        "a class": with_ground(semantic=torch.full((len(ground),), 3).short()),
+        "a label": with_actor(label="Pedestrian"),
+        "a size": with_actor(size_m=(4.0, 1.8, 1.6)),
+        "a track": with_actor(track=track),
+        "fewer actors": dataclasses.replace(scene, actors=scene.actors[1:]),
+        "ego": dataclasses.replace(
+            scene, frames=(dataclasses.replace(frame, world_from_ego=ego), *scene.frames[1:])
+        ),
+    }
+
+
+def test_keys_tell_contents_apart(scene: Scene) -> None:
+    cameras = cameras_of(scene)
+    keys = {"as it is": support_key(scene, cameras, SETTINGS)}
+    again = drive(sheet((-2, 14), (-6, 6), semantic=1), actors=scene.actors)
+    assert support_key(again, cameras_of(again), SETTINGS) == keys["as it is"]
+    keys |= {what: support_key(other, cameras, SETTINGS) for what, other in changed(scene).items()}
+    keys["fewer cameras"] = support_key(scene, cameras[:1], SETTINGS)
+    keys["a wider camera"] = support_key(
+        scene, [dataclasses.replace(cameras[0], fx=70.0), *cameras[1:]], SETTINGS
+    )
+    for change in ({"cell_m": 0.3}, {"max_slope_deg": 40.0}, {"estimator": "median"}):
+        settings = dataclasses.replace(SETTINGS, **change)
+        keys[str(change)] = support_key(scene, cameras, settings)
+    assert len(set(keys.values())) == len(keys)
+    assert all(len(key) == 40 and int(key, 16) >= 0 for key in keys.values())
+
+
+def test_files_of_something_else_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+    path = tmp_path / "snow.safetensors"
+    with pytest.raises(SceneError, match="no such file"):
+        load_support(path, "k")
+    save_support(path, support, "k")
+    with pytest.raises(SceneError, match="of something else: its key is 'k', expected 'other'"):
+        load_support(path, "other")
+    save_file({"x": torch.zeros(3)}, path)
+    with pytest.raises(SceneError, match="no snow support of this version"):
+        load_support(path, "k")
+    path.write_text("no tensors")
+    with pytest.raises(SceneError, match="damaged"):
+        load_support(path, "k")
+    with pytest.raises(SceneError, match="damaged"):
+        load_support(tmp_path, "k")
+
+
+def test_cut_files_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+    path = tmp_path / "snow.safetensors"
+    save_support(path, support, "k")
+    data = path.read_bytes()
+    for length in (0, 1, 7, 100, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:length])
+        with pytest.raises(SceneError, match="damaged"):
+            load_support(path, "k")
+
+
+def test_contents_that_do_not_fit_are_refused(support: SnowSupport, tmp_path: Path) -> None:
+    path = tmp_path / "snow.safetensors"
+    save_support(path, support, "k")
+    whole = load_file(path)
+    ids: dict = {"format": FORMAT, "key": "k", "track_ids": list(support.actors)}
+    short = whole["ground.light"][1:].clone()
+    neighbours, buried_by, buried = (
+        whole[f"ground.{name}"].clone() for name in ("neighbours", "buried_by", "buried")
+    )
+    neighbours[0, 0], buried_by[0, 0], buried[0] = -3, len(support.ground), -1
+    missing = {name: tensor for name, tensor in whole.items() if name != "actors.1.banks"}
+    for tensors, about in (
+        (whole | {"ground.light": short}, ids),
+        (missing, ids),
+        (whole | {"ground.tracks": whole["ground.tracks"].double()}, ids),
+        (whole | {"ground.neighbours": neighbours}, ids),
+        (whole | {"ground.buried_by": buried_by}, ids),
+        (whole | {"ground.buried": buried}, ids),
+        (whole, ids | {"track_ids": 3}),
+    ):
+        save_file(tensors, path, metadata={"snow_bed": json.dumps(about)})
+        with pytest.raises(SceneError, match="damaged"):
+            load_support(path, "k")
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(scene: Scene, tmp_path: Path) -> None:
+    in_the_way = tmp_path / "file"
+    in_the_way.write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        support_of(dataclasses.replace(scene), SETTINGS, folder=in_the_way)
+
+
+@pytest.fixture(params=[1, 4])
+def threads(request, monkeypatch) -> int:
+    monkeypatch.setattr(in_threads, "thread_count", lambda: request.param)
+    return request.param
+
+
+def test_results_are_in_the_items_order(threads: int) -> None:
+    seen, told = set(), []
+
+    def late_first(item: int) -> int:
+        time.sleep(0.002 * (5 - item))
+        seen.add(threading.current_thread())
+        return item * item
+
+    found = in_order(late_first, range(5), after_each=lambda: told.append(1))
+    assert found == [0, 1, 4, 9, 16]
+    assert len(told) == 5
+    assert (threading.current_thread() in seen) == (threads == 1)
+    assert in_order(late_first, []) == []
+    here = [threading.current_thread()] * 3  # which alone uses a GPU
+    assert in_order(lambda _: threading.current_thread(), range(3), backend="cuda") == here
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
+    begun = []
+
+    def fails(item: int) -> int:
+        begun.append(item)
+        return 1 // (item - 1)
+
+    with pytest.raises(ZeroDivisionError):
+        in_order(fails, range(1, 500))
+    assert len(begun) < 499

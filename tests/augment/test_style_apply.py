@@ -1,18 +1,14 @@
-"""Folding a style into SH and sky: against the definition, the algebra, and to the bit."""
+"""Styles on scenes: folded into SH and sky, against the definition, the algebra, and to the bit."""
 
 import dataclasses
-import pickle
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
-from augment.dataset import SceneDataset
 from augment.effects.snow.effect import snow_layers_of
-from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import (
     CLASSES,
     StyleMaps,
@@ -20,9 +16,8 @@ from augment.effects.style.color_maps import (
     style_actor,
     style_gaussians,
     style_sky,
-    styled_scene,
 )
-from augment.effects.style.style import SceneStyle, scene_style_of, style_maps
+from augment.effects.style.style import scene_style_of
 from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.composite import composite_sky, map_colors
@@ -33,12 +28,13 @@ from augment.scene import Actor, ColorWaves, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from augment.views import render_buffers, render_view
-from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
 from tests.augment.pretend_gpu import pretended_gpu
-from tests.snow_scenes import box_car, drive, sheet, side_wall
+from tests.scenes import sh_of
+from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
+from tools.bench.style import style_recipe
 
 IDENTITY_MAPS = StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
 
@@ -81,31 +77,6 @@ def test_the_kernel_equals_the_definition(backend, sh_degree, count):
         torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_colours_are_mapped_in_every_direction():
-    gaussians = random_gaussians(400, sh_degree=3)
-    color_map, towards = some_map(), directions(400)
-    before = 0.5 + evaluate_sh(gaussians.sh, towards)
-    after = 0.5 + evaluate_sh(style_gaussians(gaussians, maps_of(color_map[None])).sh, towards)
-    expected = before @ color_map[:, :3].T + color_map[:, 3]
-    torch.testing.assert_close(after, expected, rtol=0, atol=1e-5)  # sums of 16 terms, float32
-
-
-def test_every_class_takes_its_own_map():
-    gaussians, maps = with_classes(600, 1, runs=True), maps_by_class()
-    styled = style_gaussians(gaussians, maps).sh
-    for value in range(CLASSES):
-        own = gaussians.semantic == value
-        alone = style_gaussians(gaussians.select(own), maps_of(maps.splats[value : value + 1])).sh
-        assert torch.equal(styled[own], alone)
-    assert torch.equal(styled[gaussians.semantic == 3], gaussians.sh[gaussians.semantic == 3])
-
-
-def test_gaussians_without_classes_take_the_map_of_unknown():
-    gaussians, maps = random_gaussians(50, sh_degree=1), maps_by_class()
-    expected = style_gaussians(gaussians, maps_of(maps.splats[:1]))
-    assert torch.equal(style_gaussians(gaussians, maps).sh, expected.sh)
-
-
 @pytest.mark.parametrize("backend", ["cpu", "cuda"])
 def test_identities_leave_every_bit(backend):
     gaussians = with_classes(100, 2)
@@ -121,28 +92,6 @@ def test_identities_leave_every_bit(backend):
         assert torch.equal(out.cpu().view(torch.int32), bits)
     slow = map_sh(gaussians.sh, torch.eye(3, 4)[None])
     assert torch.equal(slow.view(torch.int32), bits)
-
-
-def test_only_sh_are_new():
-    gaussians = with_classes(20, 1)
-    before = gaussians.sh.clone()
-    styled = style_gaussians(gaussians, maps_by_class())
-    assert styled.sh is not gaussians.sh and torch.equal(gaussians.sh, before)
-    for name in ("means", "quats", "scales", "opacities", "semantic"):
-        assert getattr(styled, name) is getattr(gaussians, name)
-
-
-def test_into_given_memory():
-    """Its own, in place, and such that does not begin where registers do: all the same bits."""
-    gaussians, maps = with_classes(3000, 3), maps_by_class()
-    expected = style_gaussians(gaussians, maps).sh
-    count = gaussians.sh.numel()
-    for shift in (0, 1, 5):
-        out = torch.zeros(count + 8)[shift : shift + count].view(gaussians.sh.shape)
-        assert style_gaussians(gaussians, maps, out=out).sh is out
-        assert torch.equal(out, expected)
-    styled = style_gaussians(gaussians, maps, out=gaussians.sh)
-    assert styled.sh is gaussians.sh and torch.equal(gaussians.sh, expected)
 
 
 def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(monkeypatch):
@@ -166,37 +115,6 @@ def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(mon
             style_gaussians(gaussians, maps, out=torch.zeros_like(bits), backend="cuda")
 
 
-@pytest.mark.parametrize("backend", ["cpu", "cuda"])
-def test_none_and_strided_and_float64(backend):
-    maps = maps_by_class()
-    none = with_classes(5, 1).select(torch.zeros(0, dtype=torch.long))
-    assert style_gaussians(none, maps, backend=backend).sh.shape == (0, 4, 3)
-    wide = with_classes(40, 3)
-    strided = dataclasses.replace(wide, sh=wide.sh[:, :4])
-    tight = dataclasses.replace(wide, sh=wide.sh[:, :4].contiguous())
-    assert torch.equal(
-        style_gaussians(strided, maps, backend=backend).sh,
-        style_gaussians(tight, maps, backend=backend).sh,
-    )
-    double = random_gaussians(40, sh_degree=1, dtype=torch.float64)
-    single = random_gaussians(40, sh_degree=1)
-    styled = style_gaussians(double, maps, backend=backend)
-    assert styled.sh.dtype == torch.float64
-    torch.testing.assert_close(
-        styled.sh.float(), style_gaussians(single, maps).sh, rtol=1e-6, atol=1e-6
-    )
-
-
-def test_gradients_flow_through_the_definition():
-    gaussians = random_gaussians(5, sh_degree=1)
-    sh = gaussians.sh.clone().requires_grad_()
-    color_map = some_map()
-    styled = style_gaussians(dataclasses.replace(gaussians, sh=sh), maps_of(color_map[None]))
-    styled.sh.sum().backward()
-    expected = color_map[:, :3].sum(0).expand(sh.shape)
-    torch.testing.assert_close(sh.grad, expected, rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("wrong", [-1, CLASSES])
 def test_classes_without_a_map_are_refused(wrong):
     gaussians = with_classes(5, 0)
@@ -204,14 +122,6 @@ def test_classes_without_a_map_are_refused(wrong):
     with pytest.raises(ValueError, match=rf"maps for classes 0 to {CLASSES - 1}.*{wrong}"):
         style_gaussians(gaussians, maps_by_class())
     style_gaussians(gaussians, maps_of(some_map()[None]))  # one map asks for no class
-
-
-@pytest.mark.parametrize(
-    "out", [torch.zeros(5, 1, 4)[..., :3], torch.zeros(4, 1, 3), torch.zeros(5, 1, 3).double()]
-)
-def test_memory_that_does_not_fit_is_refused(out):
-    with pytest.raises(ValueError, match=r"contiguous torch.float32 \[5, 1, 3\]"):
-        style_gaussians(with_classes(5, 0), maps_of(some_map()[None]), out=out)
 
 
 def test_a_styled_scene_shows_the_mapped_picture():
@@ -259,22 +169,6 @@ def test_skies(sky):
     assert extreme.min() >= 0 and extreme.max() <= 1
 
 
-def test_a_styled_scene_keeps_everything_else():
-    scene, maps = fitted_scene(), maps_by_class()
-    styled = styled_scene(scene, maps)
-    same = [f.name for f in dataclasses.fields(scene) if f.name not in changed]
-    assert all(getattr(styled, name) is getattr(scene, name) for name in same)
-    assert torch.equal(styled.background.sh, style_gaussians(scene.background, maps).sh)
-    assert torch.equal(styled.sky.faces, style_sky(scene.sky, maps.sky).faces)
-    for before, after in zip(scene.actors, styled.actors, strict=True):
-        assert torch.equal(after.gaussians.sh, style_gaussians(before.gaussians, maps).sh)
-        assert after.gaussians.means is before.gaussians.means
-        for name in ("track_id", "label", "track", "size_m"):
-            assert getattr(after, name) is getattr(before, name)
-    same_bits = styled_scene(scene, IDENTITY_MAPS)
-    assert same_bits.background is scene.background and same_bits.sky is scene.sky
-
-
 changed = {"background", "actors", "sky"}
 
 
@@ -306,7 +200,6 @@ def test_colours_that_change_over_time_are_mapped_at_all_times():
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
 STYLE = Style(preset="dusk")
-STILL = Waves(preset="still")
 
 
 @pytest.fixture
@@ -382,13 +275,6 @@ def test_every_class_takes_its_map(scene):
     assert not changed[~reach].any()
 
 
-def test_only_colours_change(scene):
-    known_maps(scene)
-    clean, styled = (render_view(scene, camera_of(scene), recipe_of(s)) for s in (None, STYLE))
-    for name in ("depth_m", "semantic", "instance"):
-        assert np.array_equal(getattr(clean, name), getattr(styled, name))
-
-
 @pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1)}])
 def test_no_strength_is_no_style_to_the_bit(scene, weather):
     none = Style(preset="dusk", strength=0)
@@ -443,36 +329,6 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     torch.testing.assert_close(view.rgb[covered], drawn.rgb[covered], rtol=0, atol=0.02)
 
 
-def test_covers_of_two_styles_are_kept_beside_each_other(scene):
-    other = Style(preset="dusk", strength=0.5)
-    for style in (STYLE, other):
-        known_maps(scene, style)
-    placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).placed["snow"].data
-    first = snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene)
-    second = snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene)
-    assert first is not second
-    assert snow_layers_of(scene, placed, scene_style_of(scene, STYLE).lighting_scene) is first
-    assert snow_layers_of(scene, placed, scene_style_of(scene, other).lighting_scene) is second
-
-
-def test_water_mirrors_the_styled_sky(scene):
-    unchanged = torch.eye(3, 4)[None]
-    maps = StyleMaps(
-        unchanged, torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]]), gentle(3)
-    )
-    memo_of(scene).put(("style maps", STYLE), maps, shared=True)
-    deep = {"flood": Flood(level_m=0.5, reference="absolute", waves=STILL, reflection="sky",
-                           turbidity_ntu=1000)}  # fmt: skip
-    clean, styled = (
-        render_view(scene, camera_of(scene), recipe_of(s, classes=False, **deep))
-        for s in (None, STYLE)
-    )
-    far = (clean.masks["water"] == 255) & (np.arange(90)[:, None] < 55)
-    assert far.sum() > 100
-    redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
-    assert redder[0] > 5 and redder[2] < -5
-
-
 def with_directions(scene: Scene, spread: float) -> Scene:
     """The scene with a background of degree 1 whose colours change with the direction."""
     first = scene.background.sh
@@ -503,60 +359,36 @@ def test_folded_maps_draw_the_same_where_no_colour_is_clamped(scene, weather, ba
     assert by_sh.parts[1].color_maps is not None  # of an actor
 
 
-def test_folded_maps_know_the_splats_that_paint_sky(scene):
-    levels = torch.zeros(len(scene.background), dtype=torch.int16)
-    levels[::3] = 5
-    maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
-    by_color, by_sh = (
-        SceneStyle(maps, scene.sky, scene, levels, folds=folds).on(
-            scene.parts_for(camera_of(scene))
-        )
-        for folds in (False, True)
-    )
-    images = [rasterize(parts, camera_of(scene)).rgb for parts in (by_color, by_sh)]
-    torch.testing.assert_close(*images, rtol=0, atol=1e-5)
+def folding_error(scene, camera):
+    """Largest channel difference [H, W] of colours mapped in SH and of mapped colours."""
+    recipes = (style_recipe(evaluated=where) for where in ("sh", "color"))
+    folded, mapped = (render_buffers(scene, camera, make_plan(r, scene)).rgb for r in recipes)
+    return (folded - mapped).abs().amax(2).numpy()
 
 
-def test_a_view_drawn_on_the_gpu_gets_sh_that_are_folded_there(scene, monkeypatch):
-    parts = scene.parts_for(camera_of(scene))
-    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
-    expected = look.on(parts, backend="cpu")[0].gaussians.sh
-    with pretended_gpu(monkeypatch):
-        folded = look.on(parts, backend="cuda")[0].gaussians
-        assert folded.sh.device == gpu.gpu_device() and folded.means is parts[0].gaussians.means
-        torch.testing.assert_close(folded.sh.cpu(), expected, rtol=0, atol=1e-6)
-        assert look.on(parts, backend="cuda")[0].gaussians.sh is folded.sh  # once for all frames
+def touched_pixels(scene, camera):
+    """bool [H, W]; such splats are drawn white, all others far below black."""
+    own = scene.background
+    away = torch.nn.functional.normalize(own.means - camera.centre.float(), dim=1)
+    below = (evaluate_sh(own.sh, away) + 0.5 < 0).any(1)
+    sh = torch.where(below, 0.5 / SH_C0, -1 / SH_C0)[:, None, None].expand(-1, 1, 3).contiguous()
+    return rasterize([PosedGaussians(dataclasses.replace(own, sh=sh))], camera).rgb[..., 0] > 0
 
 
-def test_a_background_of_other_splats_is_mapped_by_colour(scene):
-    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
-    some = scene.background.select(torch.arange(10))
-    [part] = look.on([PosedGaussians(some)])
-    assert part.color_maps is not None and part.gaussians is some
+def with_sh(scene, sh):
+    return dataclasses.replace(scene, background=dataclasses.replace(scene.background, sh=sh))
 
 
-def test_a_preset_darkens_the_day(scene):
-    bright = dataclasses.replace(scene)
-    clean = render_view(bright, camera_of(bright), recipe_of(None)).rgb.mean()
-    night = render_view(bright, camera_of(bright), recipe_of(Style(preset="night"))).rgb.mean()
-    assert night < 0.75 * clean
-
-
-def test_a_plan_says_what_a_style_takes(scene):
-    plan = make_plan(recipe_of(Style(preset="dusk", strength=0.5, per_region=True)), scene)
-    [step] = [s for s in plan.steps if s.name == "style on the scene"]
-    assert step.runs and "dusk" in step.why and "0.5" in step.why and "region" in step.why
-    bare = make_plan(recipe_of(None), scene)
-    assert plan.buffers == bare.buffers  # no pass of its own
-
-
-def test_samples_take_their_maps_along_to_other_processes(scene, monkeypatch):
-    live = SceneDataset(scene, recipe_of())
-    expected = live[0]["image"]
-    found = style_maps(scene, STYLE)
-    copy = pickle.dumps(live)
-    monkeypatch.setattr(scene_maps, "_find_maps", lambda *_: pytest.fail("looked for again"))
-    other = pickle.loads(copy)
-    assert other.scene is not scene
-    assert torch.equal(style_maps(other.scene, STYLE).splats, found.splats)
-    assert torch.equal(other[0]["image"], expected)
+def test_maps_in_sh_are_exact_but_where_a_colour_is_below_zero():
+    road = sheet((2, 9), (-2, 2), rgb=(0.3, 0.35, 0.3), semantic=int(SemanticClass.ROAD))
+    scene = drive(road, wall(9.0, (-3, 3), (0, 2.5)), places=[(0.0, 0.0, 1.5)])
+    camera = scene.frames[0].cameras["ahead"]
+    assert not touched_pixels(scene, camera).any()
+    sh = scene.background.sh.clone()
+    sh[: len(road)] = sh_of(np.full((len(road), 3), -0.1))
+    dark = with_sh(scene, sh)
+    touched = touched_pixels(dark, camera).numpy()
+    assert touched[-5:, 60:100].all() and not touched[:20].any()
+    assert folding_error(dark, camera).max() < 1e-5  # no directions: known exactly
+    error = folding_error(with_sh(dark, torch.cat([sh, torch.zeros(len(sh), 3, 3)], 1)), camera)
+    assert error[touched].max() > 1 / 255 > 1e-5 > error[~touched].max()

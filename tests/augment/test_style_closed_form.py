@@ -1,12 +1,22 @@
-"""Closed-form colour maps: what they match, that none moves colours less, and where they stop."""
+"""Closed-form colour maps and presets: what they match, that none moves colours less, limits."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from augment.effects.style.color_maps import CLASSES
+from augment.effects.style.network import (
+    METADATA_KEY,
+    SHIPPED,
+    Gscm,
+    load_network,
+    network_facts,
+    save_network,
+)
 from augment.effects.style.statistics import (
     LAND,
     LAND_LIMITS,
@@ -23,7 +33,10 @@ from augment.effects.style.statistics import (
     reinhard_map,
     statistics_of,
 )
+from augment.effects.style.style import parse_statistics, preset_statistics
+from augment.errors import StyleError
 from augment.semantics import SemanticClass
+from recipes.style import style_preset_names, style_preset_text
 
 # Nothing of the limits acts on ordinary statistics with these; the floor is far below any spread.
 FREE = Limits(floor=1e-9, max_gain=1e6, min_gain=1e-6, min_contrast=1e-6)
@@ -78,13 +91,6 @@ def test_reinhard_matches_mean_and_spread_of_each_channel(seed):
     assert np.count_nonzero(parts(color_map)[0] - np.diag(np.diag(parts(color_map)[0]))) == 0
 
 
-def test_the_floor_changes_ordinary_maps_by_less_than_a_step_of_eight_bits():
-    content, style = photo_like(0), photo_like(10, scale=0.8)
-    mean, covariance = mapped(mkl_map(content, style), content)
-    assert mean == pytest.approx(style.mean, abs=1e-12)
-    assert covariance == pytest.approx(style.covariance, abs=LAND_LIMITS.floor**2)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_mkl_is_symmetric_positive_definite_and_moves_colours_least(seed):
     content, style = photo_like(seed), photo_like(seed + 10)
@@ -110,33 +116,6 @@ def test_mkl_is_symmetric_positive_definite_and_moves_colours_least(seed):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-def test_channels_have_no_order(method, order):
-    content, style = photo_like(3), photo_like(4)
-    p = np.eye(3)[list(order)]
-
-    def swapped(statistics):
-        return ColorStatistics(p @ statistics.mean, p @ statistics.covariance @ p.T)
-
-    matrix, offset = parts(METHODS[method](content, style))
-    other, other_offset = parts(METHODS[method](swapped(content), swapped(style)))
-    assert other == pytest.approx(p @ matrix @ p.T, abs=1e-10)
-    assert other_offset == pytest.approx(p @ offset, abs=1e-10)
-
-
-def test_brightness_and_contrast_of_both_change_nothing_of_the_matrix():
-    content, style = photo_like(5), photo_like(6)
-
-    def scaled(statistics):
-        return ColorStatistics(0.5 * statistics.mean + 0.1, 0.25 * statistics.covariance)
-
-    matrix, offset = parts(mkl_map(content, style, FREE))
-    other, other_offset = parts(mkl_map(scaled(content), scaled(style), FREE))
-    assert other == pytest.approx(matrix, abs=1e-9)
-    assert other_offset == pytest.approx(0.5 * offset + 0.1 - matrix @ np.full(3, 0.1), abs=1e-9)
-
-
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     "statistics",
     [photo_like(0), photo_like(1, mean=(0.99, 0.01, 1.2)), constant(0, 0, 0), constant(1, 0, 0)],
@@ -144,19 +123,6 @@ def test_brightness_and_contrast_of_both_change_nothing_of_the_matrix():
 def test_the_scene_itself_as_style_changes_nothing(method, statistics):
     color_map = METHODS[method](statistics, statistics)
     assert color_map == pytest.approx(np.eye(3, 4), abs=1e-6)
-
-
-def test_mapped_pixels_have_the_style_s_statistics():
-    rng = np.random.default_rng(0)
-    pixels = rng.multivariate_normal((0.4, 0.4, 0.5), photo_like(0).covariance, 500)
-    style = photo_like(11)
-    content = statistics_of(pixels)
-    assert content is not None
-    matrix, offset = parts(mkl_map(content, style, FREE))
-    after = statistics_of(pixels @ matrix.T + offset)
-    assert after is not None
-    assert after.mean == pytest.approx(style.mean) and after.share == 1
-    assert after.covariance == pytest.approx(style.covariance, abs=1e-10)
 
 
 EXTREMES = {
@@ -200,21 +166,6 @@ def test_a_constant_style_tints_and_leaves_the_shapes():
         assert (mean - 2 * deviations > -0.02).all() and (mean + 2 * deviations < 1.02).all()
 
 
-def test_a_grey_style_takes_the_colour_out_and_keeps_the_contrast():
-    content, grey = photo_like(0), EXTREMES["greys only"]
-    _, covariance = mapped(mkl_map(content, grey), content)
-    across = np.eye(3) - 1 / 3
-    before = np.trace(across @ content.covariance @ across)
-    assert np.trace(across @ covariance @ across) < 0.05 * before
-    assert covariance.sum() == pytest.approx(grey.covariance.sum(), rel=0.02)
-
-
-def test_limits_are_checked():
-    for wrong in ({"floor": 0.0}, {"max_gain": 0.5}, {"min_gain": 0.6}, {"min_contrast": 2.0}):
-        with pytest.raises(ValueError, match="limits need"):
-            Limits(**wrong)
-
-
 def shared(seed, share, **keywords):
     statistics = photo_like(seed, **keywords)
     return ColorStatistics(statistics.mean, statistics.covariance, share)
@@ -240,13 +191,6 @@ def test_sky_and_land_have_their_own_maps_where_both_sides_show_them():
     assert torch.equal(found.picture, mkl_map(content[WHOLE], style[WHOLE]).float())
 
 
-@pytest.mark.parametrize("one_sided", [(), (SKY, LAND)])
-def test_one_map_for_all_where_a_side_shows_no_sky(one_sided):
-    for content, style in ((scene(0), scene(20, *one_sided)), (scene(0, *one_sided), scene(20))):
-        found = maps(content, style)
-        assert torch.equal(found.sky, found.picture) and torch.equal(found.splats[0], found.picture)
-
-
 def test_regions_have_maps_of_their_own_by_class():
     regions = (SKY, LAND, ROAD, VEGETATION, REST)
     content, style = scene(0, *regions), scene(20, *regions)
@@ -268,31 +212,6 @@ def test_regions_have_maps_of_their_own_by_class():
         assert torch.equal(found.splats[kind], expected), kind
 
 
-def test_a_small_region_fades_into_the_land_without_a_step():
-    regions = (SKY, LAND, ROAD)
-    style = scene(20, *regions)
-
-    def road(share):
-        content = scene(0, *regions)
-        content[ROAD] = ColorStatistics(content[ROAD].mean, content[ROAD].covariance, share)
-        return maps(content, style, per_region=True).splats[SemanticClass.ROAD]
-
-    land = maps(scene(0, *regions), style).splats[0]
-    shares = np.linspace(0.005, 0.2, 40)
-    distances = [float((road(share) - land).abs().max()) for share in shares]
-    assert distances[0] == 0 and distances[-1] == distances[-5] > 0.05
-    assert distances == sorted(distances)
-    assert max(np.diff(distances)) < 0.08 * distances[-1]
-
-
-def test_regions_without_a_partner_take_the_land_s_map():
-    content, style = scene(0, SKY, LAND, ROAD), scene(20, SKY, LAND, VEGETATION)
-    found = maps(content, style, per_region=True)
-    others = [kind for kind in SemanticClass if kind is not SemanticClass.SKY]
-    assert all(torch.equal(found.splats[kind], found.splats[0]) for kind in others)
-    assert torch.equal(found.splats[0], mkl_map(content[LAND], style[LAND]).float())
-
-
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("per_region", [False, True])
 def test_strength_zero_is_the_identity_to_the_bit_and_half_lies_between(method, per_region):
@@ -309,26 +228,6 @@ def test_strength_zero_is_the_identity_to_the_bit_and_half_lies_between(method, 
         )
 
 
-def test_strength_two_goes_on_straight_where_no_limit_acts():
-    content = photo_like(0, mean=(0.45, 0.45, 0.45), scale=0.5)
-    style = ColorStatistics(np.array([0.5, 0.48, 0.44]), 1.21 * content.covariance)
-    full, double = (
-        maps({WHOLE: content}, {WHOLE: style}, strength=strength).picture for strength in (1.0, 2.0)
-    )
-    assert torch.allclose(double, torch.lerp(torch.eye(3, 4), full, 2.0), atol=1e-5)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_strength_two_of_extremes_turns_no_colour_round(method):
-    for content, style in itertools.product(EXTREMES.values(), repeat=2):
-        color_map = maps({WHOLE: content}, {WHOLE: style}, method=method, strength=2.0).picture
-        matrix, offset = parts(color_map.double())
-        gains = np.linalg.eigvalsh(matrix)
-        assert gains[0] > 0.04 and gains[-1] < 3.5
-        mean = matrix @ content.mean + offset
-        assert (mean > -1e-6).all() and (mean < 1 + 1e-6).all()
-
-
 def test_wrong_method_and_strength_are_refused(unchecked):
     content = {WHOLE: photo_like(0)}
     with pytest.raises(ValueError, match="mkl or reinhard; got 'gscm'"):
@@ -336,3 +235,194 @@ def test_wrong_method_and_strength_are_refused(unchecked):
     for strength in (-0.1, 2.1, float("nan")):
         with pytest.raises(ValueError, match="strength must be in"):
             maps(content, content, strength=strength)
+
+
+NAMES = style_preset_names()
+GOOD = """
+land:
+  mean: [0.3, 0.4, 0.5]
+  covariance: [[0.02, 0.01, 0.01], [0.01, 0.02, 0.01], [0.01, 0.01, 0.02]]
+sky:
+  mean: [1, 0, 0.5]
+  covariance: [[0, 0, 0], [0, 0, 0], [0, 0, 0]]
+"""
+
+
+def street():
+    """The statistics of a street by day with a skewed, bounded spread, as photographs have."""
+    rng = np.random.default_rng(0)
+    light = rng.beta(2, 4.5, (3000, 1))
+    land = np.clip(light * (1, 1.02, 1.04) + 0.02 * rng.standard_normal((3000, 3)), 0, 1)
+    height = rng.uniform(0, 1, (1000, 1))
+    sky = (0.5, 0.6, 0.75) + height * (0.25, 0.2, 0.1) + 0.01 * rng.standard_normal((1000, 3))
+    both = np.concatenate([land, sky])
+    found = {WHOLE: statistics_of(both)}
+    found |= {LAND: statistics_of(land, total=4000.0), SKY: statistics_of(sky, total=4000.0)}
+    return {LAND: land, SKY: sky}, found
+
+
+def styled(name, **keywords):
+    pixels, content = street()
+    maps = closed_maps(
+        content,
+        preset_statistics(name),
+        **({"method": "mkl", "strength": 1.0, "per_region": False} | keywords),
+    )
+    of = {LAND: maps.splats[0].double().numpy(), SKY: maps.sky.double().numpy()}
+    return {region: pixels[region] @ m[:, :3].T + m[:, 3] for region, m in of.items()}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_presets_are_statistics_and_say_where_they_come_from(name):
+    found = preset_statistics(name)
+    assert set(found) == {WHOLE, LAND, SKY}
+    for statistics in found.values():
+        assert ((statistics.mean > 0) & (statistics.mean < 1)).all()
+        assert np.linalg.eigvalsh(statistics.covariance)[0] > 0
+    comment = [line for line in style_preset_text(name).splitlines() if line.startswith("#")]
+    assert len(comment) >= 3 and "CC BY 4.0" in " ".join(comment)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_presets_cut_off_few_colours_of_a_street_and_keep_roads_nearly_grey(name):
+    after = styled(name)
+    for region, pixels in after.items():
+        cut = np.maximum(np.maximum(-pixels, pixels - 1), 0).max(1)
+        assert (cut > 0.02).mean() < 0.06, region
+    mean = after[LAND].mean(0)
+    assert (mean.max() - mean.min()) < 0.15, "land is tinted, not dyed"
+
+
+def test_moods_are_what_their_names_say():
+    def light(name, region):
+        return preset_statistics(name)[region].mean.mean()
+
+    def warmth(name, region=LAND):
+        mean = preset_statistics(name)[region].mean
+        return mean[0] - mean[2]
+
+    assert light("night", LAND) < light("blue-hour", LAND) < light("rain", LAND)
+    assert light("rain", LAND) < light("overcast", LAND) < light("snow-light", LAND)
+    assert light("night", SKY) < light("dusk", SKY) < light("overcast", SKY)
+    assert warmth("golden-hour") > 0.1 > warmth("hazy-summer") > 0 > warmth("snow-light")
+    assert warmth("blue-hour") < -0.08 and warmth("blue-hour", SKY) < -0.2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("0.3, 0.4, 0.5", "0.3, 0.4", r"land.mean\[2\]: Field required"),
+        ("0.3, 0.4, 0.5", "0.3, 0.4, .nan", r"land.mean\[2\]: .*finite number"),
+        ("0.3, 0.4, 0.5", "0.3, 0.4, a", r"land.mean\[2\]: .*valid number"),
+        ("0.3, 0.4, 0.5", "0.3, 0.4, 1.5", r"land.mean\[2\]: .*less than or equal to 1"),
+        ("[0.3, 0.4, 0.5]", "true", "land.mean: .*valid tuple"),
+        ("[0.02, 0.01, 0.01]", "[0.02, 0.01]", r"land.covariance\[0\]\[2\]: Field required"),
+        ("[0.02, 0.01, 0.01]", "[0.02, 0.03, 0.01]", "land.covariance: must be symmetric"),
+        ("[[0, 0, 0]", "[[-0.1, 0, 0]", "sky.covariance: must have no variance below zero"),
+        ("[[0, 0, 0]", "[[.inf, 0, 0]", r"sky.covariance\[0\]\[0\]: .*finite number"),
+        ("mean: [1", "means: [1", "sky.mean: Field required; sky.means: Extra"),
+        ("sky:", "sea:", "sky: Field required; sea: Extra"),
+        ("sky:", "land: {}\nsky", "not valid YAML"),
+        ("sky:", "extra: 1\nsky:", "extra: Extra inputs"),
+    ],
+)
+def test_wrong_files_say_where(old, new, words):
+    assert old in GOOD
+    with pytest.raises(StyleError, match=f"^here(:7)?: .*({words})"):
+        parse_statistics(GOOD.replace(old, new, 1), source="here")
+
+
+def test_unknown_names_list_the_styles():
+    with pytest.raises(StyleError, match=r"did you mean dusk.*overcast"):
+        preset_statistics("dsk")
+
+
+def different() -> Gscm:
+    net = Gscm()
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for value in net.parameters():
+            value.add_(torch.randn(value.shape, generator=generator) * 0.05)
+    return net
+
+
+def test_round_trip(tmp_path):
+    path, net = tmp_path / "deep" / "net.safetensors", different()
+    save_network(path, net, {"steps": 12, "licences": ["CC0"]})
+    found = load_network(path)
+    own, read = net.state_dict(), found.state_dict()
+    assert not found.training
+    assert own.keys() == read.keys() and all(torch.equal(own[name], read[name]) for name in own)
+    assert network_facts(path)["about"] == {"steps": 12, "licences": ["CC0"]}
+    halves = {name: value.half().contiguous() for name, value in own.items()}
+    save_file(halves, path, {METADATA_KEY: json.dumps(network_facts(path))})
+    for name, value in load_network(path).state_dict().items():  # read as float32
+        torch.testing.assert_close(value, own[name], atol=1e-4, rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("net") / "net.safetensors"
+    save_network(path, Gscm(), {})
+    return path
+
+
+def test_a_header_that_lies(written, tmp_path):
+    path = tmp_path / "net.safetensors"
+    for change, message in (
+        ({"format": 2}, "format must be 1; got 2"),
+        ({"encoder": "vgg"}, "encoder must be one of"),
+        ({"encoder": 3}, "encoder must be one of small, b0; got 3"),
+        ({"k": 8}, "k must be 16; got 8"),
+        ({"offset": False}, "offset must be True; got False"),
+        ({"size": 128}, "size must be 256; got 128"),
+        ({"moments": None}, "moments must be True; got None: the file is of another version"),
+    ):
+        header = network_facts(written) | change
+        save_file(load_file(written), path, {METADATA_KEY: json.dumps(header)})
+        with pytest.raises(StyleError, match=message) as caught:
+            load_network(path)
+        assert str(path) in str(caught.value)
+
+
+def test_tensors_of_another_network(written, tmp_path):
+    own, path = load_file(written), tmp_path / "net.safetensors"
+    bias = own.pop("head.bias")
+    for change, message in (
+        ({}, r"'head.bias' must be torch.float32 \[512\]; got nothing"),
+        ({"head.bias": bias, "more": torch.zeros(1)}, r"of another network: \['more'\]"),
+        ({"head.bias": bias * torch.nan}, "not finite"),
+        ({"head.bias": bias.int()}, "torch.int32"),
+    ):
+        save_file(own | change, path, {METADATA_KEY: json.dumps(network_facts(written))})
+        with pytest.raises(StyleError, match=message):
+            load_network(path)
+
+
+def test_other_files(tmp_path, written):
+    path = tmp_path / "net.safetensors"
+    with pytest.raises(StyleError, match="cannot be read"):
+        load_network(path)
+    for content in (b"", b"no tensors at all", written.read_bytes()[:-100]):
+        path.write_bytes(content)
+        with pytest.raises(StyleError, match="cannot be read"):
+            load_network(path)
+    for text in ("[]", "{", "3"):
+        save_file({"a": torch.zeros(1)}, path, {METADATA_KEY: text})
+        with pytest.raises(StyleError, match=r"JSON|object"):
+            load_network(path)
+    save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(StyleError, match=r"no 'climategs.gscm'"):
+        load_network(path)
+    with pytest.raises(StyleError, match="climategs style train"):
+        load_network(tmp_path)
+
+
+def test_the_shipped_network():
+    net, facts = load_network(), network_facts()
+    assert facts["encoder"] == net.encoder_name == "small" and facts["offset"]
+    assert facts["about"]["licences"] and facts["about"]["data"]["held_out"]
+    assert not set(facts["about"]["data"]["train"]) & set(facts["about"]["data"]["held_out"])
+    figures = facts["about"]["figures"]
+    assert figures["network"]["look"] > figures["mkl"]["look"] > 0
+    assert SHIPPED.stat().st_size < 10 * 2**20

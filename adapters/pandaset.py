@@ -1,14 +1,16 @@
-"""The files of one PandaSet sequence, read and checked, and their labels.
+"""A raw PandaSet sequence as a scene: Gaussians from accumulated, image-coloured LiDAR.
 
     camera/<name>/NN.jpg            undistorted images; intrinsics.json, poses.json, timestamps.json
     lidar/NN.pkl.gz                 returns of both sensors; poses.json, timestamps.json
     annotations/cuboids/NN.pkl.gz   boxes
     annotations/semseg/NN.pkl.gz    class of each return; classes.json
 
-The world is the sequence's own: metres, z up. Camera poses are world_from_camera with OpenCV axes.
-A LiDAR pose is the car's: x right, y forward, z up, so world_from_ego is that pose turned by a
-quarter about z. Times are seconds, stored here as integer nanoseconds. Errors are AdapterErrors
-that name the file.
+World: PandaSet's own (metres, z up), unless the drive is further than a kilometre from its origin.
+Ego: the LiDAR pose (x right, y forward, z up) turned by a quarter about z, so that x is forward, y
+left; its origin is the pose's. Camera poses are world_from_camera with OpenCV axes. Times are
+seconds, stored here as integer nanoseconds. One actor stands for each moving object, whichever
+sensor's boxes it has; its track_id is the one that the object's boxes have in the labels. Errors
+are AdapterErrors that name the file.
 """
 
 from __future__ import annotations
@@ -17,72 +19,139 @@ import gzip
 import io
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import BaseModel, Field
+from tqdm import tqdm
 
-from adapters.plain_files import ImageFault, decode_image, is_whole_jpeg, number_of, read_json
-from adapters.raw_drive import NO_SURFACE, class_table, classes_of, drive_origin
+from adapters.lidar_scene.split import indices_between, inside_box
+from adapters.plain_files import Number, Text, read_json, validated
+from adapters.raw_drive import (
+    NO_SURFACE,
+    BoxSample,
+    DriveFrames,
+    DriveOptions,
+    Picture,
+    RawDrive,
+    Sweep,
+    TimedBoxes,
+    drive_origin,
+    find_objects,
+    is_usable,
+    scene_of_drive,
+    usable_images,
+    world_classes,
+)
 from adapters.safe_pickle import read_frame
+from adapters.uri import format_uri
+from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
-from augment.geometry import rigid, rotmat_from_quat
+from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.labels import Boxes, LidarSweep
+from augment.scene import Scene
 from augment.semantics import SemanticClass, class_of_label
 
-_LATEST_S = 9e9  # int64 nanoseconds reach 9.2e9 s
+# The recording car in its own frame (x forward, y left, z up): no other surface can be in there.
+EGO_M = np.array([[-3.0, -1.05, -1.0], [3.0, 1.05, 2.2]])
+_TIMING_MARGIN_M = 0.25  # returns this near a box tell when its sensor saw the object
+_LIDAR_TOP_DEG = 15.0  # the spinning sensor's uppermost channel
+# The back camera looks over the recording car's own roof, the same in every PandaSet sequence:
+# from this part of its rows downwards.
+_ROWS_ABOVE_CAR = {"back_camera": 0.745}
 LIDAR_COLUMNS = ("x", "y", "z", "i", "t", "d")
 # Columns: ego x (forward), y (left), z in the axes of the LiDAR pose (x right, y forward).
 LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
-@dataclass(frozen=True, eq=False)
-class CameraTrack:
-    """One camera over the sequence. size: width and height, pixels. lens: fx, fy, cx, cy, pixels.
+def open_pandaset(path: str, query: dict[str, str]) -> Scene:
+    """The scene of one PandaSet sequence folder, such as `pandaset/002`.
 
-    world_from_camera: float64 [F, 4, 4]; timestamps_ns: int64 [F]; images: one path a frame, None
-    where the image is missing or damaged."""
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits.
 
-    name: str
-    size: tuple[int, int]
-    lens: tuple[float, float, float, float]
+    Raises:
+        AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
+            Missing LiDAR or annotation files and images of single frames are Scene.problems."""
+    options = DriveOptions.from_query("pandaset", query)
+    return scene_of_drive(read_pandaset(path, query, options), options)
+
+
+def read_pandaset(path: str, query: dict[str, str], options: DriveOptions) -> RawDrive:
+    """The frames of the sequence that the options ask for, with their sweeps and boxes."""
+    root = Path(path)
+    frames, chosen, origin, problems = read_frames(root, options)
+    sweeps, boxes, more = read_sweeps(root, frames, chosen.held_out, origin)
+    return RawDrive(
+        name=root.name,
+        source=format_uri("pandaset", path, query),
+        frames=frames,
+        held_out=chosen.held_out,
+        sweeps=sweeps,
+        boxes=boxes,
+        labels=PandaSetLabels(root),
+        world_origin_m=origin,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        problems=(*problems, *chosen.problems, *more),
+        used_rows=_ROWS_ABOVE_CAR,
+    )
+
+
+# ---- Calibration, poses and times ----------------------------------------------------------------
+
+# int64 nanoseconds reach 9.2e9 s.
+_Seconds = Annotated[float, Field(strict=True, ge=-9e9, le=9e9, allow_inf_nan=False)]
+_Focal = Annotated[Number, Field(gt=0)]
+
+
+class _Xyz(BaseModel):
+    x: Number
+    y: Number
+    z: Number
+
+
+class _Wxyz(_Xyz):
+    w: Number
+
+
+class _Pose(BaseModel):
+    position: _Xyz
+    heading: _Wxyz
+
+
+class _Lens(BaseModel):
+    fx: _Focal
+    fy: _Focal
+    cx: Number
+    cy: Number
+
+
+class _CameraTrack(NamedTuple):
+    """One camera over the sequence: its lens (pixels), world_from_camera float64 [F, 4, 4] in the
+    dataset's world, and the times int64 [F] of its images."""
+
+    lens: _Lens
     world_from_camera: np.ndarray
     timestamps_ns: np.ndarray
-    images: tuple[Path | None, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Sequence:
-    """Calibration and timing of a sequence of F frames, numbered from 0 as the files are.
-
-    world_origin_m: float64 [3], what was subtracted from the files' coordinates to give the scene's
-    world, in which all poses here are. world_from_ego: float64 [F, 4, 4], ego x forward, y left,
-    z up. timestamps_ns: int64 [F], the ends of the sweeps. problems: what was missing and gone on
-    without, one sentence each."""
-
-    root: Path
-    world_origin_m: np.ndarray
-    world_from_ego: np.ndarray
-    timestamps_ns: np.ndarray
-    cameras: tuple[CameraTrack, ...]
-    problems: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.timestamps_ns)
-
-
-def read_sequence(root: Path) -> Sequence:
-    """The calibration, poses and times of the sequence in a folder."""
+def read_frames(
+    root: Path, options: DriveOptions
+) -> tuple[tuple[Frame, ...], DriveFrames, np.ndarray, tuple[str, ...]]:
+    """The frames that the options ask for with their usable images, in the scene's world; which
+    they are; the world's origin in the dataset's; and a sentence for each unusable image."""
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
-    poses, times = _read_lidar_track(root)
+    world_from_ego, times_ns = read_ego_track(root)
+    chosen = options.select(range(len(times_ns)), where=f"pandaset:{root}")
     if not (root / "camera").is_dir():
         raise AdapterError(
             f"{root / 'camera'} does not exist; expected a PandaSet sequence's camera/"
@@ -90,14 +159,37 @@ def read_sequence(root: Path) -> Sequence:
     folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir())
     if not folders:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
-    problems: list[str] = []
-    cameras = [_read_camera(folder, len(poses), problems) for folder in folders]
-    origin = drive_origin(poses[:, :3, 3])
-    poses[:, :3, 3] -= origin
-    for camera in cameras:
-        camera.world_from_camera[:, :3, 3] -= origin
-    ego = poses @ LIDAR_POSE_FROM_EGO
-    return Sequence(root, origin, ego, times, tuple(cameras), tuple(problems))
+    cameras = {folder.name: _read_camera(folder, len(times_ns)) for folder in folders}
+    images = usable_images(
+        [Picture(f.name, n, f / f"{n:02d}.jpg") for f in folders for n in chosen.numbers]
+    )
+    origin = drive_origin(world_from_ego[:, :3, 3])
+
+    def recentred(pose: np.ndarray) -> torch.Tensor:
+        pose = pose.copy()
+        pose[:3, 3] -= origin
+        return torch.from_numpy(pose)
+
+    frames = tuple(
+        Frame(
+            index=n,
+            timestamp_ns=int(times_ns[n]),
+            world_from_ego=recentred(world_from_ego[n]),
+            cameras={
+                name: Camera(
+                    name,
+                    *images.sizes[name],
+                    **camera.lens.model_dump(),
+                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n])),
+                    timestamp_ns=int(camera.timestamps_ns[n]),
+                )
+                for name, camera in cameras.items()
+            },
+            image_paths=images.paths[n],
+        )
+        for n in chosen.numbers
+    )
+    return frames, chosen, origin, images.problems
 
 
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -110,14 +202,63 @@ def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
-    poses, times = _read_lidar_track(root)
-    return poses @ LIDAR_POSE_FROM_EGO, times
-
-
-def _read_lidar_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The LiDAR's poses [F, 4, 4] in the dataset's own world, and the times [F]."""
     poses = _read_poses(root / "lidar" / "poses.json")
-    return poses, _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
+    return poses @ LIDAR_POSE_FROM_EGO, _read_times(root / "lidar" / "timestamps.json", len(poses))
+
+
+def _read_camera(folder: Path, frames: int) -> _CameraTrack:
+    path = folder / "intrinsics.json"
+    lens = validated(_Lens, read_json(path), str(path))
+    poses = _read_poses(folder / "poses.json")
+    if len(poses) != frames:
+        raise AdapterError(
+            f"{folder / 'poses.json'} has {len(poses)} poses; lidar/poses.json has {frames}"
+        )
+    numbers = [int(p.stem) for p in folder.glob("*.jpg") if re.fullmatch(r"\d+", p.stem)]
+    if not numbers:
+        raise AdapterError(f"{folder} holds no images NN.jpg; unpack the sequence again")
+    if max(numbers) >= frames:
+        raise AdapterError(
+            f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
+            f"{frames - 1:02d}: images and timestamps are not of one sequence"
+        )
+    return _CameraTrack(lens, poses, _read_times(folder / "timestamps.json", frames))
+
+
+def _read_times(path: Path, expected: int) -> np.ndarray:
+    """Nanoseconds, int64 [expected]."""
+    entries = enumerate(read_json(path, list))
+    times = np.array([validated(_Seconds, t, f"{path}, frame {n}, seconds") for n, t in entries])
+    if len(times) != expected:
+        raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
+    if not (np.diff(times) > 0).all():
+        frame = int(np.argmin(np.diff(times) > 0)) + 1
+        raise AdapterError(
+            f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
+            f"{times[frame - 1]} s. Copy it again"
+        )
+    return np.round(times * 1e9).astype(np.int64)
+
+
+def _read_poses(path: Path) -> np.ndarray:
+    """Rigid transforms, float64 [F, 4, 4]."""
+    poses = [validated(_Pose, p, f"{path}, frame {n}") for n, p in enumerate(read_json(path, list))]
+    if not poses:
+        raise AdapterError(f"{path} holds no poses")
+    headings = np.array([(p.heading.w, p.heading.x, p.heading.y, p.heading.z) for p in poses])
+    # Headings are stored to 16 digits; a norm off by a thousandth is no rotation.
+    off = np.abs(np.linalg.norm(headings, axis=1) - 1) >= 1e-3
+    if off.any():
+        frame = int(np.argmax(off))
+        raise AdapterError(
+            f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
+            f"{headings[frame].tolist()}. Copy the file again"
+        )
+    positions = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
+    return rigid(rotmat_from_quat(torch.from_numpy(headings)), torch.from_numpy(positions)).numpy()
+
+
+# ---- Tables --------------------------------------------------------------------------------------
 
 
 def frame_file(root: Path, folder: str, frame: int) -> Path:
@@ -161,129 +302,115 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
     return table
 
 
-def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
-    path = folder / "intrinsics.json"
-    lens = read_json(path)
-    fx, fy, cx, cy = (
-        number_of(lens.get(key), f"{path}: {key} (pixels)") for key in ("fx", "fy", "cx", "cy")
-    )
-    if min(fx, fy) <= 0:
-        raise AdapterError(f"{path}: fx and fy (pixels) must be above 0; got {fx} and {fy}")
-    poses = _read_poses(folder / "poses.json")
-    if len(poses) != frames:
-        raise AdapterError(
-            f"{folder / 'poses.json'} has {len(poses)} poses; lidar/poses.json has {frames}"
-        )
-    times = _read_times(folder / "timestamps.json", expected=frames)
-    images, (height, width) = _find_images(folder, frames, problems)
-    return CameraTrack(folder.name, (width, height), (fx, fy, cx, cy), poses, times, images)
+# ---- Sweeps, and when their sensors saw the boxes ------------------------------------------------
 
 
-def _find_images(
-    folder: Path, frames: int, problems: list[str]
-) -> tuple[tuple[Path | None, ...], tuple[int, int]]:
-    """The usable image of every frame, and the rows and columns of all."""
-    numbers = {int(p.stem) for p in folder.glob("*.jpg") if re.fullmatch(r"\d+", p.stem)}
-    if not numbers:
-        raise AdapterError(f"{folder} holds no images NN.jpg; unpack the sequence again")
-    if max(numbers) >= frames:
-        raise AdapterError(
-            f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
-            f"{frames - 1:02d}: images and timestamps are not of one sequence"
-        )
-    paths = [folder / f"{frame:02d}.jpg" for frame in range(frames)]
-    faults = [_file_fault(path) for path in paths]
-    size = _image_size(folder, [p for p, fault in zip(paths, faults, strict=True) if not fault])
-    images: list[Path | None] = []
-    for frame, (path, fault) in enumerate(zip(paths, faults, strict=True)):
-        fault = fault or _picture_fault(path, size)
-        if fault:
-            problems.append(f"camera {folder.name}, frame {frame}: image {path} {fault}")
-        images.append(None if fault else path)
-    return tuple(images), size
+class _SensorSweep(NamedTuple):
+    """All returns of a frame. sensor: [N], 0 the spinning one, 1 the forward one."""
+
+    sweep: Sweep
+    sensor: np.ndarray
 
 
-def _file_fault(path: Path) -> str:
-    try:
-        return "" if is_whole_jpeg(path) else "is not a JPEG file"
-    except ImageFault as fault:
-        return str(fault)
-
-
-def _picture_fault(path: Path, size: tuple[int, int]) -> str:
-    """What is wrong with the picture in a JPEG file, decoded at an eighth of its size."""
-    image = decode_image(path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    if image is None:
-        return "cannot be decoded"
-    if image.shape != tuple(-(-side // 8) for side in size):
-        return f"is not of {size[1]}x{size[0]} pixels as the camera's first image"
-    return ""
-
-
-def _image_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
-    """Rows and columns of the first image that can be decoded."""
-    for path in paths:
-        image = decode_image(path, cv2.IMREAD_UNCHANGED)
-        if image is not None:
-            return image.shape[0], image.shape[1]
-    raise AdapterError(f"{folder} holds no image that can be decoded; unpack the sequence again")
-
-
-def _read_times(path: Path, *, expected: int) -> np.ndarray:
-    """Nanoseconds, int64 [expected]."""
-    times = np.array(
-        [
-            number_of(seconds, f"{path}, frame {frame}: the time in seconds", largest=_LATEST_S)
-            for frame, seconds in enumerate(read_json(path, list))
-        ]
-    )
-    if len(times) != expected:
-        raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
-    if not (np.diff(times) > 0).all():
-        frame = int(np.argmin(np.diff(times) > 0)) + 1
-        raise AdapterError(
-            f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
-            f"{times[frame - 1]} s. Copy it again"
-        )
-    return np.round(times * 1e9).astype(np.int64)
-
-
-def _read_poses(path: Path) -> np.ndarray:
-    """Rigid transforms, float64 [F, 4, 4]."""
-    values = np.array(
-        [
-            _pose_numbers(entry, f"{path}, frame {i}")
-            for i, entry in enumerate(read_json(path, list))
-        ]
-    )
-    if len(values) == 0:
-        raise AdapterError(f"{path} holds no poses")
-    norms = np.linalg.norm(values[:, 3:], axis=1)
-    # Headings are stored to 16 digits; a norm off by a thousandth is no rotation.
-    if not (np.abs(norms - 1) < 1e-3).all():
-        frame = int(np.argmax(np.abs(norms - 1) >= 1e-3))
-        raise AdapterError(
-            f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
-            f"{values[frame, 3:].tolist()}. Copy the file again"
-        )
-    rotation = rotmat_from_quat(torch.from_numpy(values[:, 3:]))
-    return rigid(rotation, torch.from_numpy(values[:, :3])).numpy()
-
-
-def _pose_numbers(entry: Any, where: str) -> list[float]:
-    """x y z and w x y z of an entry of poses.json."""
-    numbers = []
-    for group, axes in (("position", "xyz"), ("heading", "wxyz")):
-        values = entry.get(group) if isinstance(entry, dict) else None
-        if not isinstance(values, dict):
-            raise AdapterError(
-                f"{where} must have a position x y z and a heading w x y z; got {entry!r:.80}"
+def read_sweeps(
+    root: Path, frames: Sequence[Frame], held_out: frozenset[int], origin: np.ndarray
+) -> tuple[tuple[Sweep, ...], tuple[BoxSample, ...], tuple[str, ...]]:
+    """Usable sweeps of the frames that are not held out, boxes of what moves in all of them, and a
+    sentence for each missing file. Left out are returns of smoke, exhaust, spray, mirror images and
+    the recording car. Held-out sweeps only tell when their boxes were seen."""
+    meaning = class_meanings(root)
+    cuboids = {frame.index: read_cuboids(root, frame.index) for frame in frames}
+    moving = _moving_boxes(root, frames, cuboids, origin)
+    sweeps, boxes, problems = [], [], []
+    for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
+        n, seen = frame.index, None
+        lidar = read_lidar(root, n)
+        if lidar is None:
+            problems.append(f"frame {n}: lidar/{n:02d}.pkl.gz is missing, its points too")
+        else:
+            world = lidar[["x", "y", "z"]].to_numpy(dtype=np.float64) - origin
+            classes = read_semantics(root, n, len(lidar))
+            if classes is None:
+                problems.append(
+                    f"frame {n}: annotations/semseg/{n:02d}.pkl.gz is missing; its points have no "
+                    f"class"
+                )
+            sweep = Sweep(
+                world.astype(np.float32),
+                np.round(lidar["t"].to_numpy(dtype=np.float64) * 1e9).astype(np.int64),
+                np.full(len(lidar), SemanticClass.UNKNOWN, np.int16)
+                if classes is None
+                else world_classes(classes, meaning),
             )
-        numbers += [number_of(values.get(axis), f"{where}: {group}.{axis}") for axis in axes]
-    return numbers
+            seen = _SensorSweep(sweep, lidar["d"].to_numpy())
+            if n not in held_out:
+                keep = is_usable(sweep, world, frame.world_from_ego.numpy(), EGO_M)
+                sweeps.append(sweep.select(keep))
+        table = cuboids[n]
+        if table is None:
+            problems.append(
+                f"frame {n}: annotations/cuboids/{n:02d}.pkl.gz is missing; moving objects are "
+                f"interpolated"
+            )
+        elif seen is None:
+            boxes += moving[n]
+        else:
+            sensors = sensors_of(table)
+            boxes += [_when_seen(box, seen, sensors[box.row], frame) for box in moving[n]]
+    return tuple(sweeps), tuple(boxes), tuple(problems)
 
 
-# ---- Boxes, sweeps and classes -------------------------------------------------------------------
+def _moving_boxes(
+    root: Path,
+    frames: Sequence[Frame],
+    cuboids: Mapping[int, pd.DataFrame | None],
+    origin: np.ndarray,
+) -> Mapping[int, list[BoxSample]]:
+    """By frame the boxes of the objects that move, both sensors' under the object's name."""
+    names = read_objects(root).names
+
+    def timed(frame: Frame, table: pd.DataFrame) -> TimedBoxes:
+        boxes = boxes_of_cuboids(table)
+        known = tuple(names[uuid] for uuid in boxes.track_ids)
+        moves = ~table["stationary"].to_numpy().astype(bool)
+        boxes = replace(boxes, track_ids=known, attributes={})
+        return TimedBoxes(frame.index, boxes, frame.timestamp_ns, moves)
+
+    tables = ((frame, cuboids[frame.index]) for frame in frames)
+    found = find_objects(
+        (timed(frame, table) for frame, table in tables if table is not None), origin, several=True
+    )
+    by_frame: dict[int, list[BoxSample]] = defaultdict(list)
+    for box in found.moving:
+        by_frame[box.frame].append(box)
+    return by_frame
+
+
+def _when_seen(box: BoxSample, seen: _SensorSweep, sensor: int, frame: Frame) -> BoxSample:
+    """The box at the time when its sensor saw it, as boxes were drawn around returns of 0.1 s: the
+    median time of its returns in the box, else the time of the return of nearest bearing from the
+    car."""
+    points, times = seen.sweep.points, seen.sweep.timestamps_ns
+    pose, reach = box.world_from_box, float(np.linalg.norm(box.size_m))
+    near = indices_between(points, pose[:3, 3] - reach, pose[:3, 3] + reach)
+    if sensor >= 0:
+        near = near[seen.sensor[near] == sensor]
+    local = (points[near] - pose[:3, 3]) @ pose[:3, :3]
+    inside = near[inside_box(local, box.size_m, _TIMING_MARGIN_M)]
+    if len(inside):
+        return replace(box, timestamp_ns=int(np.sort(times[inside])[len(inside) // 2]))
+    finite = np.isfinite(points[:, 0])
+    ofs = finite & (seen.sensor == sensor) if (seen.sensor == sensor).any() else finite
+    if not ofs.any():
+        return box
+    origin = frame.world_from_ego.numpy()[:2, 3]
+    to_points = points[ofs, :2] - origin
+    to_box = pose[:2, 3] - origin
+    cosine = (to_points @ to_box) / np.maximum(np.linalg.norm(to_points, axis=1), 1e-6)
+    return replace(box, timestamp_ns=int(times[ofs][np.argmax(cosine)]))
+
+
+# ---- Objects and classes -------------------------------------------------------------------------
 # A moving object is labelled once a sensor, up to 0.1 s apart, with a uuid for each box
 # (`cuboids.sensor_id`: 0 the spinning sensor, 1 the forward one, -1 a box of both) and the other's
 # uuid in `cuboids.sibling_id`. Published links go one way only, are cut short, or name their own
@@ -322,6 +449,7 @@ _CLASSES: tuple[tuple[str, int], ...] = (
     ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
     ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
 )  # fmt: skip
+_ClassNames = dict[Annotated[str, Field(pattern="^[0-9]{1,9}$")], Text]
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,10 +494,10 @@ def _read_objects(root: Path, state: tuple[tuple[int, int, int], ...]) -> Object
             continue
         if table is not None:
             tables[frame] = table
-    return find_objects(tables)
+    return tie_boxes(tables)
 
 
-def find_objects(tables: Mapping[int, pd.DataFrame]) -> Objects:
+def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
     """The objects in the cuboids of some frames: tied by links in both directions, then in one,
     then, without a partner, by overlap: boxes of one class and both sensors that share MIN_OVERLAP
     on average. No tie makes two boxes of one sensor in one frame the same object."""
@@ -468,22 +596,18 @@ def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
     return shared / (np.prod(a[1]) + np.prod(b[1]) - shared)
 
 
-def semantic_table(root: Path) -> np.ndarray:
-    """SemanticClass (or NO_SURFACE) by the sequence's class number, int16 [256]; unknown names
-    are UNKNOWN. Numbers are those of annotations/semseg/classes.json, or of the published list."""
-    names = {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
+def class_meanings(root: Path) -> dict[int, int]:
+    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN.
+    Numbers are those of annotations/semseg/classes.json, or of the published list."""
     path = root / "annotations" / "semseg" / "classes.json"
-    if path.exists():
-        found = read_json(path)
-        for key, name in found.items():
-            if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
-                raise AdapterError(
-                    f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
-                )
-        names = {int(key): name for key, name in found.items()}
-        if max(names, default=0) > 255:
-            raise AdapterError(f"{path}: class numbers must lie in 0 to 255; got {max(names)}")
-    return class_table(names, dict(_CLASSES))
+    if not path.exists():
+        return {number: meaning for number, (_, meaning) in enumerate(_CLASSES, start=1)}
+    names = validated(_ClassNames, read_json(path), f"{path} must map class numbers to names")
+    meaning = dict(_CLASSES)
+    return {int(n): meaning.get(name, SemanticClass.UNKNOWN) for n, name in names.items()}
+
+
+# ---- Labels --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -510,11 +634,12 @@ class PandaSetLabels:
     @property
     def no_surface_classes(self) -> tuple[int, ...]:
         """The sweeps' class numbers of returns that no surface made: smoke, spray, reflections."""
-        return tuple(int(n) for n in np.flatnonzero(semantic_table(self.root) == NO_SURFACE))
+        return tuple(n for n, c in sorted(class_meanings(self.root).items()) if c == NO_SURFACE)
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
-        return classes_of(sweep, semantic_table(self.root))
+        numbers = sweep.columns.get("semantic")
+        return None if numbers is None else world_classes(numbers, class_meanings(self.root))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Where each return's own sensor was at its own time: the car on a straight line between

@@ -1,4 +1,4 @@
-"""What a job writes, and what it says when something is wrong."""
+"""`climategs render`: what a job writes, goes on with, and says when something is wrong."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import dataclasses
 import errno
 import hashlib
 import json
-import multiprocessing
 import os
-import subprocess
-import sys
+import shutil
 import threading
 from pathlib import Path
 
 import cv2
-import lock_holder
 import numpy as np
 import pytest
 from batch_scenes import (
@@ -25,6 +22,7 @@ from batch_scenes import (
     make_camera,
     make_frame,
     make_recipe,
+    must_not_render,
     open_fake,
     tree_digest,
 )
@@ -38,11 +36,37 @@ from augment.jobs.processes import OutputLock, process_mark
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes, read_lidar
 from recipes.load import load_recipe
+from recipes.schema import Render
+
+IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
+FOLDER = Path("street") / "fog-000"
 
 
 def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
     options = {"scene_loader": open_fake, "progress": False, **options}
     return run_job(job, renderer=renderer, **options)
+
+
+def fog_job(out: Path, uri: str = "fake:street", **options) -> RenderJob:
+    """4 frames of 2 cameras in smog."""
+    return RenderJob(uri, [make_recipe()], out, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one uninterrupted run; shared, so nobody writes to it."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    result = run(fog_job(out))
+    assert (result.written, result.skipped, result.failed) == (8, 0, 0)
+    return out
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "copied"))
+
+
+# ---- Files ---------------------------------------------------------------------------------------
 
 
 def assert_same_column(got: np.ndarray, expected: np.ndarray) -> None:
@@ -53,31 +77,24 @@ def assert_same_column(got: np.ndarray, expected: np.ndarray) -> None:
         assert got.tobytes() == expected.tobytes()
 
 
-def test_files_hold_what_was_rendered(tmp_path: Path) -> None:
-    recipe = make_recipe()
-    result = run(RenderJob("fake:street", [recipe], tmp_path))
-    assert (result.written, result.skipped, result.failed) == (8, 0, 0)
-    scene = open_fake("fake:street")
+def test_files_hold_what_was_rendered(whole: Path) -> None:
+    recipe, scene = make_recipe(), open_fake("fake:street")
     for frame in scene.frames:
         for name, camera in frame.cameras.items():
             paths = item_paths("street", recipe, name, frame.index)
             view = fake_render(scene, camera, recipe, backend="auto")
-            image = cv2.imread(str(tmp_path / paths["image"]), cv2.IMREAD_COLOR_RGB)
+            image = cv2.imread(str(whole / paths["image"]), cv2.IMREAD_COLOR_RGB)
             np.testing.assert_array_equal(image, view.rgb)
-            depth = cv2.imread(str(tmp_path / paths["depth"]), cv2.IMREAD_UNCHANGED)
+            depth = cv2.imread(str(whole / paths["depth"]), cv2.IMREAD_UNCHANGED)
             assert depth.dtype == np.uint16
             none = (view.depth_m < 1 / 512) | (view.depth_m > 65535.5 / 256)
             assert none.any() and not none.all()
             np.testing.assert_array_equal(depth == 0, none)
             # Half a step of 1/256 m.
             assert np.abs(depth / 256 - view.depth_m)[~none].max() <= 1 / 512
-            for path, ids in (
-                (paths["semantic"], view.semantic),
-                (paths["instance"], view.instance),
-            ):
-                np.testing.assert_array_equal(
-                    cv2.imread(str(tmp_path / path), cv2.IMREAD_UNCHANGED), ids
-                )
+            for kind, ids in (("semantic", view.semantic), ("instance", view.instance)):
+                written = cv2.imread(str(whole / paths[kind]), cv2.IMREAD_UNCHANGED)
+                np.testing.assert_array_equal(written, ids)
 
 
 def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
@@ -133,9 +150,8 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
     assert len(files) == 9 and all((tmp_path / file).is_file() for file in files)
 
 
-def test_labels_and_lidar_pass_through_to_the_bit(tmp_path: Path) -> None:
-    run(RenderJob("fake:street", [make_recipe()], tmp_path))
-    folder = tmp_path / "street" / "fog-000"
+def test_labels_and_lidar_pass_through_to_the_bit(whole: Path) -> None:
+    folder = whole / FOLDER
     written = read_boxes(folder / "labels" / "boxes.parquet")
     assert list(written) == [0, 1, 2, 3]
     for number in range(4):
@@ -157,11 +173,9 @@ def test_labels_and_lidar_pass_through_to_the_bit(tmp_path: Path) -> None:
 
 
 def test_calibration_is_in_the_datasets_world(tmp_path: Path) -> None:
-    recipe = make_recipe().model_copy(update={"render": make_recipe().render})
-    recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": 0.5})})
+    recipe = make_recipe().model_copy(update={"render": Render(scale=0.5)})
     run(RenderJob("fake:street", [recipe], tmp_path))
-    text = (tmp_path / "street" / "fog-000" / "calibration.json").read_text()
-    calibration = json.loads(text)
+    calibration = json.loads((tmp_path / FOLDER / "calibration.json").read_text())
     assert [entry["frame"] for entry in calibration["frames"]] == [0, 1, 2, 3]
     entry = calibration["frames"][2]
     camera = entry["cameras"]["rear/left"]
@@ -175,23 +189,17 @@ def test_calibration_is_in_the_datasets_world(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pose[:3, :3], scaled.world_from_camera[:3, :3].numpy())
     assert entry["world_from_ego"][0][3] == ORIGIN_M[0] + 0.2
     assert calibration["world_origin_m"] == ORIGIN_M.tolist()
-
-
-def test_recipe_yaml_reads_back_as_the_recipe(tmp_path: Path) -> None:
-    recipe = make_recipe(variant=4)
-    run(RenderJob("fake:street", [recipe], tmp_path, frames=[0]))
-    again = load_recipe(tmp_path / "street" / "fog-004" / "recipe.yaml").resolve(0)
+    again = load_recipe(tmp_path / FOLDER / "recipe.yaml").resolve(0)
     assert again == recipe and again.hash == recipe.hash
 
 
-def test_a_bad_frame_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_a_bad_frame_is_recorded_and_the_rest_goes_on(whole: Path, tmp_path: Path) -> None:
     def render(scene, camera, recipe, *, backend):
         if camera.timestamp_ns == make_frame(2).cameras["rear/left"].timestamp_ns:
             raise RuntimeError("the covariance of splat 7\nis singular")
         return fake_render(scene, camera, recipe, backend=backend)
 
-    job = RenderJob("fake:street?unreadable=1", [make_recipe()], tmp_path)
-    result = run(job, render)
+    result = run(fog_job(tmp_path, "fake:street?unreadable=1"), render)
     assert (result.written, result.failed) == (5, 3)
     assert len(result.failures) == 3 and "street/fog-000, frame 1" in result.failures[0]
     failed = [row for row in read_manifest(tmp_path).to_pylist() if row["status"] == "failed"]
@@ -207,12 +215,9 @@ def test_a_bad_frame_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert all(row["image_path"] is None and row["checksum"] == "" for row in failed)
 
     # Mended, only those are tried again, and the result is that of a run without failures.
-    whole = RenderJob("fake:street", [make_recipe()], tmp_path)
-    result = run(whole)
+    result = run(fog_job(tmp_path))
     assert (result.written, result.skipped, result.failed) == (3, 5, 0)
-    run(RenderJob("fake:street", [make_recipe()], tmp_path / "new"))
-    new = tree_digest(tmp_path / "new")
-    assert {k: v for k, v in tree_digest(tmp_path).items() if not k.startswith("new/")} == new
+    assert tree_digest(tmp_path) == tree_digest(whole)
 
 
 def test_an_unreadable_sweep_fails_its_frame(tmp_path: Path) -> None:
@@ -220,35 +225,32 @@ def test_an_unreadable_sweep_fails_its_frame(tmp_path: Path) -> None:
         def lidar(self, frame_index):
             raise EOFError("compressed file ended early")
 
-    def open_scene(uri):
-        return dataclasses.replace(open_fake(uri), labels=Labels())
-
-    job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0], cameras=["front"])
-    result = run(job, scene_loader=open_scene)
+    scene = dataclasses.replace(open_fake("fake:street"), labels=Labels())
+    result = run(fog_job(tmp_path, frames=[0]), scene_loader=lambda _uri: scene)
     assert result.failures[0].endswith(
         "reading the LiDAR sweep: EOFError: compressed file ended early"
     )
     without = RenderJob("fake:street", [make_recipe("clear", lidar=False)], tmp_path, frames=[0])
-    assert run(without, scene_loader=open_scene).failed == 0
+    assert run(without, scene_loader=lambda _uri: scene).failed == 0
 
 
-def test_unknown_frames_and_cameras_list_what_there_is(tmp_path: Path) -> None:
-    job = RenderJob("fake:street", [make_recipe()], tmp_path / "out", frames=[2, 9, 11])
-    with pytest.raises(SceneError, match=r"no frame 9, 11; it has 0-3"):
-        run(job)
-    job = RenderJob("fake:street", [make_recipe()], tmp_path / "out", cameras=["back"])
-    with pytest.raises(SceneError, match=r"no camera back; it has front, rear/left"):
-        run(job)
-    assert not (tmp_path / "out").exists()
-
-
-def test_jobs_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ValueError, match="workers must be >= 1; got 0"):
-        RenderJob("fake:s", [make_recipe()], "out", workers=0)
-    with pytest.raises(ValueError, match="at least one recipe"):
-        RenderJob("fake:s", [], "out")
-    with pytest.raises(ValueError, match=r"repeated: \['fog-000'\]"):
-        RenderJob("fake:s", [make_recipe(), make_recipe(depth="none")], "out")
+def test_jobs_that_cannot_be_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    out, recipe = tmp_path / "out", make_recipe()
+    for error, message, recipes, options in (
+        (SceneError, r"no frame 9, 11; it has 0-3", [recipe], {"frames": [2, 9, 11]}),
+        (SceneError, r"no camera back; it has front, rear/left", [recipe], {"cameras": ["back"]}),
+        (ValueError, "workers must be >= 1; got 0", [recipe], {"workers": 0}),
+        (ValueError, "at least one recipe", [], {}),
+        (ValueError, r"repeated: \['fog-000'\]", [recipe, make_recipe(depth="none")], {}),
+        (ValueError, r"backend must be one of auto, .*'vulkan'", [recipe], {"backend": "vulkan"}),
+    ):
+        with pytest.raises(error, match=message):
+            run(RenderJob("fake:street", recipes, out, **options), None)
+        assert not out.exists()
+    out.write_text("mine")
+    with pytest.raises(OutputError, match=r"out.*(is a file|is in the way)"):
+        run(fog_job(out))
+    assert out.read_text() == "mine"
 
 
 def test_a_camera_path_replaces_the_frames(tmp_path: Path) -> None:
@@ -259,14 +261,13 @@ def test_a_camera_path_replaces_the_frames(tmp_path: Path) -> None:
         Frame(1, recorded.timestamp_ns, recorded.world_from_ego, side),
         Frame(2, 5, recorded.world_from_ego, {"front": make_camera("front", 5, 0.7)}),
     ]
-    job = RenderJob("fake:street", [make_recipe()], tmp_path, camera_path=path)
-    assert run(job).written == 2
+    assert run(fog_job(tmp_path, camera_path=path)).written == 2
     rows = read_manifest(tmp_path).to_pylist()
     assert [row["labels_path"] is None for row in rows] == [False, True]
     assert [row["lidar_path"] is None for row in rows] == [False, True]
     assert rows[0]["trajectory"] == rows[1]["trajectory"] != "recorded"
     with pytest.raises(OutputError, match=r"camera path there 'path-.*', here 'recorded'"):
-        run(RenderJob("fake:street", [make_recipe()], tmp_path))
+        run(fog_job(tmp_path))
 
 
 def test_a_second_job_on_the_same_folder_is_refused(tmp_path: Path) -> None:
@@ -277,18 +278,16 @@ def test_a_second_job_on_the_same_folder_is_refused(tmp_path: Path) -> None:
         go_on.wait(20)
         return fake_render(scene, camera, recipe, backend=backend)
 
-    first = threading.Thread(
-        target=run, args=(RenderJob("fake:a", [make_recipe()], tmp_path), render)
-    )
+    first = threading.Thread(target=run, args=(fog_job(tmp_path, "fake:a"), render))
     first.start()
     begun.wait(20)
     try:
         with pytest.raises(OutputError, match=r"is being written by another job \(process \d+\)"):
-            run(RenderJob("fake:b", [make_recipe()], tmp_path))
+            run(fog_job(tmp_path, "fake:b"))
     finally:
         go_on.set()
         first.join()
-    assert run(RenderJob("fake:b", [make_recipe()], tmp_path)).written == 8
+    assert run(fog_job(tmp_path, "fake:b")).written == 8
 
 
 def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
@@ -300,70 +299,6 @@ def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
     assert (state / "lock").read_bytes() == b""
 
 
-@pytest.mark.long
-def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
-    """As after the parent was killed: the folder is free once the last worker has gone."""
-    monkeypatch.setattr("augment.jobs.processes.ORPHANS_S", 0.1)
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    with OutputLock(tmp_path) as lock:
-        child = context.Process(target=lock_holder.hold, args=(lock.inherited(), theirs))
-        child.start()
-        assert ours.recv() == "holding"
-    with pytest.raises(OutputError, match="is being written by another job; wait"):
-        OutputLock(tmp_path).__enter__()
-    # The dead parent had this process's number, as in another run of a container.
-    (tmp_path / ".climategs" / "lock").write_text(f"{os.getpid()} 1")
-    monkeypatch.setattr("augment.jobs.processes.ORPHANS_S", 20)
-    threading.Timer(0.2, ours.send, ["end"]).start()
-    OutputLock(tmp_path).__enter__().__exit__()
-    child.join()
-    with OutputLock(tmp_path):
-        pass
-    for connection in (ours, theirs):
-        connection.close()
-
-
-def test_an_output_folder_that_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(OutputError, match=r"out.*(is a file|is in the way)"):
-        run(RenderJob("fake:street", [make_recipe()], tmp_path / "out"))
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-FULL_DISK = """
-import resource, sys
-sys.path.insert(0, sys.argv[2])
-from batch_scenes import fake_render, make_recipe, open_fake
-from augment.jobs.render_job import RenderJob, run_job
-from augment.errors import OutputError
-resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # the LiDAR fits not, images do
-job = RenderJob("fake:street", [make_recipe(semantic=False)], sys.argv[1])
-try:
-    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
-except OutputError as error:
-    print(error)
-"""
-
-
-def test_a_refused_write_leaves_no_partial_file(tmp_path: Path) -> None:
-    """A limit on file sizes stands in for a full disk: the kernel cuts the write in its midst."""
-    run(RenderJob("fake:street", [make_recipe(semantic=False)], tmp_path / "whole"))
-    whole = tree_digest(tmp_path / "whole")
-    out = tmp_path / "out"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, out, Path(__file__).parent],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert "cannot write" in done.stdout and "File too large" in done.stdout, done.stderr
-    left = {k: v for k, v in tree_digest(out).items() if not k.startswith(".climategs")}
-    assert all(whole[name] == digest for name, digest in left.items())
-    run(RenderJob("fake:street", [make_recipe(semantic=False)], out))
-    assert tree_digest(out) == whole
-
-
 def test_a_full_disk_stops_the_job_and_says_what_to_do(tmp_path, monkeypatch) -> None:
     real, left = os.fsync, [80]
 
@@ -373,7 +308,7 @@ def test_a_full_disk_stops_the_job_and_says_what_to_do(tmp_path, monkeypatch) ->
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(descriptor)
 
-    job = RenderJob("fake:street", [make_recipe()], tmp_path)
+    job = fog_job(tmp_path)
     monkeypatch.setattr(os, "fsync", flush)
     with pytest.raises(OutputError, match=r"cannot write .*: No space left.*free some space"):
         run(job)
@@ -402,13 +337,6 @@ def test_unlabelled_scenes_have_no_label_files(tmp_path: Path) -> None:
     assert not (tmp_path / "s" / "fog-000" / "labels").exists()
 
 
-def test_backends_are_checked_before_anything_is_written(tmp_path: Path) -> None:
-    job = RenderJob("fake:street", [make_recipe()], tmp_path / "out", backend="vulkan")
-    with pytest.raises(ValueError, match=r"backend must be one of auto, .*got 'vulkan'"):
-        run(job, renderer=None)
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_librarys_own_renderer(tmp_path: Path) -> None:
     """`auto` is written down as the backend that it stood for."""
     job = RenderJob(
@@ -429,3 +357,122 @@ def test_rows_that_are_merged_while_a_job_runs_stay(tmp_path: Path) -> None:
     run(street, on_outcome=lambda _: write_manifest(out, others))
     scenes = read_manifest(out)["scene"].to_pylist()
     assert scenes.count("other") == scenes.count("street") == others.num_rows
+
+
+IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
+
+
+def test_a_complete_job_renders_nothing_and_touches_nothing(copied: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*") if path.is_file()}
+    result = run(fog_job(copied), must_not_render)
+    assert (result.written, result.skipped, result.failed) == (0, 8, 0)
+    lock = copied / ".climategs" / "lock"
+    after = {path: path.stat().st_mtime_ns for path in before}
+    assert {p for p in before if before[p] != after[p]} <= {lock}
+
+
+def test_selections_in_any_order_give_the_tree_of_one_run(tmp_path: Path) -> None:
+    recipes = [make_recipe(), make_recipe("clear", image="jpg")]
+    run(RenderJob("fake:street", recipes, tmp_path / "once"))
+    parts = tmp_path / "parts"
+    run(RenderJob("fake:street", recipes[1:], parts, frames=[3, 1]))
+    run(RenderJob("fake:street", recipes, parts, cameras=["rear/left"]))
+    run(RenderJob("fake:street", recipes, parts))
+    assert tree_digest(parts) == tree_digest(tmp_path / "once")
+
+
+def test_a_missing_file_is_rendered_again_and_leftovers_of_a_killed_run_go(
+    whole: Path, copied: Path
+) -> None:
+    for place in (copied / FOLDER / "images" / "front", copied, copied / ".climategs"):
+        (place / ".000001.png.99-0.climategs-tmp").write_bytes(b"half")
+    assert run(fog_job(copied), must_not_render).skipped == 8
+    assert tree_digest(copied) == tree_digest(whole)
+    for name in ("images/front/000001.png", "depth/front/000002.png", "labels/boxes.parquet"):
+        (copied / FOLDER / name).unlink()
+    assert run(fog_job(copied)).written == 2
+    assert tree_digest(copied) == tree_digest(whole)
+
+
+def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path) -> None:
+    recipes = [make_recipe(), make_recipe(variant=1)]
+    run(RenderJob("fake:street", recipes, tmp_path / "whole"))
+    calls = []
+
+    def interrupted(scene, camera, recipe, *, backend):
+        calls.append(camera.name)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    job = RenderJob("fake:street", recipes, tmp_path / "stopped")
+    with pytest.raises(KeyboardInterrupt, match="stopped with 3 of 16 images finished; run the"):
+        run(job, interrupted)
+    assert read_manifest(tmp_path / "stopped").num_rows == 3
+    assert run(job).skipped == 3
+    assert tree_digest(tmp_path / "stopped") == tree_digest(tmp_path / "whole")
+
+
+def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
+    """As a kill in the midst of a write leaves it; whole lines before it still count."""
+    recipes = [make_recipe("clear", labels=False)]  # whose rows are all that a line holds
+    run(RenderJob("fake:street", recipes, tmp_path / "whole"))
+    out = tmp_path / "torn"
+    run(RenderJob("fake:street", recipes, out, frames=[0, 1]))
+    rows = read_manifest(out).to_pylist()
+    (out / "manifest.parquet").unlink()
+    lines = [{name: rows[0][name] for name in IDENTITY}, *rows]
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    progress_log = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
+    progress_log.parent.mkdir(parents=True)
+    progress_log.write_text(text[:-20])
+    assert run(RenderJob("fake:street", recipes, out)).skipped == 3
+    assert tree_digest(out) == tree_digest(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("ended", [True, False], ids=["finished", "only begun"])
+def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bool) -> None:
+    run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
+    if not ended:  # as a kill leaves it: a journal and no manifest
+        identity = read_manifest(tmp_path).to_pylist()[0]
+        (tmp_path / "manifest.parquet").unlink()
+        progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+        progress_log.parent.mkdir(parents=True)
+        progress_log.write_text(json.dumps({name: identity[name] for name in IDENTITY}) + "\n")
+    before = tree_digest(tmp_path)
+    changed = make_recipe(depth="none")
+    pattern = f"fog-000 already holds.*recipe hash there '{make_recipe().hash}'.*overwrite"
+    with pytest.raises(OutputError, match=pattern):
+        run(RenderJob("fake:street", [changed], tmp_path), must_not_render)
+    assert tree_digest(tmp_path) == before
+
+    calls = []
+
+    def stops_at_the_third(scene, camera, recipe, *, backend):
+        calls.append(camera.name)
+        if len(calls) == 3:
+            raise SystemExit("stopped without a chance to tidy up")
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    with pytest.raises(SystemExit, match="stopped without"):
+        run(RenderJob("fake:street", [changed], tmp_path, overwrite=True), stops_at_the_third)
+    assert run(RenderJob("fake:street", [changed], tmp_path)).skipped == 2
+    assert {row["recipe_hash"] for row in read_manifest(tmp_path).to_pylist()} == {changed.hash}
+    digest = tree_digest(tmp_path)
+    run(RenderJob("fake:street", [changed], tmp_path / "new"))
+    assert digest == tree_digest(tmp_path / "new")
+
+
+def test_overwriting_replaces_the_variant_and_no_other(tmp_path: Path) -> None:
+    run(RenderJob("fake:street", [make_recipe(), make_recipe(variant=1)], tmp_path))
+    changed = make_recipe(depth="none")
+    result = run(RenderJob("fake:street", [changed], tmp_path, frames=[0], overwrite=True))
+    assert (result.written, result.skipped) == (2, 0)
+    run(RenderJob("fake:street", [changed], tmp_path / "new", frames=[0]))
+    fog = "street/fog-000/"
+    here = {k: v for k, v in tree_digest(tmp_path).items() if k.startswith(fog)}
+    new = {k: v for k, v in tree_digest(tmp_path / "new").items() if k.startswith(fog)}
+    assert here == new
+    assert (
+        read_manifest(tmp_path).column("variant").to_pylist() == ["fog-000"] * 2 + ["fog-001"] * 8
+    )

@@ -1,0 +1,280 @@
+"""Raw scenes as they were built last, kept in the user's cache folder.
+
+A raw scene takes a minute of a processor to build, and an instant to open again. An entry is a
+scene file (augment.files.scene_file), named by what it was made from and by its own bytes:
+
+    $XDG_CACHE_HOME or ~/.cache, climategs/scenes/KEY-DIGEST.climategs
+
+KEY is a digest of path and options, of the code and the libraries that build the scene, and of
+path, size and time of change of every file that the adapter reads. A file that is replaced by one
+of the same size and time goes unnoticed; to read all bytes of a drive would take seconds. Labels
+are no part of an entry: they are read from the recording, as ever.
+
+CLIMATEGS_SCENE_CACHE_GB says how large the folder may grow (10 by default), what was not used for
+longest goes first; with 0 the cache is neither read nor written.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import hashlib
+import json
+import logging
+import math
+import os
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import distributions
+from pathlib import Path
+
+from llvmlite.binding import get_host_cpu_name
+
+from adapters.scene_folder import with_images_in
+from adapters.uri import SCHEMES, format_uri
+from augment.errors import AdapterError, ClimateGSError, SceneError
+from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
+from augment.jobs.atomic import remove_temporaries
+from augment.labels import LabelSource
+from augment.scene import Scene, is_drawable
+
+logger = logging.getLogger(__name__)
+
+LIMIT_KEY = "CLIMATEGS_SCENE_CACHE_GB"
+DEFAULT_LIMIT_GB = 10.0  # some 150 scenes
+_MAX_FILES = 1_000_000  # of a dataset's folder: some seconds to look at; or links lead in circles
+_CODE = ("adapters", "augment", "recipes")
+_LIBRARIES = (
+    "climategs", "numpy", "scipy", "numba", "torch", "opencv-contrib-python-headless",
+    "opencv-python-headless", "opencv-python", "pandas", "pyarrow", "open3d",
+)  # fmt: skip
+
+
+def cached_scene(
+    scheme: str, path: str, query: Mapping[str, str], build: Callable[[], Scene]
+) -> Scene:
+    """The scene that `build` would make of this URI, from the cache if it is there."""
+    limit_bytes = _limit_bytes()
+    open_labels = functools.cache(partial(SCHEMES[scheme].open_labels, path, query))
+    key = _scene_key(scheme, path, query, open_labels) if limit_bytes else None
+    folder = _cache_folder()
+    if key is None or folder is None:
+        return build()
+    found = _read(folder, key)
+    if found is None:
+        with _alone(folder, key) as can_write:
+            found = _read(folder, key) if can_write else None  # by another process meanwhile
+            if found is None:
+                scene = build()
+                if can_write:
+                    _store(scene, folder, key, limit_bytes)
+                return scene
+    return replace(
+        found,
+        source=format_uri(scheme, path, query),
+        frames=tuple(with_images_in(path, frame, os.path.abspath(path)) for frame in found.frames),
+        labels=open_labels(),
+        recorded_source=None,
+    )
+
+
+def leave_out_cache() -> None:
+    """Neither read nor write it, in this process and those that it starts."""
+    os.environ[LIMIT_KEY] = "0"
+
+
+def _cache_folder() -> Path | None:
+    """Where entries are; None where the user has no home."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        base = given if given.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return base / "climategs" / "scenes"
+
+
+def _limit_bytes() -> float:
+    text = os.environ.get(LIMIT_KEY, "") or str(DEFAULT_LIMIT_GB)
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = math.nan
+    if not limit >= 0:
+        raise AdapterError(
+            f"{LIMIT_KEY} must be a number of gigabytes, 0 for no scene cache; got {text!r}"
+        )
+    return limit * 1e9
+
+
+# ---- What a scene is made from -------------------------------------------------------------------
+
+
+def _scene_key(
+    scheme: str, path: str, query: Mapping[str, str], open_labels: Callable[[], LabelSource | None]
+) -> str | None:
+    """The KEY of a scene, hexadecimal; None where the scene's files cannot be listed, which the
+    adapter has better words for."""
+    try:
+        files = list(_facts_of(_files_of(scheme, path, query, open_labels)))
+    except (OSError, ClimateGSError):
+        return None
+    facts = [VERSION, *_builder(), scheme, os.path.abspath(path), sorted(query.items()), files]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:32]
+
+
+def _files_of(
+    scheme: str, path: str, query: Mapping[str, str], open_labels: Callable[[], LabelSource | None]
+) -> Iterator[Path]:
+    """The files that the adapter reads, those too that it would read if they were there; a folder
+    stands for all that is in it."""
+    yield from (Path(value) for value in query.values() if Path(value).is_file())
+    root = Path(path)
+    if scheme == "nuscenes":  # a folder of hundreds of scenes
+        from adapters.nuscenes.adapter import NuScenesLabels
+
+        labels = open_labels()
+        assert isinstance(labels, NuScenesLabels)
+        tables = labels.tables
+        yield root / tables.version
+        for frame in labels.frames:
+            yield from (root / f.filename for f in (frame.sweep, *frame.images.values()))
+        yield from (root / name for name in tables.semantic_files.values())
+        return
+    yield root
+    if scheme == "kitti":
+        from adapters.kitti.files import kitti_root
+
+        yield from sorted(kitti_root(path)[1].glob("calib_*.txt"))
+    elif scheme == "recording":  # a variant of a job has its scene's sweeps
+        from augment.jobs.layout import SWEEPS
+
+        yield root / os.pardir / SWEEPS
+
+
+def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
+    """Path, size and time of change of files and of all files in folders; of missing ones, that."""
+    count = 0
+    for path in paths:
+        names: Iterable[str] = [str(path)]
+        if path.is_dir():
+            walk = os.walk(path, followlinks=True)
+            names = (os.path.join(place, name) for place, _, files in walk for name in files)
+        for name in sorted(names):
+            count += 1
+            if count > _MAX_FILES:
+                raise AdapterError(f"{path} has more than {_MAX_FILES} files")
+            try:
+                facts = os.stat(name)
+            except FileNotFoundError:  # or a link to nothing
+                yield os.path.abspath(name), -1, -1
+            else:
+                yield os.path.abspath(name), facts.st_size, facts.st_mtime_ns
+
+
+@functools.cache
+def _builder() -> tuple[str, ...]:
+    """The code that builds scenes, the libraries that it calculates with, and the processor, whose
+    instructions they choose from."""
+    code = hashlib.sha256()
+    for package in _CODE:
+        top = Path(__file__).parents[1] / package
+        for file in sorted(top.rglob("*.py")):
+            code.update(f"{file.relative_to(top)}\0".encode() + file.read_bytes())
+    installed = {
+        each.name: each.version for name in _LIBRARIES for each in distributions(name=name)
+    }
+    return (code.hexdigest(), *map(str, installed.items()), get_host_cpu_name())
+
+
+# ---- Entries -------------------------------------------------------------------------------------
+
+
+def _read(folder: Path, key: str) -> Scene | None:
+    """The scene of a whole entry, which is marked as used."""
+    for entry in folder.glob(f"{key}-*{SCENE_SUFFIX}"):
+        try:
+            if entry.stem != f"{key}-{_digest_of(entry)}":
+                raise SceneError("its bytes are not those that were written")
+            scene = load_scene_parts(entry)
+        except (OSError, SceneError) as error:
+            if entry.exists():  # not what another process has just removed
+                logger.warning("%s is damaged (%s); the scene is built again", entry, error)
+                with contextlib.suppress(OSError):
+                    entry.unlink()
+            continue
+        with contextlib.suppress(OSError):  # a cache that is read only
+            os.utime(entry)
+        logger.info("%s: as it was built last, from %s", scene.name, entry)
+        return scene
+    return None
+
+
+def _store(scene: Scene, folder: Path, key: str, limit_bytes: float) -> None:
+    """Write an entry as a whole or not at all; where that cannot be done, say so once."""
+    if not all(map(is_drawable, scene.all_gaussians)):
+        return  # scene files leave such Gaussians out
+    new = folder / f"{key}.{secrets.token_hex(8)}{SCENE_SUFFIX}"
+    try:
+        save_scene_file(scene, new)
+        os.replace(new, new.with_name(f"{key}-{_digest_of(new)}{SCENE_SUFFIX}"))
+        _make_room(folder, limit_bytes)
+    except (OSError, ClimateGSError) as error:
+        _complain(folder, error)
+
+
+def _make_room(folder: Path, limit_bytes: float) -> None:
+    """Remove what was not used for longest, and what killed processes have left."""
+    remove_temporaries(folder, recursive=False)
+    used = []
+    for entry in folder.glob(f"*{SCENE_SUFFIX}"):
+        with contextlib.suppress(FileNotFoundError):
+            facts = entry.stat()
+            used.append((facts.st_mtime_ns, facts.st_size, entry))
+    total = 0
+    for _, size, entry in sorted(used, reverse=True):
+        total += size
+        if total > limit_bytes:
+            entry.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, key: str) -> Iterator[bool]:
+    """Let one process build a scene while others that want the same wait; whether the folder can be
+    written. Where the system has no locks, each builds its own."""
+    path = folder / f"{key}.lock"
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            lock = stack.enter_context(path.open("wb"))
+        except OSError as error:
+            _complain(folder, error)
+            yield False
+            return
+        stack.callback(path.unlink, missing_ok=True)
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                logger.info("another process is building this scene; waiting for it")
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            # Not left to closing the file, which a process started meanwhile may have open too.
+            stack.callback(fcntl.flock, lock, fcntl.LOCK_UN)
+        yield True
+
+
+def _digest_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+
+
+def _complain(folder: Path, error: Exception) -> None:
+    """Say once in a process that scenes cannot be kept."""
+    if folder not in _complained:
+        logger.warning("scenes are not kept in %s for the next command: %s", folder, error)
+    _complained.add(folder)
+
+
+_complained: set[Path] = set()

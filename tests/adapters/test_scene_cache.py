@@ -1,0 +1,189 @@
+"""Raw scenes opened from the cache: the same bits, and never those of other files or options."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import kitti_files
+import nuscenes_files
+import pytest
+from fitted_scenes import assert_same, fitted_scene
+from pandaset_folder import write_sequence
+from recording_folder import write_recording
+
+from adapters.base import open_scene
+from adapters.scene_cache import LIMIT_KEY, cached_scene
+from augment.errors import AdapterError
+from augment.render.rasterize import rasterize
+from tools.cli import main
+
+COARSE = "voxel_m=0.4&image_scale=0.5&sky_size=8&frames=0:2"
+
+
+def _nuscenes(root: Path) -> str:
+    return f"nuscenes:{nuscenes_files.write_dataset(root)}?scene={nuscenes_files.SCENES[0]}&"
+
+
+RAW: dict[str, Callable[[Path], str]] = {
+    "pandaset": lambda root: f"pandaset:{write_sequence(root)}?",
+    "recording": lambda root: f"recording:{write_recording(root)}?",
+    "kitti": lambda root: f"kitti:{kitti_files.write_raw(root)}?",
+    "nuscenes": _nuscenes,
+}
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty cache in use. Its folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv(LIMIT_KEY, "1")
+    yield tmp_path / "cache" / "climategs" / "scenes"
+
+
+def entries(cache: Path) -> set[str]:
+    return {path.name for path in cache.iterdir()}
+
+
+@pytest.mark.parametrize("scheme", RAW)
+def test_a_cached_scene_is_the_built_one_to_the_bit(
+    scheme: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = RAW[scheme](tmp_path / "data") + COARSE
+    monkeypatch.chdir(tmp_path)
+    near = uri.replace(f"{tmp_path}/", "")  # a relative path: those of the images are so, too
+    monkeypatch.setenv(LIMIT_KEY, "0")
+    built = open_scene(near)
+    assert not cache.exists()
+    monkeypatch.setenv(LIMIT_KEY, "1")
+    stored = open_scene(uri)
+    kept = entries(cache)
+    cached = open_scene(near)
+    assert len(kept) == 1 and entries(cache) == kept
+    assert_same(built, cached, but=("labels",))
+    assert_same(built, stored, but=("labels", "source", "frames"))
+    assert type(cached.labels) is type(built.labels)
+    number = built.frames[-1].index
+    assert_same(built.lidar(number), cached.lidar(number))
+    assert built.boxes(number).track_ids == cached.boxes(number).track_ids
+    camera, same = (next(iter(scene.frames[0].cameras.values())) for scene in (built, cached))
+    for field in dataclasses.fields(camera):  # NumPy's numbers count otherwise than Python's
+        assert type(getattr(camera, field.name)) is type(getattr(same, field.name)), field.name
+    images = [rasterize(scene.parts_for(camera), camera).rgb for scene in (built, cached)]
+    assert_same(*images)
+
+
+def test_other_options_and_files_are_other_scenes(cache: Path, tmp_path: Path) -> None:
+    root = write_recording(tmp_path / "data")
+    uri = f"recording:{root}?{COARSE}"
+    first = open_scene(uri)
+    assert open_scene(f"{uri}&ground_z=-3").ground_z_m == -3  # laid over what is kept
+    assert len(entries(cache)) == 1
+    assert len(open_scene(uri.replace("0.4", "0.6")).background) < len(first.background)
+    image = sorted((root / "images").glob("*/*"))[0]
+    content = image.read_bytes()
+    image.unlink()
+    assert len(open_scene(uri).frames[0].image_paths) < len(first.frames[0].image_paths)
+    image.write_bytes(content)
+    os.utime(image, ns=(0, 0))
+    assert_same(open_scene(uri), first, but=("labels",))
+    assert len(entries(cache)) == 4
+
+
+@pytest.mark.parametrize("damage", ["cut short", "a bit"])
+def test_a_damaged_entry_is_built_again(
+    damage: str, cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = _kept(tmp_path / "a")
+    (entry,) = cache.iterdir()
+    content = bytearray(entry.read_bytes())
+    content[-100] ^= 1
+    entry.write_bytes(content[:-50] if damage == "cut short" else content)
+    assert_same(_kept(tmp_path / "a"), first)
+    assert "damaged" in caplog.text
+    caplog.clear()
+    _kept(tmp_path / "a")
+    assert "damaged" not in caplog.text
+
+
+def test_what_was_not_used_for_longest_makes_room(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _kept(tmp_path / "a")
+    (first,) = cache.iterdir()
+    monkeypatch.setenv(LIMIT_KEY, str(2.5 * first.stat().st_size / 1e9))
+    _kept(tmp_path / "b")
+    (second,) = set(cache.iterdir()) - {first}
+    os.utime(second, ns=(0, 0))
+    os.utime(first, ns=(1, 1))
+    _kept(tmp_path / "b")  # which now was used last
+    _kept(tmp_path / "c")
+    assert second.exists() and not first.exists() and len(entries(cache)) == 2
+
+
+def test_who_wants_a_scene_that_is_being_built_waits_for_it(cache: Path, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    builders, started = [], threading.Event()
+
+    def build():
+        builders.append(threading.get_ident())
+        started.set()
+        time.sleep(0.5)
+        return fitted_scene()
+
+    found = []
+
+    def open_() -> None:
+        found.append(cached_scene("recording", str(tmp_path / "a"), {}, build))
+
+    first, second = (threading.Thread(target=open_) for _ in range(2))
+    first.start()
+    started.wait()
+    second.start()
+    first.join()
+    second.join()
+    assert len(builders) == 1 and len(entries(cache)) == 1
+    assert_same(found[0].background, found[1].background)
+
+
+@pytest.mark.parametrize("why", ["no folder", "no room"])
+def test_without_a_cache_to_write_to_scenes_open_with_one_warning(
+    why: str, cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    if why == "no folder":
+        cache.parents[1].write_text("a file")
+    else:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        for name in "ab":
+            assert_same(_kept(tmp_path / name), fitted_scene())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert caplog.text.count("are not kept") == 1
+    assert not cache.exists() or not entries(cache)
+
+
+def test_no_cache_leaves_it_out(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = f"recording:{write_recording(tmp_path / 'data')}?{COARSE}"
+    assert main(["inspect", uri, "--no-cache"]) == 0
+    assert not cache.exists()
+    monkeypatch.setenv(LIMIT_KEY, "much")
+    with pytest.raises(AdapterError, match=f"{LIMIT_KEY}.*'much'"):
+        open_scene(uri)
+
+
+def _kept(folder: Path):
+    """A scene of everything that scenes hold, of a folder of its own."""
+    folder.mkdir(exist_ok=True)
+    return cached_scene("recording", str(folder), {}, fitted_scene)

@@ -1,0 +1,749 @@
+"""What a job writes of its effects, and what it finds once for all of its images."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from batch_scenes import (
+    LEVEL_Z_M,
+    ORIGIN_M,
+    THICKNESS_M,
+    FakeLabels,
+    FakeView,
+    bed_render,
+    fake_render,
+    make_bed,
+    make_camera,
+    make_frame,
+    make_maps,
+    make_recipe,
+    must_not_render,
+    open_fake,
+    style_render,
+    tree_digest,
+)
+
+from augment.boxes import PlacedBoxes
+from augment.cameras import Camera, Frame
+from augment.dataset import SceneDataset, WeatherDataset, collate_frames
+from augment.effects.flood.effect import hidden_pixels, submerged_fraction
+from augment.effects.smog import box_transmittance
+from augment.effects.snow import support as beds
+from augment.effects.snow.placement import PlacementSettings
+from augment.effects.snow.snow import snow_pixels
+from augment.effects.style import style as scene_maps
+from augment.errors import OutputError, SceneError, StyleError
+from augment.jobs.files import box_tables, visibility
+from augment.jobs.manifest import later_columns, read_manifest
+from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
+from augment.labels import Boxes
+from recipes.errors import RecipeError
+from recipes.files import with_digest
+from recipes.flood import Flood
+from recipes.load import load_recipe
+from recipes.schema import Recipe, Smog, Weather
+from recipes.snow import Snow
+from recipes.style import Style
+
+# Snow of no depth is not laid, so no place is looked for; the stand-in draws some all the same.
+SNOW, FLOOD = Snow(depth_m=0), Flood(level_m=0.3)
+FOLDER = Path("street") / "fog-000"
+LABELS = FOLDER / "labels"
+CLEAR = make_recipe("clear")
+
+
+def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
+    options = {"scene_loader": open_fake, "progress": False, **options}
+    return run_job(job, renderer=renderer, **options)
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """All effects: none may get into another one's files."""
+    return make_recipe(snow=SNOW, flood=FLOOD)
+
+
+@pytest.fixture(scope="module")
+def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one uninterrupted run; shared, so nobody writes to it."""
+    out = tmp_path_factory.mktemp("effects") / "out"
+    assert run(RenderJob("fake:street", [recipe], out)).failed == 0
+    return out
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "copied"))
+
+
+def rows_of(out: Path) -> list[dict]:
+    return read_manifest(out).to_pylist()
+
+
+def camera_and_view(row: dict, recipe: Recipe) -> tuple[Camera, FakeView]:
+    scene = open_fake("fake:street")
+    camera = scene.frame(row["frame"]).cameras[row["camera"]]
+    return camera, fake_render(scene, camera, recipe, backend="auto")
+
+
+@pytest.mark.parametrize("kind", ["water", "snow"])
+def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe, kind: str) -> None:
+    assert {row[f"{kind}_path"] for row in rows_of(whole)} == {
+        f"street/fog-000/{kind}/{camera}/00000{frame}.png"
+        for camera in ("front", "rear_left-16c859cb")
+        for frame in range(4)
+    }
+    for row in rows_of(whole):
+        mask = cv2.imread(str(whole / row[f"{kind}_path"]), cv2.IMREAD_UNCHANGED)
+        assert mask.dtype == np.uint8
+        np.testing.assert_array_equal(mask, camera_and_view(row, recipe)[1].masks[kind])
+        assert (row["snow_depth_m"], row["surface"]) == (0.0, "solid")
+
+
+def expected_numbers(kind: str, boxes: Boxes, camera: Camera, view: FakeView) -> dict:
+    """Of what the file has of each box, without what follows from it."""
+    placed = PlacedBoxes.of(boxes, ORIGIN_M)
+    if kind == "smog":
+        seen = view.effects["smog"]
+        found = box_transmittance(placed, camera, seen.placed.data.fog, seen.depth_m)
+        return {"transmittance": found.transmittance, "pixels": found.pixels}
+    seen = view.effects["flood" if kind == "water" else kind]
+    if kind == "snow":
+        if seen.depth_m is None:
+            return {}
+        counted = snow_pixels(placed, camera, seen.depth_m, view.masks["snow"], THICKNESS_M)
+        return {"pixels": counted.pixels, "snow_pixels": counted.marked}
+    found = {"submerged_fraction": submerged_fraction(placed, LEVEL_Z_M)}
+    if seen.depth_m is not None:
+        counted = hidden_pixels(placed, camera, seen.depth_m, view.masks["water"])
+        found |= {"pixels": counted.pixels, "hidden_pixels": counted.marked}
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "marked", "fraction"),
+    [
+        ("water", "hidden_pixels", "hidden_fraction"),
+        ("snow", "snow_pixels", "snow_fraction"),
+        ("smog", None, None),
+    ],
+)
+def test_boxes_have_their_numbers_beside_the_labels(
+    whole: Path, recipe: Recipe, kind, marked, fraction
+) -> None:
+    """Read with any Parquet reader, a row per frame, camera and box."""
+    path = whole / LABELS / f"{kind}.parquet"
+    rows = pq.read_table(path).to_pylist()
+    assert [(row["frame"], row["camera"], row["box"]) for row in rows] == [
+        (frame, camera, box)
+        for frame in range(4)
+        for camera in ("front", "rear/left")
+        for box in range(frame % 4)
+    ]
+    for row in rows:
+        boxes, k = FakeLabels().boxes(row["frame"]), row["box"]
+        assert row["track_id"] == boxes.track_ids[k]
+        expected = expected_numbers(kind, boxes, *camera_and_view(row, recipe))
+        assert {name: row[name] for name in expected} == {n: v[k] for n, v in expected.items()}
+        if "pixels" not in expected:  # none of it is in view
+            assert (row["frame"], row["camera"]) == (3, "rear/left")
+            assert (row["pixels"], row[marked], row[fraction]) == (None, 0, 0.0)
+        elif fraction is not None and row["pixels"]:
+            assert row[fraction] == row[marked] / row["pixels"]
+        elif fraction is not None:
+            assert np.isnan(row[fraction])
+    pixels = [row["pixels"] or 0 for row in rows]
+    assert 0 in pixels and max(pixels) > 0
+    assert marked is None or sum(pixels) > sum(row[marked] for row in rows) > 0
+    assert all(whole / row[f"box_{kind}_path"] == path for row in rows_of(whole))
+
+
+def test_a_clear_day_has_the_same_labels_and_no_tables(whole: Path, tmp_path: Path) -> None:
+    names = ["boxes", "boxes_2d", "smog", "snow", "water"]
+    assert sorted(p.name for p in (whole / LABELS).iterdir()) == [f"{n}.parquet" for n in names]
+    run(RenderJob("fake:street", [CLEAR], tmp_path))
+    clear = tmp_path / "street/clear-000"
+    assert sorted(p.name for p in (clear / "labels").iterdir()) == [
+        f"{n}.parquet" for n in names[:2]
+    ]
+    boxes = (whole / LABELS / "boxes.parquet").read_bytes()
+    assert (clear / "labels/boxes.parquet").read_bytes() == boxes
+    assert not (clear / "snow").exists() and not (clear / "water").exists()
+    for row in rows_of(tmp_path):
+        kinds = ("snow", "water", "box_snow", "box_water", "box_smog")
+        assert {row[f"{kind}_path"] for kind in kinds} == {None}
+        assert np.isnan(row["snow_depth_m"])
+
+
+def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Recipe) -> None:
+    recorded = make_frame(1)
+    path = [
+        Frame(number, time, recorded.world_from_ego, {"front": make_camera("front", time, 0.5)})
+        for number, time in ((1, recorded.timestamp_ns), (2, 5))
+    ]
+    job = RenderJob("fake:street", [recipe], tmp_path, camera_path=path)
+    assert run(job).written == 2
+    assert [row["box_water_path"] is None for row in rows_of(tmp_path)] == [False, True]
+    water = box_tables()["box_water"].read(tmp_path / LABELS / "water.parquet")
+    assert list(water) == [(1, "front")]
+    assert run(job, must_not_render).skipped == 2
+
+
+@pytest.mark.parametrize(
+    ("uri", "output"), [("fake:street?unlabelled=1", {}), ("fake:street", {"labels": False})]
+)
+def test_without_labels_there_are_only_the_masks(tmp_path: Path, uri: str, output: dict) -> None:
+    job = RenderJob(uri, [make_recipe(snow=SNOW, flood=FLOOD, **output)], tmp_path)
+    assert run(job).failed == 0
+    rows = rows_of(tmp_path)
+    assert all(row["snow_path"] and row["water_path"] for row in rows)
+    assert {row[f"{kind}_path"] for row in rows for kind in box_tables()} == {None}
+    assert not (tmp_path / LABELS).exists()
+    assert run(job, must_not_render).skipped == 8
+
+
+def test_a_view_that_breaks_its_contract_is_recorded(tmp_path, recipe, unchecked) -> None:
+    def without(name: str):
+        return lambda images: {key: image for key, image in images.items() if key != name}
+
+    small, ones = np.zeros((8, 12), np.uint8), np.ones((16, 24), np.uint8)
+    foggy, flooded = make_recipe(instance=False), make_recipe(instance=False, flood=FLOOD)
+    as_asked = lambda image: image  # noqa: E731
+    for number, (asked, given, field, change, message) in enumerate([
+        (recipe, recipe, "rgb", lambda _: np.zeros((16, 24, 3), np.float32), "rgb must be uint8"),
+        (recipe, recipe, "rgb", lambda rgb: rgb[:8, :12], r"rgb of \[8, 12, 3\].*16 rows"),
+        (recipe, recipe, "depth_m", lambda _: None, "returned no depth_m buffer"),
+        (recipe, recipe, "masks", without("water"), "returned no water buffer"),
+        (recipe, recipe, "masks", lambda m: m | {"water": small}, r"water of \[8, 12\].*16 rows"),
+        (recipe, recipe, "masks", lambda m: m | {"water": ones}, r"hold 0 and 255 only; got \[1\]"),
+        (recipe, recipe, "masks", lambda m: m | {"water": ones > 1}, "mask must be uint8"),
+        (recipe, recipe, "masks", lambda m: m | {"rain": ones}, "a rain buffer, which the recipe"),
+        (recipe, recipe, "effects", without("flood"), "labels of smog, snow are .* flood, smog"),
+        (foggy, flooded, "rgb", as_asked, "labels of flood, smog are measured from, .* with smog"),
+        (foggy, make_recipe(), "rgb", as_asked, "a instance buffer, which the recipe does not ask"),
+    ]):  # fmt: skip
+
+        def render(scene, camera, _, *, backend, given=given, field=field, change=change):
+            view = fake_render(scene, camera, given, backend=backend)
+            return dataclasses.replace(view, **{field: change(getattr(view, field))})
+
+        out = tmp_path / str(number)
+        result = run(RenderJob("fake:s", [asked], out, frames=[1], cameras=["front"]), render)
+        assert result.failed == 1 and re.search(message, result.failures[0]), result.failures
+        for kind in ("water", "snow") if asked is recipe else ():
+            table = box_tables()[f"box_{kind}"]
+            assert not table.read(out / "s/fog-000/labels" / f"{kind}.parquet")
+
+
+def test_what_is_lost_or_damaged_is_made_again(whole: Path, recipe, copied: Path, caplog) -> None:
+    for lost, rendered in (
+        (["snow/front/000001.png", "water/front/000002.png"], 2),
+        (["labels/snow.parquet", "labels/water.parquet", "labels/smog.parquet"], 8),
+        (["labels/boxes.parquet"], 0),  # which the scene still has
+    ):
+        for name in lost:
+            (copied / FOLDER / name).unlink()
+        assert run(RenderJob("fake:street", [recipe], copied)).written == rendered
+        assert tree_digest(copied) == tree_digest(whole)
+    table = copied / LABELS / "water.parquet"
+    table.write_bytes(table.read_bytes()[:100])
+    assert run(RenderJob("fake:street", [recipe], copied)).written == 8
+    assert "water.parquet is missing or not a readable" in caplog.text
+    assert tree_digest(copied) == tree_digest(whole)
+
+
+def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
+    run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
+    assert len(box_tables()["box_snow"].read(tmp_path / LABELS / "snow.parquet")) == 2
+    run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
+    assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
+    assert tree_digest(tmp_path) == tree_digest(whole)
+
+
+def test_a_progress_log_carries_the_numbers(whole: Path, recipe, tmp_path: Path) -> None:
+    """As a kill leaves a folder: a log, and neither tables nor manifest."""
+
+    def stops(scene, camera, recipe, *, backend):
+        if camera.name == "front" and camera.timestamp_ns == make_frame(2).timestamp_ns:
+            raise SystemExit("stopped without a chance to tidy up")
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    with pytest.raises(SystemExit):
+        run(RenderJob("fake:street", [recipe], tmp_path), stops)
+    assert not (tmp_path / "manifest.parquet").exists() and not (tmp_path / LABELS).exists()
+    result = run(RenderJob("fake:street", [recipe], tmp_path))
+    assert (result.skipped, result.written) == (4, 4)
+    assert tree_digest(tmp_path) == tree_digest(whole)
+
+
+def test_an_image_that_fails_later_loses_its_rows(whole: Path, recipe, copied: Path) -> None:
+    (copied / FOLDER / "images" / "front" / "000003.png").unlink()
+
+    def fails(scene, camera, recipe, *, backend):
+        raise RuntimeError("no such luck")
+
+    assert run(RenderJob("fake:street", [recipe], copied), fails).failed == 1
+    assert (3, "front") not in box_tables()["box_water"].read(copied / LABELS / "water.parquet")
+    assert run(RenderJob("fake:street", [recipe], copied)).written == 1
+    assert tree_digest(copied) == tree_digest(whole)
+
+
+def test_outputs_of_the_first_version_are_gone_on_with(tmp_path: Path) -> None:
+    """Without the columns that came later: no style; no weather, so surfaces are alike."""
+    whole, old = tmp_path / "whole", tmp_path / "old"
+    run(RenderJob("fake:street", [CLEAR], whole))
+    run(RenderJob("fake:street", [CLEAR], old, frames=[0, 1]))
+    table = pq.read_table(old / "manifest.parquet")
+    young = [n for n in table.column_names if n.startswith(("flood_", "snow_", "style_"))]
+    pq.write_table(table.drop_columns([*{*young, *later_columns()}]), old / "manifest.parquet")
+    assert read_manifest(old)["surface"].to_pylist() == ["solid"] * 4
+    sample = WeatherDataset(old)[0]
+    assert sample["surface"] == "solid" and sample["water"] is sample["snow"] is None
+    assert sample["boxes"]["submerged_fraction"] is sample["boxes"]["transmittance"] is None
+    assert run(RenderJob("fake:street", [CLEAR], old)).skipped == 4
+    assert without_2d(old) == without_2d(whole)
+    measured = [row["box_2d_path"] is not None for row in rows_of(old)]
+    assert measured == [False] * 4 + [True] * 4  # only rendering tells
+
+
+def without_2d(out: Path) -> tuple[dict[str, str], list[str]]:
+    """Files and rows, without what only rendering tells."""
+    files = tree_digest(out / "street")
+    assert files.pop("clear-000/labels/boxes_2d.parquet")
+    unknown = dict.fromkeys(("box_2d_path", "lidar", "lidar_note"))
+    return files, [repr({**row, **unknown}) for row in rows_of(out)]
+
+
+@pytest.fixture
+def older(copied: Path) -> Path:
+    """The folder as a version without the table of smog left it."""
+    (copied / LABELS / "smog.parquet").unlink()
+    table = pq.read_table(copied / "manifest.parquet")
+    pq.write_table(table.drop_columns(["box_smog_path"]), copied / "manifest.parquet")
+    return copied
+
+
+def test_a_finished_folder_of_before_stays_as_it_is(whole, recipe, older: Path) -> None:
+    """Rendering all of it again would be the only way to the numbers: nobody asked for that."""
+    before = tree_digest(older)
+    result = run(RenderJob("fake:street", [recipe], older), must_not_render)
+    assert (result.written, result.skipped) == (0, 8)
+    assert tree_digest(older) == before
+    sample = WeatherDataset(older)[5]
+    assert sample["paths"]["box_smog"] is None and sample["boxes"]["transmittance"] is None
+    for lost in ("labels/boxes.parquet", "calibration.json"):  # comes back without rendering
+        (older / FOLDER / lost).unlink()
+        assert run(RenderJob("fake:street", [recipe], older), must_not_render).skipped == 8
+        assert (older / FOLDER / lost).read_bytes() == (whole / FOLDER / lost).read_bytes()
+    assert not (older / LABELS / "smog.parquet").exists()
+
+
+def test_new_images_of_an_older_folder_have_their_numbers(whole, recipe, older: Path) -> None:
+    """The others keep none, and the next run has nothing to do."""
+    for frame in (0, 2):
+        (older / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
+    job, path = RenderJob("fake:street", [recipe], older), LABELS / "smog.parquet"
+    assert run(job).written == 2
+    table, expected = (box_tables()["box_smog"].read(out / path) for out in (older, whole))
+    assert set(table) == {(0, "front"), (2, "front")}
+    item = 2, "front"
+    np.testing.assert_array_equal(table[item]["transmittance"], expected[item]["transmittance"])
+    has = {(r["frame"], r["camera"]) for r in rows_of(older) if r["box_smog_path"]}
+    assert has == set(table)
+    assert len([s for s in WeatherDataset(older) if s["boxes"]["transmittance"] is not None]) == 2
+    assert run(job, must_not_render).skipped == 8
+
+
+def test_samples_hold_them_read_or_rendered(whole: Path, recipe: Recipe) -> None:
+    files = WeatherDataset(whole, cameras=["front"], frames=[2])
+    (row,) = files.table.to_pylist()
+    sample, view = files[0], camera_and_view(row, recipe)[1]
+    live = SceneDataset(open_fake("fake:street"), recipe, renderer=fake_render)[4]
+    assert (live["frame"], live["camera"]["name"]) == (2, "front")
+    np.testing.assert_array_equal(sample["snow"].numpy(), view.masks["snow"] > 0)
+    np.testing.assert_array_equal(live["snow"], sample["snow"])
+    for kind, name in (("snow", "snow_fraction"), ("smog", "transmittance")):
+        table = box_tables()[f"box_{kind}"].read(whole / LABELS / f"{kind}.parquet")
+        numbers = table[2, "front"][name]
+        np.testing.assert_array_equal(sample["boxes"][name], numbers)
+        np.testing.assert_array_equal(live["boxes"][name], numbers)
+    assert sample["paths"]["snow"].endswith("snow/front/000002.png")
+    assert sample["weather"]["snow_depth_m"] == 0.0
+    assert collate_frames([sample, live])["snow"].shape == (2, 16, 24)
+
+
+def test_all_comes_through_smog_without_density(tmp_path: Path) -> None:
+    thin = make_recipe().model_copy(update={"weather": Weather(smog=Smog(extinction_per_m=0))})
+    run(RenderJob("fake:street", [thin], tmp_path, frames=[1]))
+    rows = pq.read_table(tmp_path / LABELS / "smog.parquet").to_pylist()
+    assert {(row["transmittance"], row["pixels"]) for row in rows} == {(1.0, None)}
+
+
+def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
+    names = ("a", "b", "c", "d")
+    smog = box_tables()["box_smog"].from_json([names, [0.5, 0.25, 1.0, np.nan], [9, 0, 9, -1]])
+    water = box_tables()["box_water"].from_json([names, [0.0] * 4, [10, 0, 4, 0], [5, 0, 4, 0]])
+    snow = box_tables()["box_snow"].from_json([names, [-1, -1, 8, -1], [0, 0, 2, 0]])
+    everything = {"box_smog": smog, "box_water": water, "box_snow": snow}
+    assert everything.keys() == box_tables().keys() - {"box_2d"}  # which is not of the weather
+    for effects, expected in (
+        ({}, [1, 1, 1, 1]),
+        ({"box_smog": smog}, [0.5, 0.25, 1, 1]),
+        ({"box_water": water}, [0.5, 1, 0, 1]),
+        ({"box_snow": snow}, [1, 1, 0.75, 1]),
+        (everything, [0.25, 0.25, 0, 1]),
+    ):
+        np.testing.assert_array_equal(visibility(effects, 4), expected)
+    assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64
+    tables = {f"box_{k}": box_tables()[f"box_{k}"].read(whole / LABELS / f"{k}.parquet")
+              for k in ("smog", "water", "snow")}  # fmt: skip
+    for item, numbers in tables["box_smog"].items():
+        left = visibility({k: table[item] for k, table in tables.items()}, len(numbers.track_ids))
+        assert ((left >= 0) & (left <= 1) & (left <= numbers["transmittance"])).all()
+
+
+FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
+
+
+# ---- Where snow can lie: found once a job, used again by later jobs ------------------------------
+
+
+class Placements(list):
+    """Stands in for finding a bed: lists (settings, cameras) of every call.
+
+    before: what to do at each call.
+    """
+
+    before: Callable[[], None] = staticmethod(lambda: None)
+
+    def __call__(self, scene, cameras, settings, *, backend="auto", progress=False):
+        self.before()
+        self.append((settings, list(cameras)))
+        return make_bed(len(self[-1][1]) + settings.cell_m)
+
+
+@pytest.fixture
+def placements(monkeypatch: pytest.MonkeyPatch) -> Placements:
+    found = Placements()
+    monkeypatch.setattr(beds, "place_snow_support", found)
+    return found
+
+
+def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
+    return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
+
+
+def files_of(out: Path) -> list[Path]:
+    return [path for pattern in FILES for path in out.rglob(pattern)]
+
+
+def test_a_bed_is_found_for_all_cameras_before_any_file(placements, tmp_path: Path) -> None:
+    placements.before = lambda: placements.append(files_of(tmp_path))
+    job = RenderJob("fake:street", [snowy()], tmp_path, frames=[1], cameras=["front"])
+    result = run(job)
+    assert result.written == 1 and result.timings["prepare"] > 0
+    before, (settings, cameras) = placements
+    assert before == []
+    assert settings == PlacementSettings(cell_m=0.05, max_slope_deg=50.0)
+    expected = [camera for k in range(4) for camera in make_frame(k).cameras.values()]
+    assert [(c.name, c.timestamp_ns) for c in cameras] == [
+        (c.name, c.timestamp_ns) for c in expected
+    ]
+    # The other images need no second search.
+    assert run(dataclasses.replace(job, frames=None, cameras=None)).written == 7
+    assert len(placements) == 2
+
+
+def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> None:
+    run(RenderJob("fake:street", [snowy(0.1)], tmp_path))
+    placements.before = pytest.fail
+    result = run(RenderJob("fake:street", [snowy(0.3, 1)], tmp_path), bed_render)
+    assert (result.written, result.failures) == (8, ())
+
+
+def test_where_there_can_be_no_snow_nothing_is_written_or_replaced(
+    placements, tmp_path: Path
+) -> None:
+    def fails() -> None:
+        raise SceneError("scene 'street' does not know its metres")
+
+    run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
+    before = tree_digest(tmp_path)
+    placements.before = fails
+    for overwrite, variant in ((False, 1), (True, 0)):
+        job = RenderJob("fake:street", [snowy(0.1, variant)], tmp_path, overwrite=overwrite)
+        with pytest.raises(SceneError, match="does not know its metres"):
+            run(job)
+        assert tree_digest(tmp_path) == before
+
+
+def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
+    """And the caller's scene goes on with its own cameras' bed."""
+    scene = open_fake("fake:street")
+    recorded = make_frame(1)
+    cameras = {"front": make_camera("front", recorded.timestamp_ns, 0.5)}
+    path = [Frame(1, recorded.timestamp_ns, recorded.world_from_ego, cameras)]
+    settings, found = PlacementSettings(), []
+
+    def render(scene, camera, recipe, *, backend):
+        found.append(beds.support_of(scene, settings))
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    load = {"scene_loader": lambda _uri: scene}
+    run(RenderJob("fake:street", [snowy()], tmp_path / "path", camera_path=path), render, **load)
+    run(RenderJob("fake:street", [snowy()], tmp_path / "own", frames=[0]), render, **load)
+    assert [len(cameras) for _, cameras in placements] == [1, 8]
+    assert [bed.ground.centers_m[0, 0].item() for bed in found] == pytest.approx([1.05, 8.05, 8.05])
+    # A path's job after it neither takes the scene's bed nor leaves its own.
+    run(RenderJob("fake:street", [snowy()], tmp_path / "path2", camera_path=path), render, **load)
+    assert found[-1].ground.centers_m[0, 0].item() == pytest.approx(1.05)
+    assert beds.support_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
+
+
+def test_live_samples_share_one_search(placements) -> None:
+    scene = open_fake("fake:street")
+    live = SceneDataset(scene, snowy(), renderer=bed_render, frames=[0])
+    assert len(placements) == 1 and len(placements[0][1]) == 8
+    images = [live[k]["image"] for k in range(2)]
+    assert len(placements) == 1
+    state = {name: value for name, value in vars(live).items() if name != "scene"}
+    again = SceneDataset.__new__(SceneDataset)
+    again.__setstate__({**state, "scene": open_fake("fake:street")})  # as a worker receives it
+    placements.before = pytest.fail
+    assert all(torch.equal(again[k]["image"], images[k]) for k in range(2))
+
+
+@pytest.mark.long
+def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
+    """Real beds and real pictures: whole, by two workers, and in parts that search anew."""
+    recipe, uri = snowy(0.15, cell_m=0.2), "fake:street?frames=2"
+    whole, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
+    result = run(RenderJob(uri, [recipe], whole), None)
+    assert (result.written, result.failures) == (4, ())
+    assert run(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
+    run(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
+    for bed in (parts / ".climategs").glob("snow-*"):
+        bed.unlink()
+    assert run(RenderJob(uri, [recipe], parts), None).skipped == 1
+    for out in (shared, parts):
+        assert tree_digest(out / "street") == tree_digest(whole / "street")
+        assert (out / "manifest.parquet").read_bytes() == (whole / "manifest.parquet").read_bytes()
+    masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in whole.rglob("snow/*/*.png")]
+    assert len(masks) == 4 and max(mask.mean() for mask in masks) > 0
+
+
+# ---- Maps of styles: found once a job, and what renders its images again -------------------------
+
+
+class Searches(list):
+    """Stands in for working out maps: lists (style, cameras) of every call.
+
+    before: what to do at each call. The maps say how strong the style is and how many cameras.
+    """
+
+    before: Callable[[], None] = staticmethod(lambda: None)
+
+    def __call__(self, scene, style, cameras):
+        self.before()
+        self.append((style, cameras))
+        return make_maps(style.strength + (0 if cameras is None else 0.01 * len(cameras)))
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> Searches:
+    found = Searches()
+    monkeypatch.setattr(scene_maps, "_find_maps", found)
+    return found
+
+
+def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
+    source = {} if "image" in style else {"preset": "dusk"}
+    return make_recipe(variant=variant, style=Style(strength=strength, **source, **style))
+
+
+def run_styled(job: RenderJob, renderer=style_render) -> JobResult:
+    return run(job, renderer)
+
+
+def reds(out: Path) -> dict[str, set[int]]:
+    """The second pixel's red in the images of every variant."""
+
+    def red(path: Path) -> int:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        assert image is not None
+        return int(image[0, 1, 2])
+
+    folders = (out / "street").glob("*-*")
+    return {folder.name: set(map(red, folder.glob("images/*/*.png"))) for folder in folders}
+
+
+def image_at(path: Path, colour: int = 90) -> str:
+    """Writes a small picture: a sky over a ground."""
+    rng = np.random.default_rng(colour)
+    pixels = rng.integers(0, 60, (24, 32, 3), dtype=np.uint8) + np.uint8(colour)
+    pixels[:8] += 60
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), pixels)
+    return str(path)
+
+
+def test_maps_are_found_once_for_all_images_before_any_file(searches, tmp_path: Path) -> None:
+    searches.before = lambda: searches.append([p for p in tmp_path.rglob("*") if p.suffix])
+    recipes = [styled(0.5), styled(0.5, 1), styled(0.25, 2), make_recipe("clear")]
+    job = RenderJob("fake:street", recipes, tmp_path, frames=[1], cameras=["front"])
+    result = run_styled(job)
+    assert result.written == 4 and result.timings["prepare"] > 0
+    before, (first, cameras), _, (second, _) = searches
+    assert before == [] and (first, second) == (recipes[0].style, recipes[2].style)
+    assert cameras is None, "a selection does not count"
+    found = reds(tmp_path)
+    del found["clear-000"]
+    assert found == {"fog-000": {50}, "fog-001": {50}, "fog-002": {25}}
+    assert run_styled(dataclasses.replace(job, frames=None, cameras=None)).written == 28
+    assert reds(tmp_path)["fog-001"] == {50}
+
+
+def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Path) -> None:
+    def fails() -> None:
+        raise StyleError("sunset.jpg is cut short")
+
+    run_styled(RenderJob("fake:street", [make_recipe()], tmp_path / "out", frames=[0]))
+    before = tree_digest(tmp_path / "out")
+    searches.before = fails
+    image = image_at(tmp_path / "sunset.png")
+    changed = with_digest(styled(image=image))
+    image_at(tmp_path / "sunset.png", 91)
+    for overwrite in (False, True):
+        variant = 0 if overwrite else 1
+        bad = {
+            "is cut short": styled(1, variant),
+            "no such file": styled(1, variant, image=str(tmp_path / "dawn.png")),
+            "has changed since": changed.model_copy(update={"variant": variant}),
+        }
+        for message, recipe in bad.items():
+            job = RenderJob("fake:street", [recipe], tmp_path / "out", overwrite=overwrite)
+            with pytest.raises((StyleError, RecipeError), match=message):
+                run_styled(job)
+            assert tree_digest(tmp_path / "out") == before
+
+
+def test_the_manifest_says_the_style(searches, tmp_path: Path) -> None:
+    image = image_at(tmp_path / "sunset.png")
+    recipes = [make_recipe(), styled(0.5, 1), styled(2, 2, image=image, method="reinhard")]
+    run_styled(RenderJob("fake:street", recipes, tmp_path / "out", frames=[0], cameras=["front"]))
+    table = read_manifest(tmp_path / "out")
+    names = ("style", "style_method", "style_strength")
+    assert [tuple(row[name] for name in names) for row in table.to_pylist()] == [
+        (None, None, 0.0),
+        ("dusk", "mkl", 0.5),
+        ("sunset.png", "reinhard", 2.0),
+    ]
+    at = table.column_names.index("style")
+    assert table.column_names[at : at + 2] == ["style", "style_method"]
+
+
+def test_the_recipe_in_the_folder_renders_it_again(searches, tmp_path: Path) -> None:
+    """Wherever the folder is taken, without the files that it was made from."""
+    (tmp_path / "looks").mkdir()
+    image_at(tmp_path / "looks" / "my sunset.png")
+    image_at(tmp_path / "looks" / "masks" / "my sunset.png", 30)
+    (tmp_path / "looks" / "fog.yaml").write_text(
+        "weather: {smog: {visibility_m: 50}}\n"
+        "style: {image: my sunset.png, mask: masks/my sunset.png, strength: {uniform: [0, 1]}}\n"
+    )
+    recipe = load_recipe(tmp_path / "looks" / "fog.yaml").resolve(2)
+    run_styled(RenderJob("fake:street", [recipe], tmp_path / "out"))
+    (tmp_path / "out").rename(tmp_path / "taken")
+    images = [p for p in (tmp_path / "looks").rglob("*.png")]
+    contents = {p.read_bytes() for p in images}
+    for path in images:
+        path.unlink()
+    folder = tmp_path / "taken" / "street" / "fog-002"
+    kept = sorted((folder / "style").iterdir())
+    assert len(kept) == 2 and {p.read_bytes() for p in kept} == contents
+    again = load_recipe(folder / "recipe.yaml").resolve(0)
+    assert again.hash == recipe.hash and again.style is not None
+    assert Path(again.style.image or "").parent == folder / "style"
+    run_styled(RenderJob("fake:street", [again], tmp_path / "again"))
+    assert tree_digest(tmp_path / "again" / "street" / "fog-002" / "images") == tree_digest(
+        folder / "images"
+    )
+    # And the names are safe now: they stay.
+    assert (tmp_path / "again" / "street" / "fog-002" / "recipe.yaml").read_bytes() == (
+        folder / "recipe.yaml"
+    ).read_bytes()
+    # The job goes on in its own folder, and does not overwrite what it needs.
+    (folder / "images" / "front" / "000001.png").unlink()
+    assert run_styled(RenderJob("fake:street", [again], tmp_path / "taken")).written == 1
+    before = tree_digest(tmp_path / "taken")
+    with pytest.raises(OutputError, match="copy the recipe and its files out of it first"):
+        run_styled(RenderJob("fake:street", [again], tmp_path / "taken", overwrite=True))
+    assert tree_digest(tmp_path / "taken") == before
+
+
+def test_files_keep_their_names_but_for_collisions() -> None:
+    for files, names in (
+        ({"image": "/a/x.png"}, ["x.png"]),
+        ({"image": "x.png", "mask": "/b/x.png"}, ["x.png", "mask-x.png"]),
+        ({"image": "mask-X.png", "mask": "b/mask-x.png"}, ["mask-X.png", "mask-mask-x.png"]),
+        (
+            {"image": "x", "mask": "b/x", "checkpoint": "c/mask-x", "method": "gscm"},
+            ["x", "mask-x", "checkpoint-mask-x"],
+        ),
+    ):
+        assert list(stored_names(Recipe(style=Style(**files))).values()) == [
+            f"style/{name}" for name in names
+        ]
+
+
+def test_unsafe_names_become_safe_ones_and_then_stay() -> None:
+    def stored(image: str) -> str:
+        return stored_names(Recipe(style=Style(image=image)))["style.image"]
+
+    for name in ("été 3.JPG", "..png", "-x.png", "a.b c", "a" * 200, "b" * 200 + ".png"):
+        first = stored(f"/photos/{name}")
+        assert first != f"style/{name}" and first.isascii() and " " not in first
+        assert first.endswith((".JPG", ".png")) == name.endswith((".JPG", ".png"))
+        assert len(first) < 140
+        assert stored(f"/out/{first}") == first
+        assert stored(f"/photos/x{name}") != first
+
+
+def test_a_picture_under_another_name_is_the_same_style(searches, tmp_path: Path) -> None:
+    """And the rows that were there say the new name, as all others do."""
+    out = tmp_path / "out"
+    first = styled(image=image_at(tmp_path / "a" / "sunset.png"))
+    run_styled(RenderJob("fake:street", [first], out, frames=[0]))
+    second = styled(image=image_at(tmp_path / "b" / "evening.png"))
+    result = run_styled(RenderJob("fake:street", [second], out))
+    assert (result.written, result.skipped) == (6, 2)
+    assert set(read_manifest(out)["style"].to_pylist()) == {"evening.png"}
+    other = styled(image=image_at(tmp_path / "c" / "evening.png", 50))
+    with pytest.raises(OutputError, match="recipe hash there"):
+        run_styled(RenderJob("fake:street", [other], out), must_not_render)
+
+
+def test_the_librarys_own_style_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
+    """Real maps and real pictures, whole and in parts that search anew."""
+    image, uri = image_at(tmp_path / "sunset.png", 150), "fake:street?frames=2"
+    recipes = [styled(1, 0, image=image), styled(1, 1, image=image, applied_to="picture")]
+    whole, parts, plain = (tmp_path / name for name in ("whole", "parts", "plain"))
+    result = run_styled(RenderJob(uri, recipes, whole), None)
+    assert (result.written, result.failures) == (8, ())
+    run_styled(RenderJob(uri, recipes, parts, frames=[1], cameras=["front"]), None)
+    assert run_styled(RenderJob(uri, recipes, parts), None).skipped == 2
+    assert tree_digest(parts) == tree_digest(whole)
+    run_styled(RenderJob(uri, [make_recipe()], plain), None)
+    unstyled = tree_digest(plain / "street" / "fog-000" / "images")
+    for variant in ("fog-000", "fog-001"):
+        pictures = tree_digest(whole / "street" / variant / "images")
+        assert not set(pictures.values()) & set(unstyled.values())
