@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+from numba import prange
+
+from augment.render.cpu.jit import inner, kernel, serial_kernel
 
 BLOCK = 2048  # splats a thread takes at a time
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def colors_at(sh, coefficients, weights, turn, out):
     """out [N, K, 3]: sh with sum_t weights[t] coefficients[:, t] added to its first row, and bands
     turned by the blocks of turn [K, K]; an empty turn leaves them.
@@ -17,7 +19,7 @@ def colors_at(sh, coefficients, weights, turn, out):
     """
     count, rows, _ = sh.shape
     zero = np.float32(0)
-    for block in numba.prange((count + BLOCK - 1) // BLOCK):
+    for block in prange((count + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             for c in range(3):
                 value = sh[i, 0, c]
@@ -44,7 +46,7 @@ def colors_at(sh, coefficients, weights, turn, out):
 
 
 # Of one thread: it runs beside the renderer, on those that write files.
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@serial_kernel
 def count_occlusion(
     depth, instance, actors, windows, across, down, axes, eyes, owned, labelled, near_m, found
 ):
@@ -114,7 +116,7 @@ def count_occlusion(
             found[box, 2:] = 0
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@inner()
 def _add(found, row, column):
     found[0] += 1
     found[2], found[3] = min(found[2], column), min(found[3], row)

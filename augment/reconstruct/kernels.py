@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba import prange
 
@@ -24,7 +23,7 @@ from augment.render.cpu.backward_kernels import (
     GRAD,
 )
 from augment.render.cpu.geometry import from_eye
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
 from augment.render.layout import BLOCK, LANES, U
@@ -38,7 +37,7 @@ BAND = 8  # image rows at a time; part p sums bands p, p + PARTS, ... so that al
 UNSEEN = -1  # texel of a pixel whose sky was not looked up
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fractions):
     """The sky's colour at every pixel through which at least `least` of it is seen, else black.
 
@@ -52,7 +51,7 @@ def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fracti
     last = np.float32(size - 1)
     scale = np.float32(size) * half
     ifx, ify, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    for band in numba.prange((height + BAND - 1) // BAND):
+    for band in prange((height + BAND - 1) // BAND):
         for i in range(band * BAND, min((band + 1) * BAND, height)):
             v = (np.float32(i) + half - cy) * ify
             bx = rotation[0, 1] * v + rotation[0, 2]
@@ -96,7 +95,7 @@ def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fracti
                     colors[c, i, j] = top * (one - fr) + bottom * fr
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
     """Add the gradient of every texel seen to the parts' sums.
 
@@ -106,7 +105,7 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
     height, width = alpha.shape
     one, zero = np.float32(1), np.float32(0)
     bands = (height + BAND - 1) // BAND
-    for part in numba.prange(PARTS):
+    for part in prange(PARTS):
         for band in range(part, bands, PARTS):
             for i in range(band * BAND, min((band + 1) * BAND, height)):
                 for j in range(width):
@@ -132,7 +131,7 @@ def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
                         parts[part, at, 2] += weight * blue
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@serial_kernel
 def gather_sky(parts, touched, words, texels, grads):
     """Sum the parts, in order, into a list of the touched texels; clear what was touched.
 
@@ -171,7 +170,7 @@ def gather_sky(parts, touched, words, texels, grads):
 CHUNK = 4096  # priors summed at a time
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_expected, sums):
     """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
 
@@ -181,7 +180,7 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, min_alpha, d_e
     does not increase.
     """
     one, zero = np.float32(1), np.float32(0)
-    for chunk in numba.prange(sums.size):
+    for chunk in prange(sums.size):
         total = 0.0
         before = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
         for k in range(chunk * CHUNK, min((chunk + 1) * CHUNK, pixels.size)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import prange
@@ -20,11 +19,11 @@ from augment.render.sh import BLACK, FOLDED
 RUN = 4096  # pixels of a piece of work
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def renormalise_alpha(alpha, rgb, overlay, least):
     """alpha, overlay: float32 [P]. rgb: [3 P]. rgb, overlay: may be empty. least: of finished."""
     one = np.float32(1)
-    for run in numba.prange((alpha.size + RUN - 1) // RUN):
+    for run in prange((alpha.size + RUN - 1) // RUN):
         for pixel in range(run * RUN, min((run + 1) * RUN, alpha.size)):
             if alpha[pixel] >= least:
                 scale = one / alpha[pixel]
@@ -37,7 +36,7 @@ def renormalise_alpha(alpha, rgb, overlay, least):
                     overlay[pixel] *= scale
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
     """out = rgb + (1 - alpha) sky of a cube map, through fog where strength >= 0.
 
@@ -48,7 +47,7 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
     half, one = np.float32(0.5), np.float32(1)
     scale = np.float32(faces.shape[1] - 2) * half
     middle = scale + half  # of a face, from the centre of the first texel of its border
-    for i in numba.prange(height):
+    for i in prange(height):
         v = (np.float32(i) + half - cy) * ify
         bx = rotation[0, 1] * v + rotation[0, 2]
         by = rotation[1, 1] * v + rotation[1, 2]
@@ -91,23 +90,23 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
                 out[i, j, c] = rgb[i, j, c] + transmittance * color
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def quantise(values, out):
     """uint8 of float32 rows: clamped to [0, 1], times 255, rounded to the nearest."""
     half, top = np.float32(0.5), np.float32(255)
-    for i in numba.prange(values.shape[0]):
+    for i in prange(values.shape[0]):
         for j in range(values.shape[1]):
             value = values[i, j] * top + half
             out[i, j] = np.uint8(min(max(value, np.float32(0)), top))
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def map_colors(rgb, matrix):
     """Every colour of float32 [H, W, 3] becomes matrix[:, :3] @ colour + matrix[:, 3], in place."""
     m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
-    for i in numba.prange(rgb.shape[0]):
+    for i in prange(rgb.shape[0]):
         for j in range(rgb.shape[1]):
             r, g, b = rgb[i, j, 0], rgb[i, j, 1], rgb[i, j, 2]
             rgb[i, j, 0] = m00 * r + m01 * g + m02 * b + m03

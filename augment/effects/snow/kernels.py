@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numba import prange
 
 from augment.effects.snow.cells import OPEN_EDGE
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.render.sh import SH_C0
 
 # ---- Noise ---------------------------------------------------------------------------------------
@@ -589,7 +588,7 @@ _NEAR_BEAM_M = 0.3  # from the sensor, where nothing is looked for
 _STEP_M = 1e-7
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@serial_kernel
 def meet_layer(
     origins, directions, hits, part_from_world, circle, corner, cell, base, top, highest, slack
 ):
@@ -661,7 +660,7 @@ def meet_layer(
                 t = after
 
 
-@numba.njit(nogil=True, inline="always", error_model="numpy")
+@inner()
 def _passes(origin, direction, end, circle):
     """Whether a beam comes, seen from above, within a circle."""
     if circle[2] == np.inf:
@@ -675,7 +674,7 @@ def _passes(origin, direction, end, circle):
     return x * x + y * y <= circle[2] * circle[2]
 
 
-@numba.njit(nogil=True, inline="always", error_model="numpy")
+@inner()
 def _within(o, d, size, first, last):
     """The part of a beam from first to last that lies between 0 and size along an axis."""
     if d == 0.0:
@@ -684,7 +683,7 @@ def _within(o, d, size, first, last):
     return max(first, min(a, b)), min(last, max(a, b))
 
 
-@numba.njit(nogil=True, inline="always", error_model="numpy")
+@inner()
 def _exit(o, over_d, low, size):
     """Where a beam leaves the stretch from low to low + size along an axis."""
     if over_d == np.inf:
@@ -692,7 +691,7 @@ def _exit(o, over_d, low, size):
     return ((low + size if over_d > 0.0 else low) - o) * over_d
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@serial_kernel
 def fill_layer(centers, sizes, depths, corner, cell, base, top):
     """Enter snow of some depth on square cells [C] into a grid: the highest where several meet.
 

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numba import prange
+
+from augment.render.cpu.jit import inner, kernel, serial_kernel
 
 # ---- Which points of the ground are seen by some camera ------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inner()
 def _project(view, x, y, z):
     """Column, row and depth of a world point; depth 0 where it is behind the camera."""
     x, y, z = x - view[12], y - view[13], z - view[14]
@@ -28,7 +29,7 @@ def _project(view, x, y, z):
     return u * view[9] + view[10], v * view[11] + view[16], depth
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inner()
 def _farthest(depths, size, column, row):
     """The largest depth of three by three pixels."""
     width, height, start = size
@@ -39,7 +40,7 @@ def _farthest(depths, size, column, row):
     return deepest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inner()
 def _is_there(view, depths, size, point, tolerances):
     """1 where the view shows something solid at the point, -1 where it looks through it, else 0."""
     width, height, start = size
@@ -55,7 +56,7 @@ def _is_there(view, depths, size, point, tolerances):
     return -1 if depths[start + row * width + column] > depth else 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inner()
 def _is_seen(view, depths, size, point, normal, lifts, tolerances):
     far_share, far_m, below_share, grazing, margin = tolerances
     width, height, start = size
@@ -82,7 +83,7 @@ def _is_seen(view, depths, size, point, normal, lifts, tolerances):
     return False
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def find_seen(points, normals, is_sure, views, sizes, depths, lifts, tolerances, seen):
     """seen [C] bool: points [C, 3] that some view sees, at one of the lifts over them, and where no
     more views look through the point itself than show something there; is_sure [C]: this is known.
@@ -114,7 +115,7 @@ _ROUNDS = 4
 _LINE = 1e-9  # of the extents' product: cells that spread less across are in a line
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@serial_kernel
 def find_plane(rows, columns, heights, first_m, alike_m, min_cells, used, fits):
     """Slopes per column and row of the plane of most of the cells, NaN where there is none.
 
@@ -155,7 +156,7 @@ def find_plane(rows, columns, heights, first_m, alike_m, min_cells, used, fits):
 # ---- The cells of a plan's tiles that lie under points -------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@serial_kernel
 def find_numbers(xy, origin, side_m, tile_rows, tile_columns, sides, starts, numbers, out):
     """Numbers of the cells under points float64 [P, 2], into out int32 [P]; -1 where there is none.
 
@@ -185,7 +186,7 @@ _DOWN_LEFT, _DOWN_RIGHT, _UP_LEFT, _UP_RIGHT = 16, 32, 64, 128
 _UNKNOWN = 1 << 30  # half cells to an edge that is not known yet
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def median_heights(height, covered, radius, out):
     """Median of the covered heights in squares of 2 radius + 1 cells, into out [H, W] float32."""
     rows, columns = height.shape
@@ -212,7 +213,7 @@ def median_heights(height, covered, radius, out):
                 out[i, j] = np.float32(0.5) * (found[upper - 1] + found[upper])
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_planes(height, covered, radius, cell, slack, steepest, height_slack, fitted, slopes, good):
     """A plane through each covered cell's surroundings: its height there and its slopes.
 
@@ -257,7 +258,7 @@ def fit_planes(height, covered, radius, cell, slack, steepest, height_slack, fit
             good[i, j] = True
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def compare_sides(height, lowest, covered, can_carry, step, sides):
     """sides int8 [H, W, 4]: what follows on each side of the cells that can carry snow.
 
@@ -292,7 +293,7 @@ def compare_sides(height, lowest, covered, can_carry, step, sides):
                     sides[i, j, side] = OPEN if falls else RISES
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def _find_links(can_carry, sides, links, offsets):
     """links uint8 [H, W]: bits of the neighbours beside, below and above that each cell is linked
     to. offsets int32 [H, W, 2]: x and y, in half cells, of its own open edge, or _UNKNOWN.
@@ -320,7 +321,7 @@ def _find_links(can_carry, sides, links, offsets):
                 links[i, j] |= _UP
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner()
 def _leads(links, i, j, across, along):
     """Whether a cell hangs together with a diagonal neighbour, by way of one between them."""
     dx, dy = (-1 if across == _LEFT else 1), (-1 if along == _DOWN else 1)
@@ -329,7 +330,7 @@ def _leads(links, i, j, across, along):
     )
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def _find_ways(links, ways):
     """ways uint8 [H, W]: the links, and the bits of diagonal neighbours that they lead to."""
     rows, columns = links.shape
@@ -348,7 +349,7 @@ def _find_ways(links, ways):
             ways[i, j] = way
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner()
 def _nearer(offsets, k, m, dx, dy, x, y, square):
     """The edge at (x, y), in half cells, or that of the neighbour (k, m), which is (dx, dy) away,
     where that is nearer; with its distance squared.
@@ -362,7 +363,7 @@ def _nearer(offsets, k, m, dx, dy, x, y, square):
     return x, y, square
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner()
 def _take(offsets, ways, i, j, straight, beside, dx, before, after, dy):
     """Let cell (i, j) take the nearest edge of those that its neighbours know: the one straight
     below or above (dy), the one beside it (dx), and the diagonal ones of the same row as the first.
@@ -386,7 +387,7 @@ def _take(offsets, ways, i, j, straight, beside, dx, before, after, dy):
         offsets[i, j, 0], offsets[i, j, 1] = x, y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@inner()
 def _sweep(ways, offsets):
     """Hand offsets on from row to row, up and down again, and along each row both ways."""
     rows, columns = ways.shape
@@ -402,7 +403,7 @@ def _sweep(ways, offsets):
             _take(offsets, ways, i, j, 0, _LEFT, -1, 0, 0, 0)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@kernel
 def _distances(offsets, far, out):
     rows, columns = out.shape
     for row in prange(rows):
@@ -412,7 +413,7 @@ def _distances(offsets, far, out):
             out[i, j] = min(math.sqrt(x * x + y * y), far)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@serial_kernel
 def edge_distances(can_carry, sides, far, out):
     """Distance in cells from the middle of each cell to the nearest open edge of its own surface,
     into out [H, W] float32; at most far.

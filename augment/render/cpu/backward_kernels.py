@@ -24,13 +24,7 @@ from numba import prange
 
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
-from augment.render.cpu.blend import (
-    Work,
-    alpha_of,
-    is_closed,
-    remaining_transmittance,
-    shrink,
-)
+from augment.render.cpu.blend import Work, alpha_of, is_closed, remaining_transmittance, shrink
 from augment.render.cpu.geometry import (
     BATCH,
     ITEMS,
