@@ -27,8 +27,9 @@ from augment.render.part_views import part_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
-from tests.augment.hard_scenes import KINDS, SMOGS, drawing, hard_gaussians, in_float64, wide_camera
+from tests.augment.hard_scenes import KINDS, SMOGS, drawing, hard_gaussians, wide_camera
 from tests.augment.loss_definition import reference_loss
+from tests.scenes import in_float64
 
 pytestmark = pytest.mark.long
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -82,7 +83,7 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
     camera = wide_camera(fov_deg, (16, 9))
     gaussians = hard_gaussians(kind, camera, 30, seed=seed)
     if is_double:
-        gaussians = in_float64([PosedGaussians(gaussians)])[0].gaussians
+        gaussians = in_float64(gaussians)
     settings = RasterSettings(antialiased=antialiased)
     found = gradients(
         gaussians, camera, backend="reference", seed=seed, settings=settings, fog=SMOGS[smog]

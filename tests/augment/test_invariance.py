@@ -33,31 +33,19 @@ from tests.augment.extremes import street
 from tests.augment.hard_scenes import (
     KINDS,
     SMOGS,
-    colour_maps,
     drawing,
     hard_gaussians,
-    in_float64,
-    snow_light,
+    in_weather,
     untied,
     wide_camera,
 )
-from tests.scenes import slight_pose
+from tests.scenes import parts_in_float64, slight_pose
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
 ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, OVERLAY})
 WEATHERS = ("clear", "uniform", "layered", "clip", "light", "maps")
 weathers = st.sampled_from(WEATHERS)
 seeds = st.integers(0, 2**31)
-
-
-def part_of(gaussians: Gaussians, weather: str, seed: int = 0, pose=None) -> PosedGaussians:
-    part = PosedGaussians(gaussians, pose)
-    if weather == "light":
-        light = snow_light(len(gaussians), seed)
-        return dataclasses.replace(part, is_overlay=True, shading=light)
-    if weather == "maps":
-        return dataclasses.replace(part, color_maps=colour_maps(seed))
-    return part
 
 
 def render(parts: list[PosedGaussians], camera: Camera, weather: str) -> RenderOutput:
@@ -86,8 +74,8 @@ def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_d
     camera = wide_camera(fov_deg)
     gaussians = untied(hard_gaussians(kind, camera, count, seed=seed), camera)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(len(gaussians)))
-    first = images(render([part_of(gaussians, weather, seed)], camera, weather))
-    part = part_of(gaussians, weather, seed)
+    first = images(render([in_weather(gaussians, weather, seed)], camera, weather))
+    part = in_weather(gaussians, weather, seed)
     shuffled = dataclasses.replace(part, gaussians=gaussians.select(order))
     if part.shading is not None:
         light = dataclasses.replace(part.shading, slopes=part.shading.slopes[order])
@@ -106,7 +94,7 @@ def test_a_part_split_in_two_has_the_same_bits(kind, weather, seed, is_posed, cu
     """Ids too, for they count through the parts. Blocks of 2048 begin anew with each part."""
     camera, count = wide_camera(60.0), 2600
     gaussians = hard_gaussians(kind, camera, count, seed=seed)
-    whole = part_of(gaussians, weather, seed, slight_pose() if is_posed else None)
+    whole = in_weather(gaussians, weather, seed, slight_pose() if is_posed else None)
     at = [slice(0, min(cut, count)), slice(min(cut, count), count)]
     halves = [dataclasses.replace(whole, gaussians=_sliced(gaussians, s)) for s in at]
     if whole.shading is not None:
@@ -169,7 +157,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
     moved = dataclasses.replace(camera, cx=camera.cx + dx, cy=camera.cy + dy)
     margins = max(-dx, 0), max(-dy, 0), max(dx, 0), max(dy, 0)
     gaussians = _centred(hard_gaussians(kind, camera, 120, seed=seed), camera, *margins)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     first = images(render(parts, camera, weather))
     second = images(render(parts, moved, weather))
     height, width = camera.height, camera.width
@@ -185,7 +173,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
 def test_a_larger_image_holds_the_smaller_one_to_the_bit(kind, weather, seed, wider, higher):
     camera = wide_camera(60.0, (45, 37))
     gaussians = _centred(hard_gaussians(kind, camera, 300, seed=seed), camera)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     larger = dataclasses.replace(camera, width=45 + wider, height=37 + higher)
     whole = images(render(parts, larger, weather))
     for name, image in images(render(parts, camera, weather)).items():
@@ -200,7 +188,7 @@ def test_a_window_shows_its_part_of_the_picture(kind, weather, seed, left, top):
     width, height = 90 - left - 17, 64 - top - 11
     gaussians = hard_gaussians(kind, camera, 200, seed=seed)
     gaussians = _centred(gaussians, camera, left, top, 17, 11)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     window = camera.cropped(left, top, width, height)
     whole = images(render(parts, camera, weather))
     cut = {n: image[top : top + height, left : left + width] for n, image in whole.items()}
@@ -278,15 +266,6 @@ def render_on(parts, camera: Camera, weather: str, backend: str) -> dict[str, to
     return {name: getattr(output, name) for name in buffers}
 
 
-def overlay_of(gaussians, weather: str, seed: int) -> PosedGaussians:
-    part = PosedGaussians(gaussians, is_overlay=bool(seed % 2))
-    if weather == "light":
-        return dataclasses.replace(part, shading=snow_light(len(gaussians), seed))
-    if weather == "maps":
-        return dataclasses.replace(part, color_maps=colour_maps(seed))
-    return part
-
-
 def errors(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> dict:
     """Of every pixel, float64 [H W], by buffer; of ids 1 where they differ."""
     found = {}
@@ -334,10 +313,10 @@ def assert_within(found: dict, bounds: dict[str, float], weather: str) -> None:
 
 
 def compare(gaussians, camera: Camera, weather: str, seed: int) -> dict:
-    part = overlay_of(gaussians, weather, seed)
+    part = in_weather(gaussians, weather, seed)
     return errors(
         render_on([part], camera, weather, "cpu"),
-        render_on(in_float64([part]), camera, weather, "reference"),
+        render_on(parts_in_float64([part]), camera, weather, "reference"),
     )
 
 

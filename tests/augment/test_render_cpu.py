@@ -24,11 +24,14 @@ from augment.render.cpu.driver import rasterize_cpu
 from augment.render.fog import Fog
 from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
-from tests.assertions import assert_images_close, assert_labels_equal
+from tests.assertions import assert_images_close, assert_labels_equal, assert_stored_render
 from tests.scenes import (
+    GOLDEN,
+    GOLDEN_MODES,
     camera_ahead,
     golden_view,
     one_gaussian,
+    parts_in_float64,
     random_gaussians,
     random_pose,
     slight_pose,
@@ -37,10 +40,6 @@ from tests.scenes import (
 
 ALL = frozenset(BUFFERS)
 DEFAULT = RasterSettings()
-GOLDEN_MODES = (
-    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
-    *(f"a99_classic_sh{degree}" for degree in range(4)),
-)
 
 
 def render(parts, camera, buffers=ALL, settings=DEFAULT, smog=None):
@@ -53,20 +52,9 @@ def assert_same_bits(actual, expected, buffers=ALL):
         assert torch.equal(getattr(actual, name), getattr(expected, name)), name
 
 
-def in_float64(parts):
-    """The same numbers in the precision the definition is exact in."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return [
-        dataclasses.replace(
-            part, gaussians=Gaussians(**{n: getattr(part.gaussians, n).double() for n in names})
-        )
-        for part in parts
-    ]
-
-
 def assert_matches_definition(parts, camera, settings=DEFAULT, smog=None, *, max_flips=2):
     actual = render(parts, camera, ALL, settings, smog)
-    expected = rasterize_reference(in_float64(parts), camera, ALL, settings, smog)
+    expected = rasterize_reference(parts_in_float64(parts), camera, ALL, settings, smog)
     # 1e-5: forty float32 blends and an exp2 that is good to 3e-6. Depths are up to 9 m.
     for name in (RGB, ALPHA):
         assert_images_close(
@@ -91,25 +79,10 @@ def assert_matches_definition(parts, camera, settings=DEFAULT, smog=None, *, max
 
 
 @pytest.mark.parametrize("mode", GOLDEN_MODES)
-@pytest.mark.parametrize("name", ["edge", "garden_small", "opaque"])
+@pytest.mark.parametrize("name", GOLDEN)
 def test_stored_renders(shared_dir, name, mode):
-    with_sh = mode[-3:-1] == "sh"
-    parts, camera, arrays = golden_view(shared_dir / "golden" / f"{name}.npz", with_sh=with_sh)
-    settings = RasterSettings(
-        alpha_max=0.999 if mode.startswith("a999") else 0.99,
-        antialiased="_aa" in mode,
-        sh_degree=int(mode[-1]) if with_sh else None,
-    )
-    output = render(parts, camera, {RGB, ALPHA, EXPECTED_DEPTH}, settings)
-    stored = {"rgb": output.rgb} if with_sh else {"rgb": output.rgb, "alpha": output.alpha}
-    for key, image in stored.items():
-        # The required bound is 1e-4; exp2's 3e-6 a splat leaves less than 1e-5. Antialiasing puts
-        # one splat of garden_small on the other side of 1/255, in up to 3 of 17 010 pixels.
-        assert_images_close(image, arrays[f"{mode}_{key}"], p999=1e-5, max_flips=5)
-    if not with_sh:
-        expected = torch.from_numpy(arrays[f"{mode}_ED"]).reshape(output.alpha.shape)
-        relative = output.expected_depth / expected.clamp_min(1e-3)
-        assert_images_close(relative, expected / expected.clamp_min(1e-3), p999=1e-5, max_flips=5)
+    parts, camera, settings, arrays = golden_view(shared_dir, name, mode)
+    assert_stored_render(render(parts, camera, {RGB, ALPHA, EXPECTED_DEPTH}, settings), arrays)
 
 
 # ---- the definition ----------------------------------------------------------------------------

@@ -27,7 +27,9 @@ from augment.sky import ConstantSky, CubemapSky
 from tests.assertions import assert_images_close
 from tests.scenes import (
     camera_ahead,
+    in_float64,
     one_gaussian,
+    parts_in_float64,
     random_gaussians,
     random_pose,
     sh_of,
@@ -42,11 +44,6 @@ BACKENDS = ("cpu", pytest.param("reference", marks=pytest.mark.long))
 def render(parts, camera, clip=None, backend="cpu", buffers=ALL):
     parts = [PosedGaussians(parts)] if isinstance(parts, Gaussians) else parts
     return rasterize(parts, camera, buffers=buffers, clip=clip, backend=backend)
-
-
-def in_float64(gaussians: Gaussians) -> Gaussians:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(**{n: getattr(gaussians, n).double() for n in names})
 
 
 def sheet(points, flat_axis: int, size: float, thickness=0.002) -> Gaussians:
@@ -93,7 +90,7 @@ def test_kernels_cut_as_the_definition_does(seed, z_m, keep):
 @pytest.mark.parametrize("pose", [None, random_pose(3)])
 def test_posed_parts_and_the_mirrored_eye(pose):
     parts = [PosedGaussians(random_gaussians(200, seed=4), pose)]
-    double = [dataclasses.replace(parts[0], gaussians=in_float64(parts[0].gaussians))]
+    double = parts_in_float64(parts)
     camera = mirrored_camera(camera_ahead(), -0.3)  # stands below the plane and looks up at it
     clip = HeightClip(-0.3, "above")
     actual, expected = render(parts, camera, clip), render(double, camera, clip, "reference")
@@ -582,14 +579,13 @@ def test_the_floor_decides_what_is_one_surface(backend):
 
 
 def test_gradients_are_those_of_differences():
-    """Splats far from every cut-off; the floor makes two clusters of them, or one."""
+    """Splats far from every cut-off, of which the floor makes two clusters."""
     scene, camera = smooth_gaussians(4), camera_ahead(7, 5, 9.0)
     inputs = [t.clone().requires_grad_() for t in (scene.means, scene.opacities, scene.scales)]
-    for floor_m in (0.3, 5.0):
-        settings = RasterSettings(mode_depth_floor_m=floor_m)
+    settings = RasterSettings(mode_depth_floor_m=0.3)
 
-        def mode(means, opacities, scales, settings=settings):
-            moved = dataclasses.replace(scene, means=means, opacities=opacities, scales=scales)
-            return render_mode_depth(moved, camera, "reference", settings=settings).mode_depth
+    def mode(means, opacities, scales):
+        moved = dataclasses.replace(scene, means=means, opacities=opacities, scales=scales)
+        return render_mode_depth(moved, camera, "reference", settings=settings).mode_depth
 
-        assert torch.autograd.gradcheck(mode, inputs, eps=1e-6, atol=1e-5)
+    assert torch.autograd.gradcheck(mode, inputs, eps=1e-6, atol=1e-5)

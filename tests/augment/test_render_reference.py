@@ -16,6 +16,8 @@ from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
 from tests.scenes import (
+    GOLDEN,
+    GOLDEN_MODES,
     camera_ahead,
     golden_view,
     one_gaussian,
@@ -333,50 +335,25 @@ def test_smog_with_a_scale_height_uses_world_heights():
     assert float(ratio) == pytest.approx(1 - math.exp(-tau), rel=1e-6)  # midpoint rule
 
 
-GOLDEN = ("edge", "garden_small", "opaque")
-MODES = (
-    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
-    *(f"a99_classic_sh{degree}" for degree in range(4)),
-)
-STORED = {"rgb": RGB, "alpha": ALPHA, "ED": EXPECTED_DEPTH}
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", GOLDEN_MODES)
 @pytest.mark.parametrize("name", GOLDEN)
-def test_stored_renders(shared_dir, name, mode, dtype):
-    with_sh = mode[-3:-1] == "sh"
-    path = shared_dir / "golden" / f"{name}.npz"
-    parts, camera, arrays = golden_view(path, with_sh=with_sh, dtype=dtype)
-    settings = RasterSettings(
-        alpha_max=0.999 if mode.startswith("a999") else 0.99,
-        antialiased="_aa" in mode,
-        sh_degree=int(mode[-1]) if with_sh else None,
-    )
-    output = rasterize_reference(parts, camera, frozenset(STORED.values()), settings, None)
-    # The files hold float32, so float64 agrees to its rounding of depths up to 4 m, and no pixel
-    # flips. In float32 a handful of 17 010 pixels may land on the other side of a threshold.
-    exact = dtype == torch.float64
-    tolerance = {"p999": 5e-7, "flip": 1e-6} if exact else {"p999": 1e-4, "max_flips": 5}
-    compared = 0
-    for key, buffer in STORED.items():
-        if f"{mode}_{key}" in arrays:
-            expected = arrays[f"{mode}_{key}"]
-            assert_images_close(getattr(output, buffer), expected, **tolerance)
-            compared += 1
-    assert compared == (1 if with_sh else 3)
+def test_stored_renders(shared_dir, name, mode):
+    parts, camera, settings, arrays = golden_view(shared_dir, name, mode, torch.float64)
+    images = {"rgb": RGB, "alpha": ALPHA, "ED": EXPECTED_DEPTH}
+    output = rasterize_reference(parts, camera, frozenset(images.values()), settings, None)
+    for key in arrays.keys() & images.keys():
+        # The files hold float32: rounding of depths of up to 4 m, and no pixel flips.
+        assert_images_close(getattr(output, images[key]), arrays[key], p999=5e-7, flip=1e-6)
 
 
 @pytest.mark.parametrize("name", GOLDEN)
 def test_stored_projections(shared_dir, name):
-    path = shared_dir / "golden" / f"{name}.npz"
-    parts, camera, arrays = golden_view(path, with_sh=False, dtype=torch.float64)
+    parts, camera, _, arrays = golden_view(shared_dir, name, "a999_classic", torch.float64)
     splats = project_parts(parts, camera, RasterSettings())
     # The file's arrays are zero where its renderer culled; this one culls by the image later.
     seen = (arrays["radii"] > 0).all(1)
-    shared = torch.from_numpy(seen)[splats.ids]
     assert set(np.flatnonzero(seen)) <= set(splats.ids.tolist())
-    splats = splats.select(shared)
+    splats = splats.select(torch.from_numpy(seen)[splats.ids])
     ids = splats.ids.numpy()
     xx, xy, yy = splats.covs2d.unbind(1)
     conics = torch.stack([yy, -xy, xx], 1) / splats.dets[:, None]
@@ -394,7 +371,10 @@ def render_posed(gaussians, camera, settings=None, smog=None, pose=None):
     return rasterize_reference(parts, camera, frozenset(BUFFERS), settings, smog)
 
 
-@pytest.mark.parametrize("variant", ["classic", "antialiased", "smog"])
+@pytest.mark.parametrize(
+    "variant",
+    ["classic", *(pytest.param(v, marks=pytest.mark.long) for v in ("antialiased", "smog"))],
+)
 def test_gradients_of_every_tensor(variant):
     camera = camera_ahead(4, 3, 7.0)
     gaussians = smooth_gaussians(3, sh_degree=1 if variant == "classic" else 0)
@@ -413,8 +393,7 @@ def test_gradients_of_every_tensor(variant):
     assert torch.autograd.gradcheck(image, tensors, eps=1e-6, atol=1e-6, fast_mode=False)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_stay_finite_at_every_cut_off(dtype):
+def test_gradients_stay_finite_at_every_cut_off(dtype=torch.float32):
     gaussians = random_gaussians(400, seed=8, dtype=dtype)
     opacities = gaussians.opacities.clone()
     opacities[:40] = 1.0
