@@ -28,13 +28,11 @@ from augment.drawing import LayerRenderer
 from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.effects.flood.flood import FloodMedium, exact, schlick
 from augment.effects.flood.flood_view import FloodedImage, render_flooded
-from augment.effects.flood.water_plane import Margins, resized
 from augment.effects.flood.waves import make_waves
 from augment.geometry import rigid
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
-from augment.render.composite import quantise
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.fog import Fog
@@ -360,23 +358,6 @@ def test_extremes_give_finite_pictures(scene, name):
     assert float(got.rgb.min()) > -0.01 and float(got.rgb.max()) < 1.05
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("level_m", [0.4, 5.0])
-def test_infinite_extinction_shows_water_alone(scene, level_m):
-    """No recipe can say it, a medium can: the bed is gone, and 0 times infinity is no NaN."""
-    plan = make_plan(recipe_of(flood(level_m, refraction_index=1.0)), scene)
-    medium = dataclasses.replace(
-        plan.placed["flood"].data, extinction_per_m=(np.inf, np.inf, np.inf)
-    )
-    view = camera()
-    renderer = LayerRenderer(scene.parts_for(view), scene.sky, None, False, plan.settings, "auto")
-    got = render_flooded(renderer, view, medium, plan.buffers)
-    assert got is not None and bool(torch.isfinite(got.rgb).all())
-    rgb = quantise(got.rgb)[got.water.numpy()]
-    share = (np.abs(rgb - 255 * np.array(medium.rgb)).max(-1) < 1.5).mean()
-    assert share > 0.9  # all but the waterline's pixels
-
-
 def test_snells_window(scene):
     """Straight up from below: the sky through a cone of 48.6 degrees, and water outside it."""
     view = camera(101, 101, position=(-6.0, 0.0, ROAD_Z + 0.2), pitch=-np.pi / 2, focal=30.0)
@@ -574,29 +555,6 @@ def test_a_flooded_view_stays_on_the_gpu_and_is_the_cpu_s(monkeypatch, reflectio
         there = flooded("cuda", view, water, smog, deferred=deferred)
         # The screen's march interpolates on the CPU, and traces all pixels on the GPU.
         same_picture(there, here, 0.05 if reflection == "screen_space" else 0.01)
-
-
-@pytest.mark.long
-def test_a_small_flooded_view_from_its_splats_on(monkeypatch):
-    view, water = small_camera(17, 11, roll=0.0), medium("sky", "still")
-    few = parts()[0].gaussians.select(torch.arange(6, 14))
-    here = flooded("cpu", view, water, None, deferred=False, hidden_by=few)
-    with pretended_gpu(monkeypatch):
-        there = flooded("cuda", view, water, None, deferred=False, hidden_by=few)
-        same_picture(there, here, 0.02)
-
-
-def test_masks_grow_and_shrink_on_a_gpu_as_they_do_here(monkeypatch):
-    mask = torch.rand(45, 70, generator=torch.Generator().manual_seed(1)) > 0.995
-    assert 3 < int(mask.sum()) < 60
-    margins, reach = Margins(5, 20, 0, 33), Margins(17, 3, 0, 40)
-    grown = margins.around(mask, reach)
-    small = small_camera(19, 13)
-    with pretended_gpu(monkeypatch):
-        away = mask.to("meta")
-        there = margins.around(away, reach)
-        assert there.shape == grown.shape and torch.equal(there.cpu(), grown)
-        assert torch.equal(resized(there, small).cpu(), resized(grown, small))
 
 
 QUERY = {"seed": "3", "frames": "2", "gaussians": "120000"}

@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 
 from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
-from augment.reconstruct.config import LearningRates, LossWeights
-from augment.reconstruct.loss import IDENTITY_MAP, MIN_ALPHA, MIN_SKY, ViewLoss, view_loss
+from augment.reconstruct.config import LearningRates
 from augment.reconstruct.splats import CORRECTIONS, Splats, splat_rates
 from augment.reconstruct.trainer import Knots, part_forces, splat_inputs
-from augment.reconstruct.view import RecordedView
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.cpu import backward as cpu_backward
@@ -28,7 +26,6 @@ from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
 from tests.augment.hard_scenes import KINDS, SMOGS, drawing, hard_gaussians, wide_camera
-from tests.augment.loss_definition import reference_loss
 from tests.scenes import in_float64
 
 pytestmark = pytest.mark.long
@@ -92,73 +89,6 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
 
 
 # ---- reconstruction ------------------------------------------------------------------------------
-
-# Values at which the loss changes its mind, on both sides, and the ends of what a render holds.
-ALPHAS = (0.0, 1e-7, MIN_ALPHA, MIN_ALPHA + 1e-6, 0.5, 1 - MIN_SKY, 1 - 1e-6, 1.0)
-DEPTHS = (0.0, 0.01, 1.0, 1e6)
-COLOURS = (0.0, 1e-40, 0.5, 1.0, 1e4)
-WEIGHTS = LossWeights(d_ssim=0.3, depth=0.7, sky=0.2, surface=0.1)
-
-
-def hard_view(seed: int, height: int, width: int, fov_deg: float, *, is_constant: bool) -> dict:
-    """Arguments of view_loss: every pixel, prior and texel at one of its extremes."""
-    rng = np.random.default_rng(seed)
-    size = (height, width)
-
-    def pick(values, *shape: int) -> np.ndarray:
-        chosen = rng.choice(values) if is_constant else rng.choice(values, shape)
-        return np.broadcast_to(np.float32(chosen), shape).copy()
-
-    count = int(rng.integers(0, height * width + 1))
-    view = RecordedView(
-        camera=wide_camera(fov_deg, (width, height)),
-        rgb=pick((0.0, 1.0, 128.0, 255.0), *size, 3).astype(np.uint8),
-        weight=pick((0.0, 1e-6, 1.0), *size),
-        sky=rng.random(size) < 0.3,
-        depth_pixels=np.sort(rng.choice(height * width, count, replace=False)).astype(np.int32),
-        depth_m=pick((0.01, 1.0, 1e6), count),
-        depth_weight=pick((0.0, 1.0), count),
-    )
-    return {
-        "rgb": pick(COLOURS, *size, 3),
-        "alpha": pick(ALPHAS, *size),
-        "expected_depth": pick(DEPTHS, *size),
-        "view": view,
-        "sky_faces": pick((0.0, 0.5, 1.0), 6, 8, 8, 3),
-        "color_map": IDENTITY_MAP * np.float32(rng.choice((0.0, 1.0, 3.0))),
-        "weights": WEIGHTS,
-    }
-
-
-def loss_arrays(loss: ViewLoss) -> dict[str, np.ndarray]:
-    found = {
-        "total": np.array(loss.total),
-        "rgb": loss.d_rgb,
-        "alpha": loss.d_alpha,
-        "expected_depth": loss.d_expected_depth,
-        "color_map": loss.d_color_map,
-    }
-    return found if loss.d_sky is None else found | {"sky": loss.d_sky.grads}
-
-
-views = st.sampled_from(((1, 1), (1, 40), (23, 17))), fovs, st.booleans()
-
-
-@drawing(6)
-@given(seeds, *views)
-def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
-    """By the kernels and by their definition, in float32 as they and in float64."""
-    arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
-    assert_finite(loss_arrays(view_loss(**arguments)))
-    for dtype in (torch.float32, torch.float64):
-        tensors = {
-            name: torch.from_numpy(arguments[name]).to(dtype).requires_grad_()
-            for name in ("rgb", "alpha", "expected_depth", "sky_faces", "color_map")
-        }
-        loss = reference_loss(**tensors, view=arguments["view"], weights=WEIGHTS)
-        loss.total.backward()
-        grads = {name: tensor.grad for name, tensor in tensors.items()}
-        assert_finite({name: grad for name, grad in grads.items() if grad is not None})
 
 
 @drawing(5)

@@ -200,17 +200,6 @@ def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
     assert view_loss(**{**arguments, **opaque}).ssim == pytest.approx(1, abs=1e-5)
 
 
-def test_depth_counts_only_where_something_is_seen():
-    arguments = case(13, 17)
-    view = arguments["view"]
-    arguments["alpha"] = np.full((13, 17), 0.049, np.float32)
-    arguments["alpha"].reshape(-1)[view.depth_pixels[::2]] = np.float32(0.051)
-    loss = assert_matches_reference(arguments)
-    flat = loss.d_expected_depth.reshape(-1)
-    assert (flat[view.depth_pixels[::2]] != 0).all()
-    assert np.count_nonzero(flat) == len(view.depth_pixels[::2])
-
-
 def test_impossible_depths_count_nothing():
     arguments = case(13, 17)
     view = arguments["view"]

@@ -96,19 +96,6 @@ def test_what_is_split_covers_what_it_covered():
     assert float(after.rgb[inside].std()) > 3 * float(before.rgb[inside].std())
 
 
-def test_every_disc_is_drawn_once_and_inputs_stay():
-    snow, view = sheet(), camera()
-    kept = snow.opacities.clone()
-    near = split_near(snow, None, view, SUN, GRAIN)
-    assert torch.equal(snow.opacities, kept)
-    gone = near.whole.opacities == 0
-    assert torch.equal(near.whole.opacities[~gone], kept[~gone])
-    area = snow.scales[:, :2].prod(1)
-    fine = float(near.fine.scales[:, :2].prod(1).sum())
-    assert fine == pytest.approx(REACH**2 * float(area[gone].sum()), rel=1e-4)
-    assert torch.allclose(near.fine.means[:, 2], torch.zeros(len(near.fine)), atol=1e-6)
-
-
 def test_near_discs_are_split_most_and_far_ones_not_at_all():
     snow, view = sheet(0.8, 14.0, half_m=0.6), camera(f=1500.0, width=960, height=720)
     near = split_near(snow, None, view, SUN, GRAIN)
@@ -310,24 +297,3 @@ def test_a_street_full_of_snow_is_the_cpus(street, monkeypatch):
                for a, b, c in zip(found[:3], expected[:3], again[:3], strict=True))  # fmt: skip
     glints = found[4].gaussians
     assert 0 < int((held_by(glints.opacities) > 0).sum()) < 60
-
-
-@pytest.mark.gpu
-def test_much_snow_on_a_gpu_is_the_cpus_and_the_same_every_time():
-    snow, bright = discs(200_000, 11, far_m=60.0), crystals(300_000, 12, spread_m=20.0)
-    cover = snow_layers_of(layer(snow, slopes=snow.sh[:, 0].abs(), crystals=bright))
-    scene = scene_of(discs(3, 4))
-    expected = cover.parts_for(scene, camera(**CLOSE))
-    found, again = (cover.parts_for(scene, camera(**CLOSE), backend="cuda") for _ in range(2))
-    _, whole, fine, glints = (part.gaussians for part in expected)
-    for a, b in zip(found[1:], again[1:], strict=True):
-        for name in ("means", "opacities", "sh"):
-            assert torch.equal(getattr(a.gaussians, name).cpu(), getattr(b.gaussians, name).cpu())
-    there = [part.gaussians for part in found[1:]]
-    # Discs at a threshold are split by one and not by the other.
-    assert int((there[0].opacities.cpu() != whole.opacities).sum()) <= 10
-    for own, other in zip(there[1:], (fine, glints), strict=True):
-        shown = int((own.opacities > 0.0).sum())
-        assert shown == pytest.approx(len(other), rel=5e-3)
-        drawn = own.means[own.opacities > 0.0].cpu().double().mean(0)
-        torch.testing.assert_close(drawn, other.means.double().mean(0), rtol=0, atol=0.05)

@@ -10,22 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera, Frame
+from augment.cameras import Frame
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.kernels import BARE_M
 from augment.effects.snow.layer import (
-    OPACITY,
     PRESSED,
     build_snow_layer,
-    field_of,
     find_depths,
     gradient_noise,
     heights_of,
     mottle_of,
-    octaves_of,
     profile_of,
     share_covered,
-    threshold_of,
 )
 from augment.effects.snow.light import (
     Illumination,
@@ -83,15 +79,6 @@ def test_median_depth_on_open_ground_is_the_recipes(depth_m, drift):
     heights = _depths(bed.ground, depth_m=depth_m, wind={"drift": drift}, tracks="never")
     assert abs(np.median(heights) / depth_m - 1) < (0.03 if drift < 1 else 0.06)
     assert heights.min() >= depth_m / 4.1 and heights.max() <= depth_m * 4.1
-
-
-def test_wind_piles_snow_up_before_obstacles_and_takes_it_from_their_lee():
-    options = {"depth_m": 0.1, "wind": {"drift": 0.5, "direction_deg": 90}}
-    before, beside, behind = (
-        np.median(_depths(level_bed(10.0, 0.1, banks=banks).ground, **options))
-        for banks in ((0.0, 0.8), (0.8, 0.0), (0.0, -0.8))
-    )
-    assert before > 1.2 * beside and behind < 0.95 * beside
 
 
 def test_layer_is_rounded_at_open_edges_and_nowhere_else():
@@ -175,38 +162,6 @@ def test_level_layer_lets_no_light_through(depth_m, grain):
         assert _alpha(cover, camera)[inside].min() > 0.98
 
 
-def test_edge_is_as_sharp_as_a_cell():
-    cover = _lay(level_bed(4.0, border=OPEN_EDGE), depth_m=0.02, grain=0.5, tracks="never", seed=1)
-    camera = looking((2, 4, 3), (2, 4, 0), 120, 400, 2000.0)
-    alpha = _alpha(cover, camera).numpy()  # rows run towards -y
-    pixel_m = 2.98 / 2000
-    widths, middles = [], []
-    for column in alpha.T:
-        if column[-1] < 0.9:
-            continue  # a bare patch
-        low, middle, high = ((column > share).argmax() for share in (0.1, 0.5, 0.9))
-        widths.append((high - low) * pixel_m)
-        middles.append((200 - middle) * pixel_m)
-    assert len(widths) > 60
-    assert np.median(widths) < 1.2 * CELL_M and max(widths) < 1.6 * CELL_M
-    assert abs(np.median(middles)) < 0.4 * CELL_M  # from the bed's border
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("depth_m", [0.2, 2.0])
-def test_sides_of_a_deep_layer_are_closed(depth_m):
-    cover = _lay(level_bed(3.0, border=OPEN_EDGE), depth_m=depth_m)
-    height = 0.3 * depth_m
-    camera = looking((1.5, -4 - 3 * depth_m, height), (1.5, 1.5, height), 300, 200, 300.0)
-    rays = camera.ray_directions(torch.float64)
-    hit = camera.centre - camera.centre[1] / rays[..., 1:2] * rays
-    margin = 0.3 + 0.3 * min(depth_m, 1.0)
-    inside = (hit[..., 0] > margin) & (hit[..., 0] < 3 - margin)
-    inside &= (hit[..., 2] > 0.03) & (hit[..., 2] < 0.45 * depth_m)
-    assert inside.sum() > 50
-    assert _alpha(cover, camera)[inside].min() > 0.97
-
-
 def test_discs_lie_in_the_surface_of_a_slope():
     """A plane of 30 degrees: discs' middles above it by the depth, their thin axes along it."""
     slope = math.tan(math.radians(30))
@@ -241,17 +196,6 @@ def test_colours_follow_the_sun_and_stay_between_shade_and_light():
     assert away[2] - away[0] > facing[2] - facing[0] + 0.03  # bluish where the sun is low
 
 
-def test_shadows_of_the_recording_are_bluish_snow_not_dirt():
-    light = np.ones((40, 40))
-    light[:20] = 0.3
-    bed = bed_of_cells(cells_on_grid(np.zeros((40, 40)), CELL_M, light=light))
-    gaussians = _lay(bed, depth_m=0.1).ground.gaussians
-    shaded = _colors(gaussians)[gaussians.means[:, 0] < 0.7].mean(0)
-    lit = _colors(gaussians)[gaussians.means[:, 0] > 1.3].mean(0)
-    assert (shaded - torch.tensor(LIGHT.shadow_rgb)).abs().max() < 0.03
-    assert lit[0] - shaded[0] > lit[2] - shaded[2] + 0.05
-
-
 def test_two_shadings_agree_where_normals_do():
     bed = level_bed(4.0)
     baked = _lay(bed, depth_m=0.1).ground
@@ -266,34 +210,6 @@ def test_two_shadings_agree_where_normals_do():
         FAR_AWAY, looking((2, 2, 3), (2, 2, 0))
     )[-1]
     assert part.is_overlay and part.shading is not None and part.shading.sun == SUN
-
-
-# --- what it buries -------------------------------------------------------------------------------
-
-
-def test_gaussians_are_buried_where_all_their_cells_carry_snow():
-    scene = scene_of(grid_surface(np.zeros((10, 10)), 0.5))
-    before = scene.background.opacities.clone()
-    cells = level_bed(10.0, 0.1).ground
-    rng = np.random.default_rng(0)
-    buried_by = torch.from_numpy(rng.integers(0, len(cells), (60, 5), np.int32))
-    buried_by[:40, 1:] = buried_by[:40, :1]
-    buried_by[::7, 4] = -1
-    cells = dataclasses.replace(
-        cells, buried=torch.arange(20, 80, dtype=torch.int32), buried_by=buried_by
-    )
-    cover = _lay(bed_of_cells(cells), scene, depth_m=0.1, coverage=0.5)
-    snowy = set()
-    for x, y in cover.ground.gaussians.means[:, :2].tolist():  # no disc leaves its cell
-        snowy.add((math.floor(x / 0.1), math.floor(y / 0.1)))
-    places = [tuple(np.floor(c / 0.1).astype(int)) for c in cells.centers_m[:, :2].numpy()]
-    expected = before.clone()
-    for number, row in enumerate(buried_by.tolist()):
-        if all(c >= 0 and places[c] in snowy for c in row):
-            expected[20 + number] = 0
-    assert 5 < (expected == 0).sum() < 55
-    assert torch.equal(cover.ground.opacities, expected)
-    assert torch.equal(scene.background.opacities, before)
 
 
 # --- actors ---------------------------------------------------------------------------------------
@@ -354,40 +270,6 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
 # --- extremes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"depth_m": 1e-12},
-        {"depth_m": 10.0, "wind": {"drift": 1.0}, "sparkle": 1.0},
-        {"depth_m": 0.1, "coverage": 0.001, "shading": "per_pixel"},
-    ],
-)
-def test_extremes_stay_finite(options):
-    for bed in (
-        level_bed(8.0, 0.1, border=OPEN_EDGE),
-        level_bed(CELL_M),
-        level_bed(60.0, 10.0),
-        level_bed(0.01, 0.001),
-        level_bed(2.0, corner_m=(1e6, -1e6)),
-        bed_of_cells(cells_on_grid(np.full((3, 3), np.nan))),
-    ):
-        cover = _lay(bed, **options)
-        snow = cover.ground.gaussians
-        for values in (snow.means, snow.quats, snow.scales, snow.opacities, snow.sh):
-            assert torch.isfinite(values).all()
-        assert (snow.scales > 0).all() and (snow.opacities == OPACITY).all()
-        assert snow.semantic is not None and (snow.semantic == int(SemanticClass.SNOW)).all()
-        if options["depth_m"] == 10.0:
-            assert (len(snow) > 0) == (len(bed.ground) > 0)
-
-
-@pytest.mark.parametrize("options", [{"depth_m": 0.0}, {"depth_m": 0.1, "coverage": 0.0}])
-def test_no_snow_leaves_the_parts_own_tensors(options):
-    cover = _lay(level_bed(2.0), **options)
-    assert not len(cover.ground.gaussians)
-    assert cover.ground.opacities is FAR_AWAY.background.opacities
-
-
 def test_same_bits_for_any_number_of_threads_and_another_seed_is_another_snow():
     bed = level_bed(8.0, 0.1, border=OPEN_EDGE)
     layers = []
@@ -413,15 +295,6 @@ def test_noise_has_unit_deviation_and_median_zero():
     noise = gradient_noise(*_points(400_000), SEED)
     assert abs(noise.std() - 1) < 0.005
     assert abs(np.median(noise)) < 0.01
-
-
-def test_threshold_leaves_the_share_it_was_asked_for():
-    octaves = octaves_of(((2.6, 1.0), (1.1, 0.5), (0.45, 0.3)), np.random.default_rng(5))
-    field = field_of(octaves, *_points(200_000, seed=3))
-    for share in (0.01, 0.5, 0.9):
-        got = (field > threshold_of(octaves, share)).mean()
-        assert abs(got - share) < 0.005  # standard errors 0.0011 here and 0.0014 of the threshold
-    assert threshold_of(octaves, 0.0) == math.inf and threshold_of(octaves, 1.0) == -math.inf
 
 
 def _rugged_cells(corner_m=(0.0, 0.0)):
@@ -497,11 +370,6 @@ def discs(rgb: object, semantic: SemanticClass | None, *, count: int = 30, z: fl
         sh=sh.contiguous(),
         semantic=None if semantic is None else torch.full((count,), int(semantic)).short(),
     )
-
-
-def joined(*parts: Gaussians) -> Gaussians:
-    names = ("means", "quats", "scales", "opacities", "sh", "semantic")
-    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def scene(sky: Sky, ground: Gaussians, frames: tuple[Frame, ...] = ()) -> Scene:
@@ -603,43 +471,6 @@ def test_what_the_recipe_says_holds() -> None:
     bright = illumination_of(place, snow(brightness=0.8))
     assert luminance(bright.lit_rgb) == pytest.approx(luminance((0.8, 0.8, 0.8)), rel=1e-6)
     check(illumination_of(place, snow(brightness=1.0, albedo=1.0)))
-
-
-def test_the_road_is_asked_first_and_by_area() -> None:
-    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
-    road = discs((0.3, 0.3, 0.3), SemanticClass.ROAD)
-    walls = discs((0.9, 0.1, 0.1), SemanticClass.BUILDING, count=300)
-    pavement = discs((0.6, 0.6, 0.6), SemanticClass.SIDEWALK, count=300)
-    alone = light_of(scene(sky, road))
-    assert alone.ground_albedo == 0.10
-    assert alone.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
-    assert light_of(scene(sky, joined(walls, pavement, road))) == alone
-    few = discs((0.3, 0.3, 0.3), SemanticClass.ROAD, count=5)
-    assert light_of(scene(sky, joined(few, pavement))).ground_albedo == 0.22
-    # a layer of many small dark splats beneath, which nothing sees
-    beneath = discs((0.0, 0.0, 0.0), SemanticClass.ROAD, count=100)
-    small = dataclasses.replace(beneath, scales=0.3 * beneath.scales)
-    faint = dataclasses.replace(beneath, opacities=0.1 * beneath.opacities)
-    for layer in (small, faint):
-        assert light_of(scene(sky, joined(road, layer))) == alone
-
-
-def test_without_classes_level_splats_below_the_cameras_are_ground() -> None:
-    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
-    pose[1, 3] = 1.5  # the eye stands at z = 1.5 m
-    camera = Camera("front", 8, 6, 5.0, 5.0, 4.0, 3.0, pose)
-    frames = (Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": camera}),)
-    below, above = discs((0.3, 0.3, 0.3), None), discs((0.9, 0.9, 0.9), None, count=90, z=4.0)
-    turned = math.sqrt(0.5) * torch.tensor([1.0, 1.0, 0, 0]).repeat(90, 1)
-    upright = dataclasses.replace(discs((0.9, 0.1, 0.1), None, count=90), quats=turned)
-    parts = [below, above, upright]
-    names = ("means", "quats", "scales", "opacities", "sh")
-    everything = Gaussians(*(torch.cat([getattr(p, name) for p in parts]) for name in names))
-    found = light_of(scene(sky, everything, frames))
-    assert found.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
-    assert not found.ground_is_grey
 
 
 def test_any_scene_gives_colours() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from augment.effects.style import images
-from augment.effects.style.images import SIDE_PX, StyleImage, image_statistics, read_style_image
+from augment.effects.style.images import StyleImage, image_statistics, read_style_image
 from augment.effects.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE
 from augment.errors import StyleError
 
@@ -132,14 +132,6 @@ def test_depths_and_channels(tmp_path):
     assert image.rgb.shape == (4, 6, 3) and (image.rgb == np.float32(0.2)).all()
 
 
-def test_palette_and_its_transparent_entry(tmp_path):
-    indices = np.array([[0, 1], [1, 0]], np.uint8)
-    chunks = [(b"PLTE", bytes([*RED, *BLUE])), (b"tRNS", bytes([255, 0]))]
-    image = read_style_image(saved(tmp_path, "p.png", png(indices, 3, *chunks)))
-    assert image.weights.tolist() == [[1, 0], [0, 1]]
-    assert image_statistics(image)[WHOLE].mean == pytest.approx([1, 0, 0])
-
-
 @pytest.mark.parametrize("adobe", [True, False])
 def test_cmyk_is_read_as_photoshop_writes_it(tmp_path, adobe):
     # 255 is no ink; every second colour is left to the neighbour's rounding of 1/255.
@@ -158,16 +150,6 @@ def test_orientation_puts_the_sky_on_top(tmp_path, orientation, corner):
     assert rgb.shape[:2] == ((32, 48) if orientation in (1, 3) else (48, 32))
     corners = [rgb[4, 4, 0], rgb[4, -4, 0], rgb[-4, 4, 0], rgb[-4, -4, 0]]
     assert int(np.argmax(corners)) == corner and sorted(corners)[2] < 0.1
-
-
-def test_colours_under_transparent_pixels_leak_nowhere(tmp_path):
-    pixels = np.zeros((1200, 4, 4), np.uint8)
-    pixels[0::2] = (*RED, 255)
-    pixels[1::2] = (*BLUE, 0)
-    image = read_style_image(saved(tmp_path, "a.png", pixels))
-    assert image.rgb.shape[0] == SIDE_PX
-    assert image.rgb == pytest.approx(np.broadcast_to([1, 0, 0], image.rgb.shape), abs=1e-5)
-    assert image.weights.mean() == pytest.approx(0.5, abs=1e-3)
 
 
 def bad_files(folder):

@@ -13,12 +13,7 @@ from snow_scenes import wall
 from augment.cameras import Frame
 from augment.effects.style import network as checkpoint
 from augment.effects.style.color_maps import CLASSES, LEVELS, StyleMaps, sky_levels, styled_scene
-from augment.effects.style.content import (
-    content_pictures,
-    content_statistics,
-    gaussian_statistics,
-    select_views,
-)
+from augment.effects.style.content import content_pictures, content_statistics, gaussian_statistics
 from augment.effects.style.images import image_statistics, read_style_image
 from augment.effects.style.network import Gscm
 from augment.effects.style.statistics import LAND, ROAD, SKY, VEGETATION, WHOLE
@@ -148,15 +143,6 @@ def test_what_has_the_skys_colour_above_the_horizon_is_sky():
     ]  # fmt: skip
 
 
-def test_between_sky_and_land_there_is_no_step():
-    shades = torch.linspace(0, 0.2, 41)
-    balls = [ball((30.0, 0.0, 12.0), (0.6, 0.7, 0.9 - float(s))) for s in shades]
-    wide = dataclasses.replace(maps(), seen_sky=torch.cat([torch.eye(3), SEEN[:, 3:]], 1))
-    found = sky_levels(scene_of(*balls), wide)[-41:]
-    steps = found.diff()
-    assert found[0] == LEVELS and found[-1] == 0 and steps.max() <= 0 and steps.min() >= -1
-
-
 def test_a_wall_in_front_of_what_the_sky_holds_of_it_is_no_sky():
     # Where nothing is seen of a cube map, a fit leaves the wall's own colour in it.
     wall = (0.5, 0.4, 0.3)
@@ -257,28 +243,6 @@ def test_what_no_camera_sees_speaks_for_itself(why):
     assert picture.shape == (1, 3, 256, 256)
     mean = picture[0].mean((1, 2)).double().numpy()
     assert np.abs(mean - found[WHOLE].mean).max() < 1e-3
-
-
-def names_of(views) -> list[str]:
-    return [camera.name for camera in views]
-
-
-def test_views_are_spread_over_cameras_and_time():
-    cameras = [
-        dataclasses.replace(camera_ahead(timestamp_ns=t), name=name)
-        for t in range(40)
-        for name in ("left", "front", "right")
-    ]
-    views = select_views(street(), cameras, 12)
-    assert sorted(names_of(views)) == ["front"] * 4 + ["left"] * 4 + ["right"] * 4
-    times = [camera.timestamp_ns for camera in views]
-    assert times == sorted(times) and max(np.diff([0, *times, 39])) <= 4
-    few = select_views(street(), cameras[:7], 12)
-    assert set(map(id, few)) == set(map(id, cameras[:7]))
-    many = [dataclasses.replace(camera_ahead(), name=f"image {n}") for n in range(300)]
-    numbers = [int(name.split()[1]) for name in names_of(select_views(street(), many, 12))]
-    assert len(set(numbers)) == 12 and np.diff(numbers).max() == 25
-    assert select_views(street(), [], 12) == ()
 
 
 def test_bits_do_not_depend_on_threads():

@@ -388,23 +388,6 @@ def test_a_fit_without_depth_or_sky(recorded, changes, depth_weight):
         assert np.isfinite(array).all()
 
 
-def test_views_without_weight_teach_nothing(recorded):
-    empty = recorded.changed(
-        weight=np.zeros((HEIGHT, WIDTH), np.float32), sky=np.zeros((HEIGHT, WIDTH), bool), **NOTHING
-    )
-    trainer = quick(start(), empty)
-    before = {name: getattr(trainer.splats, name).copy() for name in ARRAYS}
-    sky_before = trainer.sky_faces.copy()
-    records = run(trainer, 8)
-    assert all(r.loss == 0 and r.l1 == 0 and r.ssim == 1 for r in records)
-    for name in ("means", "scales", "sh"):
-        assert np.array_equal(getattr(trainer.splats, name), before[name]), name
-    for name in ("quats", "opacities"):  # normalised anew, through the odds and back: roundings
-        got = getattr(trainer.splats, name)
-        np.testing.assert_allclose(got, before[name], rtol=0, atol=1e-6, err_msg=name)
-    assert np.array_equal(trainer.sky_faces, sky_before)
-
-
 def test_an_actor_that_views_do_not_show(recorded):
     """Its track ends before the last two frames: only the first two teach it anything."""
     gone = dataclasses.replace(car(last=1), gaussians=blurred(car().gaussians, 3))
@@ -423,23 +406,6 @@ def test_an_actor_that_views_do_not_show(recorded):
     assert both.splats.age[both.splats.starts[1] :].any()
     assert moved_m(both.scene(), start(actors=(gone,))) > 0
     assert all(math.isfinite(r.loss) for r in records)
-
-
-def test_a_camera_that_sees_nothing(recorded):
-    away = {
-        key: dataclasses.replace(
-            view,
-            camera=dataclasses.replace(
-                camera_ahead(WIDTH, HEIGHT, 32.0, yaw=math.pi), name=key.camera
-            ),
-            **NOTHING,
-        )
-        for key, view in recorded.views.items()
-    }
-    trainer = quick(start(), Recorded(away))
-    records = run(trainer, 8)
-    assert not trainer.splats.age.any() and all(math.isfinite(r.loss) for r in records)
-    assert not np.array_equal(trainer.sky_faces, np.full((6, 4, 4, 3), 0.5, np.float32))
 
 
 NS = 1_000_000_000

@@ -17,7 +17,7 @@ from augment.effects.flood.screen_space import ScreenReflection, trace_screen
 from augment.effects.flood.water_plane import Window, mirrored_camera, plane_depth, plane_window
 from augment.effects.flood.waves import WaveField, WaveSet
 from augment.geometry import invert_rigid, rigid, rotmat_from_quat
-from augment.render.fog import Fog, blend_airlight, optical_depth
+from augment.render.fog import Fog
 from augment.sky import ConstantSky, CubemapSky
 
 NONE = np.zeros(0)
@@ -95,14 +95,6 @@ def plane_layer(
     return Layer(eye, rgb.to(dtype), hit.to(dtype), depth.to(dtype))
 
 
-def constant_layer(eye: Camera, rgb: tuple, depth: float, seed: int) -> Layer:
-    """One colour behind alphas of every size, some of them holes."""
-    alpha = torch.rand(eye.height, eye.width, generator=torch.Generator().manual_seed(seed))
-    alpha = (1.6 * alpha - 0.2).clamp(0, 1)
-    flat = torch.tensor(rgb) * alpha[..., None]
-    return Layer(eye, flat, alpha, torch.full_like(alpha, depth))
-
-
 def doubled(layer: Layer) -> Layer:
     parts = {name: getattr(layer, name).double() for name in ("rgb", "alpha", "depth")}
     return dataclasses.replace(layer, **parts)
@@ -140,7 +132,6 @@ ALL = pytest.mark.parametrize("backend", ["cpu", REFERENCE])
 SMOGS = {"clear": None, "uniform": Fog(0.02, GREY), "layered": Fog(0.02, GREY, 8.0, LEVEL - 3)}
 
 
-TIERS = ["sky", "mirrored", "screen_space"]
 VIEWS = [
     ((61, 43), 0.0, "exact"),
     ((61, 43), 2e-3, "schlick"),
@@ -187,51 +178,6 @@ def test_the_kernel_matches_the_definition(smog, tier, view):
     # Where a coordinate lies that close to a pixel's border, the nearest pixel and the depth read
     # from it are another: visible where the layer ends there, or a ray just meets it or misses.
     assert int((difference > 5e-5).sum()) <= 0.002 * difference.numel()
-
-
-@pytest.mark.parametrize(
-    ("backend", "tier", "index", "extinction"),
-    [
-        *itertools.product(["reference", "cpu"], TIERS, [1.333], [1.0]),
-        *itertools.product(["reference", "cpu"], TIERS[2:], [3.0], [0.0, math.inf]),
-    ],
-)
-def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
-    eye = camera()
-    layers = {}
-    if tier != "sky":
-        layers["mirror"] = constant_layer(mirrored(eye), GREY, 5.0, 2)
-    if tier == "screen_space":
-        distance = torch.full((43, 61), 3.0)
-        distance[:, ::2] = torch.inf
-        front = constant_layer(margin(eye), GREY, 5.0, 3)
-        layers["screen"] = ScreenReflection(front, distance, torch.full((43, 61), 0.7))
-    water = medium(rgb=GREY, refraction_index=index, extinction_per_m=(extinction,) * 3)
-    bed = constant_layer(margin(eye), GREY, 8.0, 1)
-    field = wavy_field(eye, slope=0.3, variance=0.01)
-    sky = ConstantSky(torch.tensor(GREY))
-    smogs = [None, *[Fog(0.05, GREY, height) for height in (None, 5.0)]]
-    for smog in smogs:
-        out = shade_water(eye, water, field, bed, sky=sky, fog=smog, backend=backend, **layers)
-        met = eye.ray_directions(torch.float64)[..., 2] < 0
-        # Mixtures of one colour by weights that sum to 1: some twenty float32 roundings.
-        torch.testing.assert_close(
-            out[met], torch.tensor(GREY).expand_as(out[met]), atol=3e-6, rtol=0
-        )
-
-
-@ALL
-def test_without_refraction_and_absorption_the_bed_is_seen_as_it_is(backend):
-    eye = camera(pitch_deg=-40)
-    bed = plane_layer(margin(eye, 5), LEVEL - 0.5)
-    water = medium(refraction_index=1.0, extinction_per_m=(0.0, 0.0, 0.0))
-    field = wavy_field(eye)
-    out = shade_water(eye, water, field, bed, backend=backend)
-    own = bed.rgb[5:-5, 5:-5]
-    mud = torch.tensor(MUD)
-    expected = torch.where(bed.alpha[5:-5, 5:-5, None] > 0, own, mud)
-    met = eye.ray_directions(torch.float64)[..., 2] < 0
-    assert bool(met.all()) and torch.equal(out, expected)
 
 
 def refract_exactly(eye: Camera, depth: float, index: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -320,42 +266,6 @@ def test_the_sky_tier_shows_the_sky_of_the_mirrored_direction(backend):
     # Texture coordinates of float32 (1e-6) times differences between texels of up to 1.
     assert float((out - expected).abs()[met].max()) < 1e-5
     assert torch.equal(out[rays[..., 2] >= 0], torch.zeros_like(out[rays[..., 2] >= 0]))
-
-
-@ALL
-@pytest.mark.parametrize("smog", list(SMOGS.values())[1:], ids=list(SMOGS)[1:])
-def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
-    eye = camera(pitch_deg=-40)
-    bed = constant_layer(margin(eye), MUD, 9.0, 1)
-    water = medium(refraction_index=1.0, extinction_per_m=(math.inf,) * 3)
-    out = shade_water(eye, water, flat_field(eye), bed, fog=smog, backend=backend)
-    rays = eye.ray_directions(torch.float64)
-    height = float(eye.centre[2]) - LEVEL
-    distance = height / -rays[..., 2] * rays.norm(dim=-1)
-    tau = optical_depth(smog, distance, LEVEL + height, torch.full_like(distance, LEVEL))
-    mud = torch.tensor(MUD, dtype=torch.float64).expand(43, 61, 3)
-    expected = blend_airlight(mud, tau, smog)
-    torch.testing.assert_close(out.double(), expected, atol=2e-6, rtol=0)  # a few float32 roundings
-
-
-@pytest.mark.parametrize(
-    ("backend", "above", "pitch_deg"),
-    [*itertools.product(["reference", "cpu"], [1e-6, 5e3], [-90.0, 0.0])],
-)
-def test_extreme_views_stay_finite(backend, above, pitch_deg):
-    eye = camera(above=above, pitch_deg=pitch_deg, roll=0.0)
-    bed = constant_layer(eye, MUD, 3.0, 1)
-    steep = wavy_field(eye, slope=0.69, variance=0.05)
-    mirror = constant_layer(mirrored(eye), GREY, 4.0, 2)
-    screen = ScreenReflection(
-        constant_layer(eye, GREY, 4.0, 3), torch.full((43, 61), 2.0), torch.ones(43, 61)
-    )
-    for extinction in (0.0, math.inf):
-        out = shade_water(eye, medium(extinction_per_m=(extinction,) * 3), steep, bed,
-            mirror=mirror, screen=screen, fog=SMOGS["layered"], backend=backend
-        )  # fmt: skip
-        assert bool(torch.isfinite(out).all()) and float(out.min()) >= -1e-5
-        assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
 
 
 def test_a_bed_seen_by_another_camera_is_refused():
@@ -539,43 +449,12 @@ def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
 
 
 @BACKENDS
-def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
-    """A sign hangs before the sky: rays of water far behind it pass behind it."""
-    camera = looking(0, height=151)
-    front = see(camera, SIGN)
-    found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
-    rays = camera.ray_directions(torch.float64)
-    s = EYE_M / -rays[..., 2]
-    # Where the mirrored ray, seen from the eye, crosses the middle of the sign (0.7 m over it).
-    slope = (SIGN[3] + SIGN[4]) / 2 - EYE_M
-    behind = 2 * EYE_M / (-rays[..., 2] / rays[..., 1] + slope / SIGN[0] * -1)
-    z = 2 * EYE_M / (-rays[..., 2] - slope / SIGN[0])
-    x = rays[..., 0] * SIGN[0]
-    hidden = water(camera, front) & (z > 5) & (x.abs() < 0.6) & (s < z) & (behind > 0)
-    assert int(hidden.sum()) > 20
-    assert (found.weight[hidden] == 0).all() and found.distance[hidden].isinf().all()
-    beside = water(camera, front) & (x.abs() > 0.8) & (x.abs() < 1.5)
-    assert found.distance[beside].isinf().all() and int((found.weight[beside] == 1).sum()) > 20
-
-
-@BACKENDS
 def test_rays_that_come_back_to_the_camera_are_not_known(backend):
     """Looking straight down, past the point under the camera."""
     for roll in (0, 30):
         camera = looking(90, roll, 41, 41)
         front = see(camera)
         found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
-        assert (found.weight == 0).all() and found.distance.isinf().all()
-
-
-@BACKENDS
-def test_pixels_without_water_have_no_reflection(backend):
-    camera = looking(10)
-    everything = dataclasses.replace(
-        see(camera), alpha=torch.ones(75, 97), depth=torch.full((75, 97), 0.5)
-    )
-    for front, level in ((everything, LEVEL_M), (see(camera), 5.0)):  # covered; under water
-        found = trace_screen(front, camera, level, backend=backend)
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
@@ -590,19 +469,3 @@ def test_the_march_over_the_screen_matches_the_definition(pitch, roll):
     # The definition steps over corners of pixels (a pixel of the longer axis a step): there a ray
     # may pass a silhouette that it grazes, about one ray in 300.
     assert int((~close).sum()) <= 0.005 * close.numel()
-
-
-@pytest.mark.parametrize(("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 4)])
-def test_only_needed_pixels_are_traced(backend, stride):
-    camera = looking(6, 10)
-    front = see(camera, CAR, WALL)
-    whole = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
-    needed = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    needed[40:60, 5:70] = True
-    needed[65::3, 1::3] = True  # alone between pixels that are not
-    part = trace_screen(front, camera, LEVEL_M, needed=needed, stride=stride, backend=backend)
-    assert (part.weight[~needed] == 0).all() and part.distance[~needed].isinf().all()
-    assert (part.weight >= 0).all() and int((part.weight[needed] > 0).sum()) > 500
-    if stride == 1:
-        assert torch.equal(part.distance[needed], whole.distance[needed])
-        assert torch.equal(part.weight[needed], whole.weight[needed])

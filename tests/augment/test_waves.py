@@ -8,7 +8,6 @@ import torch
 
 from augment.cameras import Camera
 from augment.effects.flood.waves import (
-    FARTHEST_M,
     GRAVITY_MPS2,
     WaveSet,
     make_waves,
@@ -237,15 +236,6 @@ def assert_matches_the_definition(waves: WaveSet, camera: Camera) -> None:
     assert float((fast - slow).abs().max()) < 1e-5
 
 
-@pytest.mark.long
-def test_a_wide_image_far_from_the_origin_is_as_exact():
-    """Waves that turn hundreds of times between the eye and the image's corner."""
-    camera = camera_at([4e5, -3e5, 1.5], down_deg=2, size=(1600, 2), focal=1500.0, time=10**18)
-    camera = dataclasses.replace(camera, cy=-30.0)
-    waves = waves_of(6, steepness=0.3, slope=0.6, low=0.3, high=6.0)
-    assert_matches_the_definition(waves, camera)
-
-
 def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.ndarray, ...]:
     """The plane point of a pixel, its change per pixel [2, 2], and the ray, by moving the image."""
 
@@ -296,36 +286,3 @@ def test_the_field_is_what_its_definition_says_pixel_by_pixel(camera):
         # Differences of 1e-5 px leave 1e-9 of the footprint; the field is stored in float32.
         assert field[:, row, column].tolist() == pytest.approx(expected, abs=3e-7)
     assert partly > 10
-
-
-def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
-    camera, waves = CAMERAS["rolled"], SETS["one"]
-    camera = camera.cropped(0, 20, camera.width, 20)
-    rays = camera.ray_directions(torch.float64)
-    meets = (rays[..., 2] < 0) & (-1.5 / rays[..., 2] <= FARTHEST_M)
-    assert 0.2 < float(meets.double().mean()) < 0.9
-    for backend in ("cpu", "reference"):
-        field = fields_of(waves, camera, backend=backend)
-        assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
-        assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())
-
-
-def test_the_distance_does_not_glitter():
-    waves = make_waves(Waves(preset="wind"), seed=0, depth_m=0.5)
-    camera = camera_at([0.0, 0, 1.5], down_deg=1.0, size=(9, 400), focal=900.0)
-    field = fields_of(waves, camera, backend="cpu")
-    rays = camera.ray_directions(torch.float64)
-    seen = rays[:, 4, 2] < 0
-    tilt, variance = field[:2, seen, 4].norm(dim=0), field[2, seen, 4]
-    view = rays[-1, 4, :2] / rays[-1, 4, :2].norm()  # a column without roll: one direction
-    slopes = waves.directions @ view.numpy() * waves.wavenumbers * waves.amplitudes_m
-    total = float(0.5 * (slopes**2).sum())
-    assert bool((tilt[:3] == 0).all())  # at the horizon nothing is left to flicker,
-    assert variance[:3].tolist() == pytest.approx([total] * 3, rel=1e-6)  # it is roughness now
-    assert bool((variance.diff() <= 1e-9).all())  # and ever less of it towards the eye
-    assert float(tilt[-50:].max()) > 0.1 and float(variance[-1]) < 0.8 * total
-    rays, eye = rays[seen, 4], camera.centre
-    points = eye[:2] - eye[2] / rays[:, 2:] * rays[:, :2]
-    unfaded = wave_normals(waves, points, NOW)[:, :2].T
-    flicker, calm = (n[:, 1:21].sub(n[:, :20]).norm() for n in (unfaded, field[:2, seen, 4]))
-    assert float(calm) < 0.1 * float(flicker)  # of neighbours in the farthest 20 rows
