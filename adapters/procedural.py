@@ -86,7 +86,7 @@ def build_scene(parameters: StreetParameters) -> Scene:
         source=parameters.uri,
         background=splat(static, coarseness),
         actors=actors,
-        sky=build_sky(parameters.seed, street.to_sun),
+        sky=build_sky(parameters.seed),
         frames=build_frames(parameters),
         labels=StreetLabels(parameters),
         ground_z_m=float(ego_pose(parameters, times_ns)[0][:, 2].min()),  # lowest under the path
@@ -162,7 +162,7 @@ class StreetTruth:
 
     @cached_property
     def sky(self) -> Sky:
-        return build_sky(self.street.parameters.seed, self.street.to_sun)
+        return build_sky(self.street.parameters.seed)
 
     @cached_property
     def _shadows(self) -> tuple[ContactShadow, ...]:

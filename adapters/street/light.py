@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -207,8 +208,19 @@ CLOUD_SHADE_RGB = np.array([0.62, 0.67, 0.74])
 CLOUD_HEIGHT = 1.0  # clouds lie on a plane; its height only sets their size against the noise
 
 
-def build_sky(seed: int, to_sun: np.ndarray) -> CubemapSky:
-    """A cubemap of display-encoded colours."""
+def direction_to_sun(seed: int) -> np.ndarray:
+    """Unit vector to the sun: behind one shoulder of the driver, high enough to reach the road."""
+    rng = np.random.default_rng([seed, 6])
+    azimuth = np.radians(rng.uniform(118, 150)) * rng.choice([-1, 1])
+    height = np.radians(rng.uniform(43, 54))
+    flat = np.cos(height)
+    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(height)])
+
+
+@lru_cache(maxsize=2)
+def build_sky(seed: int) -> CubemapSky:
+    """A cubemap of display-encoded colours; the last two are kept."""
+    to_sun = direction_to_sun(seed)
     directions = directions_of_cubemap(FACE_SIZE).numpy().reshape(-1, 3)
     faces = np.empty_like(directions)
     above = directions[:, 2] > -0.03
