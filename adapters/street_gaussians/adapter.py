@@ -71,7 +71,6 @@ from adapters.street_gaussians.model import (
     read_checkpoint,
     read_ply_model,
 )
-from adapters.training_views.byte_cache import ByteCache
 from adapters.uri import format_uri
 from adapters.world import with_class_of
 from augment.cameras import Camera, Frame
@@ -79,6 +78,7 @@ from augment.errors import AdapterError
 from augment.files.pickles import PickleError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.memo import SceneMemo
 from augment.scene import Actor, ColorWaves, Scene, Track
 from augment.sky import ConstantSky, CubemapSky
 
@@ -496,31 +496,29 @@ class PointCloud:
     points: np.ndarray
     projections: np.ndarray | None
 
-    @property
-    def nbytes(self) -> int:
-        return self.points.nbytes + (0 if self.projections is None else self.projections.nbytes)
-
 
 class _Reader:
     """One file being read forward, and the frames that were last passed by."""
 
     def __init__(self, path: Path, state: tuple[int, ...]) -> None:
         self.path, self.state = path, state
-        self._recent: ByteCache[PointCloud] = ByteCache(_KEPT_BYTES)
+        self._recent = SceneMemo(_KEPT_BYTES)
         self._all: set[int] | None = None  # frames of the file, known after a whole pass
         self._passed: set[int] = set()
         self._clouds = _clouds(path)
 
     def read(self, frame: int) -> PointCloud | None:
-        found = self._recent.get(frame)
-        if found is not None or (self._all is not None and frame not in self._all):
-            return found
+        return self._recent.get(frame, lambda: self._read_on(frame))
+
+    def _read_on(self, frame: int) -> PointCloud | None:
+        if self._all is not None and frame not in self._all:
+            return None
         if frame in self._passed:
             self.rewind()
         try:
             for number, cloud in self._clouds:
                 self._passed.add(number)
-                self._recent.put(number, cloud, cloud.nbytes)
+                self._recent.put(number, cloud)
                 if number == frame:
                     return cloud
         except BaseException:
