@@ -50,7 +50,8 @@ def assert_stored_render(output, arrays) -> None:
         assert_images_close(output.alpha, arrays["alpha"], p999=1e-5, max_flips=5)
         depth = arrays["ED"].reshape(arrays["alpha"].shape)
         far = np.maximum(depth, 1e-3)
-        assert_images_close(output.expected_depth / far, depth / far, p999=1e-5, max_flips=5)
+        actual = _as_array(output.expected_depth) / far
+        assert_images_close(actual, depth / far, p999=1e-5, max_flips=5)
 
 
 def _pixel_errors(actual, expected) -> np.ndarray:

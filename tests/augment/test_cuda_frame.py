@@ -260,6 +260,9 @@ def test_two_views_under_way_do_not_mix(scene, away):
     assert not np.array_equal(alone[0].rgb, alone[1].rgb)
 
 
+# ---- snow ----------------------------------------------------------------------------------------
+
+
 @pytest.mark.long
 def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
@@ -298,6 +301,9 @@ def assert_alike(found, expected) -> None:
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
         else:
             assert torch.equal(a, b), field.name
+
+
+# ---- copies, and the pretended GPU ---------------------------------------------------------------
 
 
 def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch):
@@ -340,6 +346,8 @@ def test_without_a_gpu_kernels_are_interpreted_and_auto_does_not_take_them():
     assert gpu.is_interpreted() and gpu.gpu_device() == torch.device("cpu")
     assert available_backends()[CUDA] is None and not gpu.has_gpu()
 
+
+# ---- compiling for a Hopper GPU ------------------------------------------------------------------
 
 interpreted = pytest.mark.skipif(
     not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"

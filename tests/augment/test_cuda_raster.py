@@ -239,7 +239,9 @@ def test_all_kinds_of_parts():
     """A street, an actor, snow lit pixel by pixel, splats under colour maps of their rows and of
     their classes; more than a block holds; seen through smog.
     """
-    street, actor = random_gaussians(260, size=0.02), random_gaussians(9, seed=1, sh_degree=1)
+    seen, actor = random_gaussians(20, size=0.4), random_gaussians(9, seed=1, sh_degree=1)
+    unseen = random_gaussians(240)
+    street = stack(seen, dataclasses.replace(unseen, means=-unseen.means.abs() - 1))
     lit = random_gaussians(9, seed=2, sh_degree=0, size=0.5)
     styled = random_gaussians(9, seed=3, sh_degree=2)
     rows = torch.arange(9, dtype=torch.int16) - 2  # rows that are none mean the first map

@@ -474,6 +474,8 @@ def test_what_schlick_misses():
     assert float(angles[miss.argmax()]) == pytest.approx(84, abs=0.5)
 
 
+# ---- a street whose truth is known ---------------------------------------------------------------
+
 QUERY = {"seed": "3", "frames": "2", "gaussians": "120000"}
 URI = "procedural:street?" + "&".join(f"{k}={v}" for k, v in QUERY.items())
 VIEWS = [(0, "front"), (1, "back")]

@@ -204,6 +204,9 @@ def test_a_window_shows_its_part_of_the_picture(kind, weather, seed, left, top):
     assert_same_picture(render(parts, window, weather), cut, 40)
 
 
+# ---- whole frames --------------------------------------------------------------------------------
+
+
 def _valley(gaussians: Gaussians, camera: Camera) -> Scene:
     frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"wide": camera})
     sky = ConstantSky(torch.tensor([0.6, 0.7, 0.9]))
@@ -256,6 +259,8 @@ def test_frames_in_all_weathers_do_not_depend_on_threads(shading):
     np.testing.assert_array_equal(first.depth_m, second.depth_m)
     np.testing.assert_equal(dict(first.masks), dict(second.masks))
 
+
+# ---- float32 against float64 ---------------------------------------------------------------------
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
 CLIPPED_WEATHERS = ("clear", "uniform", "layered", "above", "below", "light", "maps")
@@ -398,6 +403,10 @@ def test_float32_coordinates_lose_centimetres_far_from_the_origin(distance_m, lo
 
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+# ---- gradients -----------------------------------------------------------------------------------
+
 kinds = st.sampled_from(KINDS)
 fovs = st.sampled_from((1, 10, 60, 120, 170))
 sizes = st.sampled_from(((33, 21), (1, 1), (17, 1), (16, 16)))

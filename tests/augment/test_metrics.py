@@ -174,6 +174,8 @@ def test_bad_depths_are_refused():
         depth_errors(np.ones(3), np.array([0, 1, np.inf]))
 
 
+# ---- consistency of views ------------------------------------------------------------------------
+
 WALL_M = 8.0
 
 
@@ -287,6 +289,8 @@ def test_a_board_goes_along_with_its_box(apart):
     wrong = consistency_of(a, standing.sample(b.picture), standing.counts & on_board)
     assert wrong.rmse == pytest.approx(0.2 * apart_m * np.sqrt(2 / 3), rel=0.05)
 
+
+# ---- LPIPS ---------------------------------------------------------------------------------------
 
 SIZE = 40
 # torchvision's `features` as its own lists have them: channels, and M for a pooling.

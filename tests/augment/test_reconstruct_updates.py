@@ -318,6 +318,8 @@ def test_depth_pixels_outside_or_out_of_order_are_refused(pixels):
         view_loss(**bad)
 
 
+# ---- Adam on splats ------------------------------------------------------------------------------
+
 EPS = 1e-15
 EXTENT_M = 50.0
 FASTER = LearningRates(means=0.5, quats=1e-2, scales=2e-2, opacities=0.2, sh_rest=1e-3)
@@ -635,6 +637,8 @@ def test_color_adam_counts_every_row_for_itself():
     assert values.min() == 0 and values.max() <= 1
     assert adam.arrays()["count"][13] == 0
 
+
+# ---- densification -------------------------------------------------------------------------------
 
 GROWN_EXTENT_M = 100.0
 PARTS = (30, 0, 12, 8)

@@ -171,6 +171,9 @@ def test_unwanted_tiles_are_left_out():
 EXACT = frozenset({RGB, ALPHA})
 
 
+# ---- parallel rays -------------------------------------------------------------------------------
+
+
 def map_camera(width=61, height=43, px_per_m=8.0, *, forward=(0.2, -0.1, -1.0)) -> Camera:
     """Looks down on `random_gaussians`, not quite along an axis of the world."""
     ahead = torch.tensor(forward, dtype=torch.float64)
@@ -330,6 +333,8 @@ def test_training_refuses_it():
     with pytest.raises(ValueError, match="gradients are of pinhole cameras only"):
         cpu_backward.record(inputs, camera, RasterSettings(), Scratch(), with_depth=False)
 
+
+# ---- modes of depth ------------------------------------------------------------------------------
 
 MODE = frozenset({MODE_DEPTH})
 # Each set of buffers takes a kernel of its own, which is compiled for seconds: where a test is
@@ -492,6 +497,8 @@ def test_gradients_are_those_of_differences():
     assert torch.autograd.gradcheck(mode, inputs, eps=1e-6, atol=1e-5)
 
 
+# ---- light per pixel -----------------------------------------------------------------------------
+
 C0 = 0.28209479177387814
 SIZE = 48
 
@@ -653,6 +660,8 @@ def test_light_that_cannot_be_is_refused(change, says):
         rasterize([part], camera())
 
 
+# ---- colour maps ---------------------------------------------------------------------------------
+
 CLASSES = 5
 SMOG = Fog(0.2, (0.7, 0.75, 0.8), None, 0.0)
 
@@ -745,6 +754,8 @@ def test_maps_that_are_none_are_refused(maps, words):
     with pytest.raises(ValueError, match=words):
         rasterize([part], camera_ahead())
 
+
+# ---- overlays ------------------------------------------------------------------------------------
 
 CAMERA = camera_ahead(97, 61, 80.0)
 

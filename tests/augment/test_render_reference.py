@@ -298,6 +298,9 @@ def test_smog_with_a_scale_height_uses_world_heights():
     assert float(ratio) == pytest.approx(1 - math.exp(-tau), rel=1e-6)  # midpoint rule
 
 
+# ---- stored renders ------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("mode", GOLDEN_MODES)
 @pytest.mark.parametrize("name", GOLDEN)
 def test_stored_renders(shared_dir, name, mode):
@@ -325,6 +328,8 @@ def test_stored_projections(shared_dir, name):
     np.testing.assert_allclose(conics, arrays["conics"][ids], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(splats.depths, arrays["depths"][ids], rtol=1e-12, atol=1e-12)
 
+
+# ---- gradients -----------------------------------------------------------------------------------
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -349,6 +349,8 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     )
 
 
+# ---- light ---------------------------------------------------------------------------------------
+
 HEIGHT = 180  # a row a degree
 GREY = (0.35, 0.35, 0.35)
 BLUE_SKY = (0.30, 0.45, 0.75)
@@ -495,6 +497,8 @@ def test_any_scene_gives_colours() -> None:
         for recipe in (snow(), snow(albedo=1.0, sun=1.0), snow(brightness=0.0)):
             check(illumination_of(place, recipe))
 
+
+# ---- near the camera -----------------------------------------------------------------------------
 
 CLOSE_CELL_M, OPACITY = 0.05, 0.98
 CLOSE_SUN = torch.tensor([math.cos(0.6), 0.0, math.sin(0.6)], dtype=torch.float64)

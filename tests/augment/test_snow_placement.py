@@ -307,6 +307,8 @@ def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
+# ---- supports in files ---------------------------------------------------------------------------
+
 SETTINGS = PlacementSettings(cell_m=0.2)
 
 

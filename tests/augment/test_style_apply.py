@@ -372,6 +372,9 @@ def test_folded_maps_draw_the_same_where_no_colour_is_clamped(scene, weather, ba
     assert by_sh.parts[1].color_maps is not None  # of an actor
 
 
+# ---- where maps in SH are exact ------------------------------------------------------------------
+
+
 def folding_error(scene, camera):
     """Largest channel difference [H, W] of colours mapped in SH and of mapped colours."""
     recipes = (style_recipe(evaluated=where) for where in ("sh", "color"))
@@ -405,6 +408,9 @@ def test_maps_in_sh_are_exact_but_where_a_colour_is_below_zero():
     assert folding_error(dark, camera).max() < 1e-5  # no directions: known exactly
     error = folding_error(with_sh(dark, torch.cat([sh, torch.zeros(len(sh), 3, 3)], 1)), camera)
     assert error[touched].max() > 1 / 255 > 1e-5 > error[~touched].max()
+
+
+# ---- from a style to maps ------------------------------------------------------------------------
 
 
 def colourful() -> object:

@@ -232,6 +232,8 @@ def test_wrong_method_and_strength_are_refused(unchecked):
             maps(content, content, strength=strength)
 
 
+# ---- presets -------------------------------------------------------------------------------------
+
 NAMES = style_preset_names()
 GOOD = """
 land:
@@ -453,6 +455,8 @@ def cmyk_jpeg(blocks: list[tuple[int, int, int, int]], *, adobe: bool) -> bytes:
     data = int(bits, 2).to_bytes(len(bits) // 8, "big").replace(b"\xff", b"\xff\0")
     return b"".join(parts) + data + b"\xff\xd9"
 
+
+# ---- images --------------------------------------------------------------------------------------
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 

@@ -201,6 +201,9 @@ def test_weights_of_another_network(b0, tmp_path):
             load_imagenet_weights(b0, path)
 
 
+# ---- losses and their features -------------------------------------------------------------------
+
+
 def random(*shape, seed=0, dtype=torch.float32) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 

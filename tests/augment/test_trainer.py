@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -408,6 +409,8 @@ def test_an_actor_that_views_do_not_show(recorded):
     assert all(math.isfinite(r.loss) for r in records)
 
 
+# ---- poses ---------------------------------------------------------------------------------------
+
 NS = 1_000_000_000
 
 
@@ -437,21 +440,6 @@ def moved(change: np.ndarray) -> np.ndarray:
 def camera_moved(camera, motion: np.ndarray):
     matrix = torch.from_numpy(motion @ camera.camera_from_world.numpy())
     return dataclasses.replace(camera, camera_from_world=matrix)
-
-
-class CameraTimes:
-    """A view source as far as CameraPoses looks at one."""
-
-    def __init__(self, cameras) -> None:
-        self._cameras = {ViewKey(i, camera.name): camera for i, camera in enumerate(cameras)}
-        self.train = tuple(self._cameras)
-        self.test = ()
-
-    def camera(self, key):
-        return self._cameras[key]
-
-    def load(self, key):
-        raise NotImplementedError
 
 
 def test_knots_are_linear_in_time_and_hold_outside():
@@ -509,7 +497,7 @@ def test_a_camera_is_found_again():
     tilt = torch.tensor([1.0, 0.004, -0.006, 0.003], dtype=torch.float64)
     change = rigid(rotmat_from_quat(tilt), torch.tensor([0.05, -0.03, 0.02], dtype=torch.float64))
     start = dataclasses.replace(truth, camera_from_world=change @ truth.camera_from_world)
-    found = CameraPoses(CameraTimes([start]))
+    found = CameraPoses(Recorded({ViewKey(0, "ahead"): SimpleNamespace(camera=start)}))
     assert found.corrected(start) is start  # nothing learnt, nothing changed
     poses, settings, scratch = np.eye(4)[None], RasterSettings(), Scratch()
 
@@ -561,6 +549,8 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
     assert track.world_from_actor[0, 1, 3] == pytest.approx(-0.01)
     assert track.world_from_actor[8, 1, 3] == 0.0  # a knot that no view has touched
 
+
+# ---- with gsplat ---------------------------------------------------------------------------------
 
 CONFIG = FitConfig(max_splats=600)
 TUNING = Tuning(sh_every=1, growth=Growth(every=3, start=0.1, stop=0.6))

@@ -174,6 +174,8 @@ def test_without_a_map_of_its_own_a_camera_keeps_every_bit(scene):
     assert not np.array_equal(view_of(mapped).rgb, clean.rgb)
 
 
+# ---- what cameras need of a plan -----------------------------------------------------------------
+
 IMAGES = Output(depth="expected", labels=False)
 
 

@@ -287,6 +287,9 @@ def test_a_bed_seen_by_another_camera_is_refused():
         shade_water(eye, medium(), flat_field(eye), turned)
 
 
+# ---- the plane -----------------------------------------------------------------------------------
+
+
 def turned_camera(seed: int, width=31, height=19, position=(0.0, 0.0, 0.0)) -> Camera:
     quat = torch.from_numpy(np.random.default_rng(seed).normal(size=4))
     rotation = rotmat_from_quat(quat / quat.norm())
@@ -331,6 +334,8 @@ def test_a_pixel_of_the_mirrored_camera_looks_along_the_reflected_ray(seed):
     back = mirrored_camera(mirrored, level)
     assert torch.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-12)
 
+
+# ---- the march over the screen -------------------------------------------------------------------
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
 LEVEL_M = 0.3
@@ -482,6 +487,8 @@ def test_the_march_over_the_screen_matches_the_definition(pitch, roll):
     # may pass a silhouette that it grazes, about one ray in 300.
     assert int((~close).sum()) <= 0.005 * close.numel()
 
+
+# ---- waves ---------------------------------------------------------------------------------------
 
 NOW = 1_700_000_000_123_456_789  # a timestamp of today's recordings
 RMS_SLOPES = {"calm": 0.012, "breeze": 0.04, "wind": 0.09}
