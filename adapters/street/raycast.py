@@ -255,14 +255,11 @@ class Tree(NamedTuple):
     shapes: tuple[np.ndarray, ...]
 
     def cast(
-        self,
-        origins: np.ndarray,
-        directions: np.ndarray,
-        limit: float = np.inf,
-        any_hit: bool = False,
+        self, origins: np.ndarray, directions: np.ndarray, limit: float = np.inf, any_hit=False
     ) -> Hits:
-        """Nearest shape, or any, along each ray; origins and directions [N, 3]."""
-        rays = len(directions)
+        """Nearest shape, or any, along each ray; origins and directions [N, 3] or, one of them,
+        [3]."""
+        rays = np.broadcast_shapes(np.shape(origins), np.shape(directions))[0]
         hits = Hits(np.empty(rays), np.empty(rays, np.int64), np.empty((rays, 3)))
         # Copies, as `trace` would be compiled once more for arrays that cannot be written.
         start, ahead = (

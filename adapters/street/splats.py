@@ -96,14 +96,13 @@ def plan_splats(body: Body, eyes: np.ndarray) -> SplatPlan:
     """How a body seen from eyes [E, 3] (its frame) is to be sampled."""
     shapes = split_long(body.shapes, eyes)
     distance, view = _sightings(shapes, eyes)
-    axes = shapes.axes
-    cosine = np.einsum(
-        "epk,pak->epa", view, axes[:, :2] / np.linalg.norm(axes[:, :2], axis=2, keepdims=True)
-    )
+    sides = shapes.axes[:, :2]
+    sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+    cosine = np.einsum("epk,pak->epa", view, sides)
     stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MAX_STRETCH**2))
     along = (distance[..., None] * stretch).min(0)
     flat = shapes.kind <= Kind.DISC
-    slant = np.einsum("epk,pk->ep", view, axes[:, 2])
+    slant = np.einsum("epk,pk->ep", view, shapes.axes[:, 2])
     tuft = shapes.material == Material.LEAF
     hidden = ((shapes.kind != Kind.ELLIPSOID) | tuft) & ~_in_sight(shapes, body.tree, eyes)
     along[hidden & flat] *= HIDDEN_STRETCH
@@ -239,13 +238,10 @@ def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.n
 
 def total_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> int:
     """How many cells these counts come to, nearly (triangles and discs are estimated)."""
-    m = counts + _graded(shapes, np.arange(len(shapes)), counts, hidden).sum(2)
-    each = (m[:, 0] * m[:, 1]).astype(np.float64)
-    each[shapes.kind == Kind.TRIANGLE] *= 0.5
-    each[shapes.kind == Kind.DISC] *= 0.5
-    tube = shapes.kind == Kind.CYLINDER
-    each[tube] = (counts[:, 0] * (counts[:, 1] + 2))[tube]
-    return int(each.sum())
+    m = counts + _graded(shapes, slice(None), counts, hidden).sum(2)
+    m[:, 1] += 2 * (shapes.kind == Kind.CYLINDER)
+    share = np.where(np.isin(shapes.kind, (Kind.TRIANGLE, Kind.DISC)), 0.5, 1.0)
+    return int((share * m.prod(1)).sum())
 
 
 def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
@@ -271,14 +267,12 @@ def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
     return Cells(shape, local, sides)
 
 
-def _graded(
-    shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray
-) -> np.ndarray:
+def _graded(shapes: Shapes, index, counts: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """Rows added at both ends of both axes, [I, 2 axes, 2 ends], for the shapes at index."""
     bits = np.array([[U0, U1], [V0, V1]], np.uint8)
-    flagged = (shapes.edges[index, None, None] & bits) > 0
+    flagged = (shapes.edges[index][:, None, None] & bits) > 0
     rows = (counts >= 2).astype(np.int64) + (counts >= FINE_FROM)
-    rows *= ((shapes.kind == Kind.PARALLELOGRAM) & ~hidden)[index, None]
+    rows *= ((shapes.kind == Kind.PARALLELOGRAM) & ~hidden)[index][:, None]
     return flagged * rows[:, :, None]
 
 
@@ -414,13 +408,9 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     x, y = (origin[k] + CELL_M * np.arange(counts[k]) for k in range(2))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     points = np.concatenate([grid, np.full((len(grid), 1), lighting.ground_z)], 1)
-    directions = lighting.sun_directions()
-    shaded = np.zeros(len(points))
-    for direction in directions:
-        rays = np.broadcast_to(direction, points.shape)
-        shaded += mover.body.tree.occluded(points, rays)
+    shaded = [mover.body.tree.occluded(points, d) for d in lighting.sun_directions()]
     full_sun = lighting.sunlit * lighting.to_sun[2] * SUN_RGB.mean()
-    sun = (1 - shaded / len(directions)) * full_sun
+    sun = (1 - np.sum(shaded, axis=0) / len(shaded)) * full_sun
     rounding = 0.8 * half.min()
     outside = np.linalg.norm(np.maximum(np.abs(grid) - half + rounding, 0), axis=1) - rounding
     hidden = 0.8 / (1 + np.exp((outside - 0.02) / (0.11 * half.min() / 0.9)))
@@ -457,10 +447,8 @@ def coarseness_for(plans: list[SplatPlan], target: int) -> float:
     low, high = 1e-3, 0.2
     for _ in range(12):
         middle = float(np.sqrt(low * high))
-        if sum(plan.total(middle) for plan in plans) > target:
-            low = middle
-        else:
-            high = middle
+        too_many = sum(plan.total(middle) for plan in plans) > target
+        low, high = (middle, high) if too_many else (low, middle)
     return high
 
 
@@ -468,18 +456,14 @@ def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
     """The Gaussians of a body."""
     counts = plan.counts(coarseness)
     backing = plan.backing(counts)
-    cells = make_cells(plan.shapes, counts, plan.hidden)
-    cells = _uncovered(plan, cells)
+    cells = _uncovered(plan, make_cells(plan.shapes, counts, plan.hidden))
     share = _sigma_per_side(plan, counts, backing)[cells.shape]
     first = _gaussians(plan, cells, share, plan.sink[cells.shape])
     # Under the ground the second layer may run on past an edge; behind a wall's it would be seen.
     upright = plan.shapes.semantic == SemanticClass.BUILDING
     below = make_cells(plan.shapes, backing, upright & (backing[:, 0] > 0))
-    count = len(below.shape)
-    if count == 0:
-        return first
-    share = np.full((count, 2), SIGMA_PER_SIDE)
-    return join_gaussians([first, _gaussians(plan, below, share, np.ones(count))])
+    share = np.full((len(below.shape), 2), SIGMA_PER_SIDE)
+    return join_gaussians([first, _gaussians(plan, below, share, np.ones(len(share)))])
 
 
 def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) -> np.ndarray:

@@ -986,7 +986,7 @@ def build_street(parameters: StreetParameters) -> Street:
 
 
 def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -> MovingBody:
-    if mover.kind == "car":
+    if mover.name.startswith("car"):
         model, shapes = draw_car(mover.seed)
         size, ground, label = model.size_m, float(road_z(mover.y_m)) - SINK_M, "Car"
     else:
