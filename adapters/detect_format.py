@@ -83,7 +83,7 @@ def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
     """The processed data that a run was trained on."""
     from adapters.drivestudio.drive import RunOptions, find_run
 
-    data = find_run(path, RunOptions.from_query(query)).data
+    data = find_run(path, RunOptions.from_query("drivestudio", query)).data
     return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg", r"lidar/\d+\.bin")
 
 

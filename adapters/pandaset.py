@@ -631,11 +631,6 @@ class PandaSetLabels:
         boxes = boxes_of_cuboids(table[objects.kept(table["uuid"].astype(str))])
         return replace(boxes, track_ids=tuple(objects.names[uuid] for uuid in boxes.track_ids))
 
-    @property
-    def no_surface_classes(self) -> tuple[int, ...]:
-        """The sweeps' class numbers of returns that no surface made: smoke, spray, reflections."""
-        return tuple(n for n, c in sorted(class_meanings(self.root).items()) if c == NO_SURFACE)
-
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
         numbers = sweep.columns.get("semantic")

@@ -16,6 +16,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from adapters.street.forms import unit as unit_vectors
+from adapters.street.forms import xyz
 from adapters.street.layout import (
     FRAME_NS,
     StreetParameters,
@@ -25,11 +27,10 @@ from adapters.street.layout import (
     frame_time_ns,
     parse_parameters,
 )
-from adapters.street.light import Body, build_sky
+from adapters.street.light import build_sky
 from adapters.street.splats import (
     SHADOW_RGB,
     ContactShadow,
-    SplatPlan,
     coarseness_for,
     contact_shadow,
     plan_splats,
@@ -77,35 +78,25 @@ def build_scene(parameters: StreetParameters) -> Scene:
     static = plan_splats(street.static, eyes)
     moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
     coarseness = coarseness_for([static, *moving], parameters.gaussians)
-    actors = tuple(
-        _actor(mover, plan, coarseness) for mover, plan in zip(street.movers, moving, strict=True)
-    )
+    actors = []
+    for mover, plan in zip(street.movers, moving, strict=True):
+        shadow = shadow_gaussians(contact_shadow(mover))
+        gaussians = join_gaussians([splat(plan, coarseness), shadow])
+        actors.append(Actor(mover.name, mover.label, gaussians, mover.motion.track, mover.size_m))
     times_ns = np.array([frame_time_ns(i) for i in range(parameters.frames)])
     scene = Scene(
         name=parameters.name,
         source=parameters.uri,
         background=splat(static, coarseness),
-        actors=actors,
-        sky=build_sky(parameters.seed, street.to_sun),
+        actors=tuple(actors),
+        sky=build_sky(parameters.seed),
         frames=build_frames(parameters),
         labels=StreetLabels(parameters),
         ground_z_m=float(ego_pose(parameters, times_ns)[0][:, 2].min()),  # lowest under the path
     )
     count = len(scene.background) + sum(len(a.gaussians) for a in actors)
-    seconds = time.perf_counter() - begun
-    logger.info("%s: %d Gaussians in %.1f s", parameters.name, count, seconds)
+    logger.info("%s: %d Gaussians in %.1f s", scene.name, count, time.perf_counter() - begun)
     return scene
-
-
-def _actor(mover: MovingBody, plan: SplatPlan, coarseness: float) -> Actor:
-    gaussians = [splat(plan, coarseness), shadow_gaussians(contact_shadow(mover))]
-    return Actor(
-        track_id=mover.name,
-        label=mover.label,
-        gaussians=join_gaussians(gaussians),
-        track=mover.motion.track,
-        size_m=mover.size_m,
-    )
 
 
 def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -162,11 +153,11 @@ class StreetTruth:
 
     @cached_property
     def sky(self) -> Sky:
-        return build_sky(self.street.parameters.seed, self.street.to_sun)
+        return build_sky(self.street.parameters.seed)
 
     @cached_property
-    def _shadows(self) -> tuple[ContactShadow, ...]:
-        return tuple(contact_shadow(mover) for mover in self.street.movers)
+    def _shadows(self) -> list[ContactShadow]:
+        return [contact_shadow(mover) for mover in self.street.movers]
 
     def cast(
         self,
@@ -177,12 +168,10 @@ class StreetTruth:
         with_rgb: bool = True,
     ) -> RayHits:
         """Follow rays [N, 3] (origins may be [3]) at a time, or at each ray's own time [N]."""
-        rays = len(directions)
-        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        rays, unit = len(directions), unit_vectors(directions)
         origins = np.ascontiguousarray(np.broadcast_to(origins, unit.shape), np.float64)
         times = np.broadcast_to(np.asarray(timestamp_ns, np.int64), (rays,))
-        hits = self.street.static.tree.cast(origins, unit)
-        distance, shape, local = hits.distance, hits.shape, hits.local
+        distance, shape, local = self.street.static.tree.cast(origins, unit)
         instance = np.zeros(rays, np.int32)
         for number, mover in enumerate(self.street.movers, start=1):
             centres, present = mover.motion.at(times)
@@ -195,15 +184,17 @@ class StreetTruth:
             met = mover.body.tree.cast(relative[index] @ turn, unit[index] @ turn)
             nearer = met.distance < distance[index]
             index = index[nearer]
-            distance[index], shape[index] = met.distance[nearer], met.shape[nearer]
-            local[index], instance[index] = met.local[nearer], number
+            for values, own in zip((distance, shape, local), met, strict=True):
+                values[index] = own[nearer]
+            instance[index] = number
         normal = np.zeros((rays, 3))
         semantic = np.full(rays, SemanticClass.SKY, np.int16)
         rgb = np.zeros((rays, 3)) if with_rgb else None
+        bodies = [(self.street.static, np.eye(3))]
+        bodies += [(mover.body, _turn(mover.motion.yaw)) for mover in self.street.movers]
         for number in np.unique(instance):
             index = np.flatnonzero((instance == number) & (shape >= 0))
-            body, turn = self._body(int(number))
-            chosen = shape[index]
+            (body, turn), chosen = bodies[number], shape[index]
             normal[index] = body.shapes.normals(chosen, local[index]) @ turn.T
             semantic[index] = body.shapes.semantic[chosen]
             if rgb is not None:
@@ -236,12 +227,6 @@ class StreetTruth:
             semantic=hits.semantic.reshape(size),
             instance=hits.instance.reshape(size),
         )
-
-    def _body(self, instance: int) -> tuple[Body, np.ndarray]:
-        if instance == 0:
-            return self.street.static, np.eye(3)
-        mover = self.street.movers[instance - 1]
-        return mover.body, _turn(mover.motion.yaw)
 
 
 def _turn(yaw: float) -> np.ndarray:
@@ -293,14 +278,8 @@ def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray
     times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
     azimuth = (ego_pose(parameters, times)[1] - 2 * np.pi * turn)[:, None]
     elevation = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, rings))[None, :]
-    directions = np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation) + 0 * azimuth,
-        ],
-        -1,
-    )
+    level = np.cos(elevation)
+    directions = xyz(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
     return sensor_origins(parameters, times), directions, times
 
 
@@ -309,8 +288,7 @@ def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> n
     positions, yaws = ego_pose(parameters, timestamps_ns)
     forward, left, up = SENSOR_M
     c, s = np.cos(yaws), np.sin(yaws)
-    offset = np.stack([c * forward - s * left, s * forward + c * left, np.full(len(c), up)], 1)
-    return positions + offset
+    return positions + xyz(c * forward - s * left, s * forward + c * left, up)
 
 
 def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
@@ -324,11 +302,9 @@ def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
     kept = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
     distance, semantic = hits.distance[kept], hits.semantic[kept]
     points = origin[kept] + distance[:, None] * direction[kept]
-    table = np.zeros(len(SemanticClass))
-    for value, share in REFLECTIVITY.items():
-        table[value] = share
+    reflectivity = np.array([REFLECTIVITY.get(value, 0.0) for value in SemanticClass])
     incidence = np.abs((hits.normal[kept] * direction[kept]).sum(1))
-    intensity = table[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
+    intensity = reflectivity[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
     return LidarSweep(
         {
             "x": points[:, 0],
@@ -357,10 +333,10 @@ class StreetLabels:
         for number, mover in enumerate(street.movers, start=1):
             centres, present = mover.motion.at(time)
             if present[0]:
-                box = (centres[0], mover.size_m, mover.motion.yaw)
+                box = centres[0], mover.size_m, mover.motion.yaw
                 rows.append((mover.name, mover.label, *box, False, number))
-        for car in street.parked:
-            rows.append((car.name, "Car", car.centre, car.size_m, car.yaw, True, 0))
+        for name, *box in street.parked:
+            rows.append((name, "Car", *box, True, 0))
         if not rows:
             return Boxes.empty()
         names, labels, centres, sizes, yaws, parked, instances = zip(*rows, strict=True)

@@ -43,7 +43,7 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
             anything but tables and arrays, or holds no table."""
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
-        found = Pickle(_TABLE_NAMES).read(stream)
+        found = Pickle(stream, _TABLE_NAMES).value()
         if isinstance(found, _Frame):
             return found.frame()
     except PickleError as error:
@@ -68,7 +68,7 @@ def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.n
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         check_holds_object(stream)
-        found = _unwrapped(Pickle(ARRAY_NAMES).read(stream))
+        found = _unwrapped(Pickle(stream, ARRAY_NAMES).value())
         arrays = {
             name: value.take()
             for name, value in found.items()
@@ -103,9 +103,9 @@ def stream_arrays(file: BufferedIOBase) -> Iterator[tuple[int, np.ndarray]]:
 
     Raises:
         PickleError: anything else is in it, or it is cut short."""
-    pickle = Pickle(ARRAY_NAMES, is_streamed=True)
+    pickle = Pickle(file, ARRAY_NAMES, is_streamed=True)
     count = 0
-    for record in pickle.steps(file):
+    for record in pickle.steps():
         if isinstance(record, ArrayRecord) and record.values is not None:
             number = pickle.stack[-2] if len(pickle.stack) > 1 else None
             number = number.item() if isinstance(number, np.generic) else number

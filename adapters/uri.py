@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -162,28 +162,6 @@ def check_query(scheme: str, query: Mapping[str, str], known: Mapping[str, str])
         guess = "" if near is None else f"did you mean {near!r}? "
         allowed = "; ".join(f"{key}: {meaning}" for key, meaning in known.items())
         raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; {guess}allowed are {allowed}")
-
-
-def whole_number_of(
-    scheme: str, query: Mapping[str, str], key: str, default: int | None = None
-) -> int | None:
-    """The whole number >= 0 of an option, the default without it."""
-    text = query.get(key)
-    if text is None:
-        return default
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise AdapterError(f"{scheme}: {key} must be a whole number; got {text!r}")
-    return int(text)
-
-
-def choice_of(
-    scheme: str, query: Mapping[str, str], key: str, allowed: Collection[str]
-) -> str | None:
-    """The value of an option that must be one of a few; None without it."""
-    text = query.get(key)
-    if text is not None and text not in allowed:
-        raise AdapterError(f"{scheme}: {key} must be {' or '.join(allowed)}; got {text!r}")
-    return text
 
 
 def _split_query(text: str, uri: str) -> tuple[str, dict[str, str]]:

@@ -1,21 +1,13 @@
-"""The one error of this package, and the list in which a file's problems are gathered."""
+"""The one error of this package, where it points to, and how it words guesses."""
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
-
-def nearest_word(word: str, words: tuple[str, ...]) -> str | None:
-    """The option that is most like `word`, if any is."""
-    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
-    return close[0] if close else None
-
-
-def did_you_mean(word: str, words: tuple[str, ...]) -> str:
-    """The guess as a part of a message, with a space after it; '' without one."""
-    near = nearest_word(word, words)
-    return f"did you mean {near}? " if near else ""
-
+from pydantic import ValidationError
 
 MAX_SHOWN = 40  # beyond this many lines the first cause is elsewhere
 
@@ -35,40 +27,89 @@ class RecipeError(Exception):
         return "\n".join(self.problems)
 
 
-class Problems:
-    """Collects what is wrong with one file, so that all of it is reported at once."""
+@dataclass(frozen=True)
+class Place:
+    """Where something was written.
 
-    def __init__(self, source: str) -> None:
-        self.source = source
-        self._found: list[tuple[int, str]] = []
+    source: a file, a preset or an option of the command line. line: counted from 1; None where
+    there are no lines. folder: where the files lie that are named there; None: none can be.
+    """
+
+    source: str
+    line: int | None = 1
+    folder: Path | None = None
+
+    def __str__(self) -> str:
+        return self.source if self.line is None else f"{self.source}:{self.line}"
+
+    def error(self, text: str) -> RecipeError:
+        """For a problem after which nothing else can be judged."""
+        return RecipeError(f"{self}: {text}")
+
+
+class Problems:
+    """Collects what is wrong, so that all of it is reported at once."""
+
+    def __init__(self) -> None:
+        self._found: list[tuple[Place, str]] = []
 
     def __len__(self) -> int:
         return len(self._found)
 
-    def add(self, line: int, text: str) -> None:
-        """Record a problem found at `line`, counted from 1."""
-        self._found.append((line, text))
+    def add(self, place: Place, text: str) -> None:
+        self._found.append((place, text))
 
     def raise_if_any(self) -> None:
-        """Raise every problem so far, in the order of the lines.
+        """Raise every problem so far, in the order of the lines of each source.
 
         Raises:
             RecipeError: there is at least one.
         """
-        if not self._found:
-            return
-        ordered = sorted(self._found, key=lambda found: found[0])
-        lines = [f"{self.source}:{line}: {text}" for line, text in ordered]
+        sources = list(dict.fromkeys(place.source for place, _ in self._found))
+        ordered = sorted(
+            self._found, key=lambda found: (sources.index(found[0].source), found[0].line or 0)
+        )
+        lines = [f"{place}: {text}" for place, text in ordered]
         if len(lines) > MAX_SHOWN:
-            lines[MAX_SHOWN:] = [f"{self.source}: and {len(lines) - MAX_SHOWN} problems more"]
-        raise RecipeError(*lines)
+            lines[MAX_SHOWN:] = [f"{sources[0]}: and {len(lines) - MAX_SHOWN} problems more"]
+        if lines:
+            raise RecipeError(*lines)
 
-    def fail(self, line: int, text: str) -> RecipeError:
-        """The error for a problem after which nothing else can be judged."""
-        return RecipeError(f"{self.source}:{line}: {text}")
+
+def nearest_word(word: str, words: Iterable[str]) -> str | None:
+    """The option that is most like `word`, if any is."""
+    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
+    return close[0] if close else None
+
+
+def did_you_mean(word: str, words: Iterable[str]) -> str:
+    """The guess as a part of a message, with a space after it; '' without one."""
+    near = nearest_word(word, words)
+    return f"did you mean {near}? " if near else ""
 
 
 def short(text: str, limit: int = 60) -> str:
     """One printable line of at most `limit` characters."""
     printable = text if text.isprintable() else repr(text)[1:-1]
     return printable if len(printable) <= limit else printable[: limit - 1] + "…"
+
+
+def join(path: str, name: str) -> str:
+    """The dotted path of a key in a section; '' is the top."""
+    return f"{path}.{name}" if path else name
+
+
+def dotted(location: Iterable[int | str]) -> str:
+    """pydantic's location of an error as a path: `waves.components[1].steepness`."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{short(part)}" for part in location)
+    return "".join(parts).removeprefix(".")
+
+
+def readable(error: ValidationError) -> list[str]:
+    """pydantic's problems, one line each: the field, then what is wrong."""
+    lines = []
+    for item in error.errors(include_url=False):
+        path, cause = dotted(item["loc"]), item.get("ctx", {}).get("error")
+        text = str(cause) if isinstance(cause, ValueError) else item["msg"]
+        lines.append(f"{path}: {text}" if path else text)
+    return lines

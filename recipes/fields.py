@@ -11,8 +11,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+)
 from pydantic.config import JsonDict
+from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from recipes.errors import did_you_mean
@@ -29,8 +37,19 @@ Rates = tuple[PerMetre, PerMetre, PerMetre]
 Angle = Annotated[float, Strict(), Field(ge=-360, le=360)]
 Seed = Annotated[int, Strict(), Field(ge=0, lt=2**63)]
 # In a recipe file a path below its folder; in a recipe in numbers any path.
-FilePath = Annotated[str, Strict(), Field(min_length=1, max_length=4096)]
-Digest = Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")]
+FilePath = Annotated[
+    str,
+    Strict(),
+    Field(
+        min_length=1,
+        max_length=4096,
+        title="a file in the recipe's folder or below it",
+        json_schema_extra={"pattern": r"^[^/\\][^\\]*$"},
+    ),
+]
+Digest = Annotated[
+    str, Strict(), Field(pattern=r"^[0-9a-f]{64}$", title="64 hexadecimal digits, small letters")
+]
 
 
 @dataclass(frozen=True)
@@ -53,6 +72,11 @@ class OneOf:
 
     def __get_pydantic_core_schema__(self, of: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self.check, handler(of))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {"enum": list(self.names())}
 
 
 class Closed(BaseModel):

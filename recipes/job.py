@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from recipes.errors import Problems, RecipeError, did_you_mean, nearest_word, short
+from recipes.errors import Place, Problems, RecipeError, did_you_mean, dotted, nearest_word, short
 from recipes.fields import Closed, Number, Whole, changed
 from recipes.load import load_recipe, preset_names, read_text
 from recipes.schema import Recipe, parse_frames
@@ -22,7 +21,6 @@ from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain, read_t
 
 MAX_BYTES = 4 << 20
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-_NAMES = "letters, digits, '.', '_' and '-', at most 64"
 Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
 Name = Annotated[str, Field(pattern=_NAME, strict=True)]
 
@@ -61,6 +59,8 @@ class JobRecipe(Closed):
     """Its name in this job and the output; its own if absent."""
     variants: Whole | None = Field(default=None, ge=1, le=100_000)
     """How many to draw; as many as it says if null."""
+    set: dict[str, Any] = Field(default_factory=dict)
+    """Fields that replace the recipe's, by dotted path: `weather.smog.visibility_m: 60`."""
 
 
 class Job(Closed):
@@ -130,32 +130,36 @@ def load_job(path: Path) -> Job:
     """
     missing, too_large = "no such file; a job is a YAML file", "name scenes by a pattern (*)"
     text = read_text(path, MAX_BYTES, missing=missing, too_large=too_large)
-    return parse_job(text, source=str(path), name=path.stem)
+    return parse_job(text, source=str(path), name=path.stem, folder=path.parent)
 
 
-def parse_job(text: str, *, source: str, name: str = "job") -> Job:
+def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None = None) -> Job:
     """The job in YAML `text`. source: stands before the line in messages. name: the default.
+    folder: where the files lie that its `set` names.
 
     Raises:
         RecipeError: it is no valid job; one line for each problem.
     """
-    problems = Problems(source)
-    tree = read_tree(text, problems, empty="the file is empty; a job names scenes and recipes")
+    problems, place = Problems(), Place(source, folder=folder)
+    empty = "the file is empty; a job names scenes and recipes"
+    tree = read_tree(text, place, problems, empty=empty)
     if not isinstance(tree, MapNode):
-        raise problems.fail(tree.line, "a job is a mapping with scenes and recipes")
+        raise tree.place.error("a job is a mapping with scenes and recipes")
     problems.raise_if_any()
+    tree.setdefault("name", ScalarNode(place, name, name))
     data: Any = plain(tree)
-    if "name" not in data and not re.fullmatch(_NAME, name):
-        text = f"the file's own name is no name for a job; give it a name: {_NAMES}"
-        raise problems.fail(1, text)
+    recipes = tree.get("recipes")
+    for index, node in enumerate(recipes if isinstance(recipes, ListNode) else ()):
+        if isinstance(node, MapNode) and "set" in node:
+            data["recipes"][index]["set"] = node["set"]  # with its lines
     try:
-        return Job.model_validate({"name": name, **data})
+        return Job.model_validate(data)
     except ValidationError as error:
         for problem in error.errors(include_url=False, include_context=False):
             if problem["type"] == "too_short" and problem["input"]:
                 continue  # it has items, each of them with a problem of its own
-            where, line = _place(tree, problem["loc"])
-            problems.add(line, f"{where}{_message(problem)}")
+            where = f"{dotted(problem['loc'])}: " if problem["loc"] else ""
+            problems.add(_place(tree, problem["loc"]), f"{where}{_message(problem)}")
     problems.raise_if_any()
     raise AssertionError("pydantic found a problem and named none")
 
@@ -170,7 +174,8 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
     for entry in job.recipes:
         is_preset = entry.recipe in preset_names()
         try:
-            template = load_recipe(entry.recipe if is_preset else folder / entry.recipe)
+            source = entry.recipe if is_preset else folder / entry.recipe
+            template = load_recipe(source, entry.set)
         except RecipeError as error:
             raise RecipeError(f"job {job.name}, recipe {entry.recipe!r}: {error}") from None
         name = entry.name or Path(entry.recipe).stem
@@ -204,41 +209,36 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
         raise RecipeError(f"{both} is not possible: {error.errors()[0]['msg']}") from None
 
 
-def _place(tree: Node, location: tuple[int | str, ...]) -> tuple[str, int]:
-    """`scenes[1].uri: ` and its line, or those of the nearest thing above that the file has."""
-    place, line, node = "", tree.line, tree
+def _place(tree: Node, location: tuple[int | str, ...]) -> Place:
+    """Of the location, or of the nearest thing above it that the file has."""
+    node: Any = tree
     for part in location:
-        if isinstance(part, int):
-            if not isinstance(node, ListNode) or part >= len(node.items):
-                break
-            node, place = node.items[part], f"{place}[{part}]"
-            line = node.line
-        elif isinstance(node, MapNode) and part in node.entries:
-            line, node = node.entries[part]
-            place = f"{place}.{short(part)}" if place else short(part)
-        elif not isinstance(node, ScalarNode):
-            place = f"{place}.{short(part)}" if place else short(part)
+        try:
+            node = node[part]
+        except (KeyError, IndexError, TypeError):
             break
-    return f"{place}: " if place else "", line
+    return node.place
+
+
+_WORDS = {
+    "missing": "is missing",
+    "tuple_type": "must be a list, with a line '- ...' for each",
+    "too_short": "names none; at least one is needed",
+    "model_type": "must be a text, or a mapping of fields",
+    "dict_type": "must be a mapping such as {weather.smog.visibility_m: 60}",
+    "string_pattern_mismatch": "must be letters, digits, '.', '_', '-', at most 64, the first a "
+    "letter or digit",
+}
 
 
 def _message(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         known = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
-        near = nearest_word(str(problem["loc"][-1]), tuple(known))
+        near = nearest_word(str(problem["loc"][-1]), known)
         return "unknown field" + (f"; did you mean {near}?" if near else "")
-    short_words = {
-        "missing": "is missing",
-        "tuple_type": "must be a list, with a line '- ...' for each",
-        "too_short": "names none; at least one is needed",
-        "model_type": "must be a text, or a mapping of fields",
-    }
-    if problem["type"] in short_words:
-        return short_words[problem["type"]]
     if problem["type"] == "value_error":
         return problem["msg"].removeprefix("Value error, ")
-    if problem["type"] == "string_pattern_mismatch":
-        expected = "must be letters, digits, '.', '_', '-', at most 64, first a letter or digit"
-    else:
-        expected = problem["msg"].replace("Input should be", "must be", 1)
-    return f"{expected}; got {short(repr(problem['input']))}"
+    if problem["type"] in _WORDS:
+        return _WORDS[problem["type"]]
+    text = problem["msg"].replace("Input should", "must", 1)
+    return f"{text}; got {short(repr(problem['input']))}"

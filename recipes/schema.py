@@ -239,7 +239,11 @@ class Recipe(Closed):
 
     version: Literal[1] = VERSION
     """Version of the recipe format."""
-    name: str = Field(default="recipe", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    name: str = Field(
+        default="recipe",
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        title="up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit",
+    )
     """Used for folders and in the manifest; the file's name if absent."""
     seed: Seed = 0
     """What all random numbers are made from."""

@@ -1,22 +1,33 @@
-"""YAML text -> a small tree that remembers lines; no object of YAML's choice is ever built.
+"""YAML text -> mappings, lists and scalars that know where they were written.
 
-The tree is built from PyYAML's events, without recursion, so that depth and size are bounded
-whatever the text. Scalars follow YAML 1.2's core schema; keys are always text.
+No object of YAML's choice is ever built, and depth and size are bounded whatever the text. Scalars
+follow YAML 1.2's core schema; keys are always text.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    CollectionStartEvent,
+    DocumentStartEvent,
+    Event,
+    MappingEndEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+)
+from ruamel.yaml.reader import ReaderError
 
-from recipes.errors import Problems, short
+from recipes.errors import Place, Problems, short
 
 MAX_DEPTH = 32
 MAX_NODES = 20_000  # counted after aliases are expanded, so nested aliases cannot multiply
-EMPTY = "the file is empty; a recipe is a mapping such as 'weather: {smog: {visibility_m: 300}}'"
 MAX_DIGITS = 400  # a longer run of digits is no number that any field takes
 
 _WHOLE = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
@@ -38,61 +49,52 @@ PlainValue = ScalarValue | list["PlainValue"] | dict[str, "PlainValue"]
 class ScalarNode:
     """text: as written, without quotes. value: what it means."""
 
-    line: int
+    place: Place
     text: str
     value: ScalarValue
-    size: int = 1
-    height: int = 1
 
 
-@dataclass(eq=False)
-class ListNode:
-    """size: how many nodes it has, aliases expanded. height: how many levels."""
-
-    line: int
-    items: list[Node] = field(default_factory=list)
-    size: int = 1
-    height: int = 1
+class ListNode(list["Node"]):
+    def __init__(self, place: Place, items: list[Node] | None = None) -> None:
+        super().__init__(items or ())
+        self.place = place
 
 
-@dataclass(eq=False)
-class MapNode:
-    """entries: key -> (line of the key, value), in the order of the file."""
+class MapNode(dict[str, "Node"]):
+    """What stands below a key is on the key's line."""
 
-    line: int
-    entries: dict[str, tuple[int, Node]] = field(default_factory=dict)
-    size: int = 1
-    height: int = 1
+    def __init__(self, place: Place, entries: dict[str, Node] | None = None) -> None:
+        super().__init__(entries or {})
+        self.place = place
 
 
 Node = ScalarNode | ListNode | MapNode
 
 
-@dataclass
-class _Open:
-    """A list or mapping whose end has not been read. key: line and text of the one before."""
-
-    node: ListNode | MapNode
-    anchor: str | None
-    key: tuple[int, str] | None = None
-
-
-def read_tree(text: str, problems: Problems, *, empty: str = EMPTY) -> Node:
+def read_tree(text: str, place: Place, problems: Problems, *, empty: str) -> Node:
     """The tree of the one document in `text`; duplicate keys are added to `problems`.
+
+    place: of the text's first line.
 
     Raises:
         RecipeError: not YAML, YAML that a recipe may not use, or nothing (`empty` says so).
     """
-    tree = _Builder(problems).build(_events(text, problems))
+    tree = None
+    events = _events(text, place)
+    for event in events:
+        if isinstance(event, DocumentStartEvent):
+            if tree is not None:
+                raise _place(place, event).error("one document a file: remove the second '---'")
+            tree = _Reader(events, place, problems).node(next(events))
     if tree is None:
-        raise problems.fail(1, empty)
+        raise place.error(empty)
     return tree
 
 
 def read_plain(text: str, *, source: str) -> PlainValue:
     """What YAML says as mappings, lists and scalars; RecipeError as for read_tree."""
-    problems = Problems(source)
-    tree = read_tree(text, problems, empty="the file is empty")
+    problems = Problems()
+    tree = read_tree(text, Place(source), problems, empty="the file is empty")
     problems.raise_if_any()
     return plain(tree)
 
@@ -100,9 +102,9 @@ def read_plain(text: str, *, source: str) -> PlainValue:
 def plain(node: Node) -> PlainValue:
     """A tree without its lines."""
     if isinstance(node, MapNode):
-        return {key: plain(value) for key, (_, value) in node.entries.items()}
+        return {key: plain(value) for key, value in node.items()}
     if isinstance(node, ListNode):
-        return [plain(item) for item in node.items]
+        return [plain(item) for item in node]
     return node.value
 
 
@@ -119,116 +121,103 @@ def plain_value(text: str) -> ScalarValue:
     return text
 
 
-class _Builder:
-    def __init__(self, problems: Problems) -> None:
-        self._problems = problems
-        self._open: list[_Open] = []
-        self._anchors: dict[str, Node | None] = {}  # None: named, but its end has not been read
-        self._root: Node | None = None
+class _Reader:
+    """Recursive, at most MAX_DEPTH deep."""
 
-    def build(self, events: Iterator[yaml.Event]) -> Node | None:
-        documents = 0
-        for event in events:
-            line = event.start_mark.line + 1
-            if isinstance(event, yaml.DocumentStartEvent):
-                documents += 1
-                if documents > 1:
-                    raise self._problems.fail(line, "one document a file: remove the second '---'")
-            elif isinstance(event, yaml.AliasEvent):
-                node = self._anchors.get(event.anchor)
-                if node is None:
-                    is_open = event.anchor in self._anchors
-                    wrong = "stands inside its own" if is_open else "refers to no"
-                    end = "" if is_open else " above it"
-                    text = f"*{short(event.anchor)} {wrong} anchor{end}"
-                    raise self._problems.fail(line, text)
-                self._attach(line, node)
-            elif isinstance(event, yaml.CollectionEndEvent):
-                done = self._open.pop()
-                if done.anchor is not None:
-                    self._anchors[done.anchor] = done.node
-                self._attach(done.node.line, done.node)
-            elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
-                self._start(line, event)
-        return self._root
+    def __init__(self, events: Iterator[Event], place: Place, problems: Problems) -> None:
+        self._events, self._place, self._problems = events, place, problems
+        self._anchors: dict[str, Node] = {}
+        self._count = 0
 
-    def _start(self, line: int, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
+    def node(
+        self, event: Event, *, place: Place | None = None, path: str = "", depth: int = 1
+    ) -> Node:
+        """What begins with `event`. place: of the key above it, if there is one."""
+        own = _place(self._place, event)
+        place = place or own
+        if isinstance(event, AliasEvent):
+            if (node := self._anchors.get(event.anchor)) is None:
+                raise own.error(f"*{short(event.anchor)} refers to no anchor that ends above it")
+            self._count_nodes(node, own, depth)
+            return node
+        self._count_node(own, depth)
+        assert isinstance(event, ScalarEvent | CollectionStartEvent)
         if event.tag is not None:
-            text = f"the tag {short(str(event.tag))!r}: tags are not allowed"
-            raise self._problems.fail(line, text)
-        if isinstance(event, yaml.ScalarEvent):
+            raise own.error(f"the tag {short(str(event.tag))!r}: tags are not allowed")
+        if isinstance(event, ScalarEvent):
             value = plain_value(event.value) if event.implicit[0] else event.value
-            node = ScalarNode(line, event.value, value)
-            if event.anchor is not None:
-                self._anchors[event.anchor] = node
-            self._attach(line, node)
-            return
+            node = ScalarNode(place, event.value, value)
+        elif isinstance(event, SequenceStartEvent):
+            node = ListNode(place)
+            while not isinstance(event_of_item := next(self._events), SequenceEndEvent):
+                below = f"{path}[{len(node)}]"
+                node.append(self.node(event_of_item, path=below, depth=depth + 1))
+        else:
+            node = MapNode(place)
+            while not isinstance(event_of_key := next(self._events), MappingEndEvent):
+                self._read_entry(node, event_of_key, path, depth)
         if event.anchor is not None:
-            self._anchors[event.anchor] = None
-        if len(self._open) >= MAX_DEPTH:
-            raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
-        kind = MapNode if isinstance(event, yaml.MappingStartEvent) else ListNode
-        self._open.append(_Open(kind(line), event.anchor))
+            self._anchors[event.anchor] = node
+        return node
 
-    def _attach(self, line: int, node: Node) -> None:
-        if not self._open:
-            self._root = node
-            return
-        level, parent = self._open[-1], self._open[-1].node
-        parent.size += node.size
-        parent.height = max(parent.height, 1 + node.height)
-        if parent.size > MAX_NODES:
-            raise self._problems.fail(line, f"more than {MAX_NODES} values, aliases expanded")
-        if parent.height > MAX_DEPTH:
-            raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
-        if isinstance(parent, ListNode):
-            parent.items.append(node)
-        elif level.key is None:
-            level.key = (line, self._key_text(line, node))
-        else:
-            (key_line, key), level.key = level.key, None
-            self._insert(parent, key_line, key, node)
-
-    def _key_text(self, line: int, node: Node) -> str:
-        if not isinstance(node, ScalarNode):
-            raise self._problems.fail(line, "a key must be plain text, not a list or a mapping")
-        if node.text == "<<":
+    def _read_entry(self, into: MapNode, event: Event, path: str, depth: int) -> None:
+        place = _place(self._place, event)
+        self._count_node(place, depth)
+        if not isinstance(event, ScalarEvent) or event.tag is not None:
+            raise place.error("a key must be plain text, not a list, a mapping or an alias")
+        key = event.value
+        if key == "<<":
             text = "merge keys (<<) are not read; write the fields out, or use *alias as a value"
-            raise self._problems.fail(line, text)
-        return node.text
-
-    def _insert(self, parent: MapNode, line: int, key: str, node: Node) -> None:
-        if key in parent.entries:
-            first = parent.entries[key][0]
-            above = [level.key[1] for level in self._open if level.key is not None]
-            path = ".".join(short(part) for part in [*above, key])
-            self._problems.add(line, f"{path} is given twice (first on line {first})")
+            raise place.error(text)
+        below = f"{path}.{short(key)}" if path else short(key)
+        value = self.node(next(self._events), place=place, path=below, depth=depth + 1)
+        if key in into:
+            first = into[key].place.line
+            self._problems.add(place, f"{below} is given twice (first on line {first})")
         else:
-            parent.entries[key] = (line, node)
+            into[key] = value
+
+    def _count_node(self, place: Place, depth: int) -> None:
+        self._count += 1
+        if self._count > MAX_NODES:
+            raise place.error(f"more than {MAX_NODES} values, aliases expanded")
+        if depth > MAX_DEPTH:
+            raise place.error(f"nested more than {MAX_DEPTH} levels deep")
+
+    def _count_nodes(self, node: Node, place: Place, depth: int) -> None:
+        self._count_node(place, depth)
+        inner = node.values() if isinstance(node, MapNode) else node
+        for below in () if isinstance(inner, ScalarNode) else inner:
+            self._count_nodes(below, place, depth + 1)
 
 
-def _events(text: str, problems: Problems) -> Iterator[yaml.Event]:
-    """PyYAML's events, its errors turned into ours."""
+def _place(place: Place, event: Event) -> Place:
+    """place: of the text's first line."""
+    if place.line is None:
+        return place
+    return replace(place, line=place.line + event.start_mark.line)
+
+
+def _events(text: str, place: Place) -> Iterator[Event]:
+    """The parser's events, its errors turned into ours."""
     try:
-        yield from yaml.parse(text, Loader=yaml.SafeLoader)
-    except yaml.reader.ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        code = error.character if isinstance(error.character, int) else ord(error.character)
-        raise problems.fail(line, f"not valid YAML: it holds the character U+{code:04X}") from None
-    except yaml.MarkedYAMLError as error:
+        yield from YAML(typ="safe", pure=True).parse(text)
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position)
+        raise _invalid(place, line, f"it holds the character U+{error.character:04X}") from None
+    except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        line = mark.line + 1 if mark else 1
-        what = " ".join(filter(None, (error.context, error.problem)))
-        hint = _tab_hint(text, line)
-        raise problems.fail(line, f"not valid YAML: {short(what, 160)}{hint}") from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:
-        # PyYAML lets chr() and int() raise on escapes and directives that are out of range.
-        raise problems.fail(1, f"not valid YAML: {short(str(error), 160)}") from None
+        line = mark.line if mark else 0
+        what = short(" ".join(filter(None, (error.context, error.problem))), 160)
+        tab = "\t" in "".join(text.splitlines()[line : line + 1])
+        hint = "; the line holds a tab: indent and separate with spaces" if tab else ""
+        raise _invalid(place, line, what + hint) from None
+    except (YAMLError, ValueError, OverflowError) as error:
+        # The parser lets chr() and int() raise on escapes and directives that are out of range.
+        raise _invalid(place, 0, short(str(error), 160)) from None
 
 
-def _tab_hint(text: str, line: int) -> str:
-    lines = text.splitlines()
-    written = lines[line - 1] if line <= len(lines) else ""
-    if "\t" in written:
-        return "; the line holds a tab: indent and separate with spaces"
-    return ""
+def _invalid(place: Place, line: int, what: str) -> Exception:
+    if place.line is not None:
+        place = replace(place, line=place.line + line)
+    return place.error(f"not valid YAML: {what}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
+from augment.render.constants import RasterSettings
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians
 
@@ -110,6 +112,16 @@ def _unit(quats: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
+def in_float64(gaussians: Gaussians) -> Gaussians:
+    """The same numbers in the precision in which the definition is taken for exact."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return dataclasses.replace(gaussians, **{n: getattr(gaussians, n).double() for n in names})
+
+
+def parts_in_float64(parts: list[PosedGaussians]) -> list[PosedGaussians]:
+    return [dataclasses.replace(part, gaussians=in_float64(part.gaussians)) for part in parts]
+
+
 def random_pose(seed: int = 0, translation=(0.5, -0.3, 0.2)) -> torch.Tensor:
     """A rigid world_from_part, float64 [4, 4]."""
     quat = torch.from_numpy(np.random.default_rng(seed).normal(size=4))
@@ -122,18 +134,25 @@ def slight_pose(translation=(0.1, 0.2, -0.1)) -> torch.Tensor:
     return rigid(rotmat_from_quat(quat), torch.tensor(translation, dtype=torch.float64))
 
 
-def golden_view(
-    path: Path, *, with_sh: bool, dtype=torch.float32
-) -> tuple[list[PosedGaussians], Camera, dict[str, np.ndarray]]:
-    """A stored scene as parts and a camera, and the file's arrays.
+GOLDEN = ("edge", "garden_small", "opaque")
+GOLDEN_MODES = (
+    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
+    *(f"a99_classic_sh{degree}" for degree in range(4)),
+)
 
-    with_sh: take the file's coefficients, else its plain colours.
+
+def golden_view(
+    folder: Path, name: str, mode: str, dtype=torch.float32
+) -> tuple[list[PosedGaussians], Camera, RasterSettings, dict[str, np.ndarray]]:
+    """A stored scene as parts, a camera and the mode's settings; arrays: the mode's images "rgb",
+    and where it takes plain colours "alpha" and "ED", beside what the file holds for all modes.
     """
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files}
+    with np.load(folder / "golden" / f"{name}.npz") as file:
+        arrays = {name.removeprefix(f"{mode}_"): file[name] for name in file.files}
+    with_sh = "_sh" in mode
     K = arrays["K"].astype(np.float64)
     camera = Camera(
-        name=path.stem,
+        name=name,
         width=int(arrays["width"]),
         height=int(arrays["height"]),
         fx=K[0, 0],
@@ -142,8 +161,13 @@ def golden_view(
         cy=K[1, 2],
         camera_from_world=torch.from_numpy(arrays["viewmat"]).to(torch.float64),
     )
+    settings = RasterSettings(
+        alpha_max=0.999 if mode.startswith("a999") else 0.99,
+        antialiased="_aa" in mode,
+        sh_degree=int(mode[-1]) if with_sh else None,
+    )
     arrays["quats"] = _unit(arrays["quats"].astype(np.float64))  # Gaussians hold unit quaternions
     sh = torch.from_numpy(arrays["sh"]).to(dtype) if with_sh else sh_of(arrays["colors"], dtype)
     names = ("means", "quats", "scales", "opacities")
     gaussians = Gaussians(**{n: torch.from_numpy(arrays[n]).to(dtype) for n in names}, sh=sh)
-    return [PosedGaussians(gaussians)], camera, arrays
+    return [PosedGaussians(gaussians)], camera, settings, arrays

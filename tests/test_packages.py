@@ -1,6 +1,6 @@
 """What holds for the packages as a whole: what importing does, and who imports whom."""
 
-import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,24 +16,18 @@ def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-@pytest.mark.parametrize("package", LAYERS)
-def test_imports_run_in_one_direction(package):
-    forbidden = set(LAYERS[LAYERS.index(package) + 1 :]) | {"tests"}
-    for path in modules(package):
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                assert node.level == 0, f"{path}: relative import"
-                names = [node.module or ""]
-            for name in names:
+IMPORT = re.compile(r"^\s*(?:from\s+(\S+)\s+import\b|import\s+(\S+))", re.MULTILINE)
+
+
+def test_imports_run_in_one_direction():
+    for number, package in enumerate(LAYERS):
+        forbidden = {*LAYERS[number + 1 :], "tests", ""} | (
+            {"torch"} if package == "recipes" else set()
+        )
+        for path in modules(package):
+            for names in IMPORT.findall(path.read_text()):
+                name = "".join(names)
                 assert name.split(".")[0] not in forbidden, f"{path} imports {name}"
-
-
-def test_recipes_need_no_torch():
-    for path in modules("recipes"):
-        assert "import torch" not in path.read_text(), path
 
 
 def test_importing_everything_compiles_nothing():

@@ -18,7 +18,14 @@ import tyro
 from pydantic import AfterValidator, Field, model_validator
 from tyro.conf import Positional, arg
 
-from tools.options import Command, FitOptions, SceneCommand, StyleTrainOptions
+from tools.options import (
+    Command,
+    FitOptions,
+    Overrides,
+    RecipeCommand,
+    SceneCommand,
+    StyleTrainOptions,
+)
 from tools.output import JsonFile, check_local, write_json
 
 if TYPE_CHECKING:
@@ -48,7 +55,7 @@ def _local(instead: str) -> AfterValidator:
     return AfterValidator(partial(check_local, instead=instead))
 
 
-class RenderOptions(SceneCommand):
+class RenderOptions(RecipeCommand):
     """Render a scene under recipes into images, depth, labels and a manifest.
 
     Run it again to go on after an interruption: what is finished is not rendered twice.
@@ -174,7 +181,7 @@ class InspectOptions(SceneCommand):
         return 0
 
 
-class ExplainOptions(SceneCommand):
+class ExplainOptions(RecipeCommand):
     """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
     Args:
@@ -192,32 +199,52 @@ class ExplainOptions(SceneCommand):
     json_file: JsonFile = None
 
     def run(self) -> int:
+        from recipes.load import load_recipe, read_overrides
         from tools.explain import explain_recipe, explanation_text
 
-        facts = explain_recipe(self.recipe, self.scene, self.variant, times=self.times)
+        template = load_recipe(self.recipe, read_overrides(self.overrides))
+        facts = explain_recipe(template, self.scene, self.variant, times=self.times)
         print(explanation_text(facts))
         write_json(self.json_file, facts)
         return 0
 
 
-def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> int:
-    """List the presets, print one of them, or write the JSON Schema that editors check against.
+class RecipesOptions(Command):
+    """List the presets, print a recipe or what it draws, or write the JSON Schema for editors.
 
     Args:
-        name: A preset to print.
-        schema: Write the JSON Schema of recipes to this file.
+        name: A preset or a recipe file to print.
+        draws: Print its ranges instead, and what every variant draws from them.
+        overrides: Replace a field, as for render, and print the draws.
+        schema_file: Write the JSON Schema of recipes to this file.
     """
-    from recipes.json_schema import write_schema
-    from recipes.load import preset_names, preset_text
 
-    if schema is not None:
-        write_schema(schema)
-        print(f"wrote {schema}")
-    elif name is not None:
-        print(preset_text(name), end="")
-    else:
-        print("\n".join(preset_names()))
-    return 0
+    name: Positional[str | None] = None
+    draws: bool = False
+    overrides: Overrides = ()
+    schema_file: Annotated[Path | None, arg(name="schema")] = None
+
+    def run(self) -> int:
+        from recipes.load import (
+            describe_preset,
+            load_recipe,
+            preset_names,
+            read_overrides,
+            recipe_text,
+        )
+        from recipes.recipe_file import write_schema
+
+        if self.schema_file is not None:
+            write_schema(self.schema_file)
+            print(f"wrote {self.schema_file}")
+        elif self.name is None:
+            for name in preset_names():
+                print(f"{name:<14} {describe_preset(name)}")
+        else:
+            template = load_recipe(self.name, read_overrides(self.overrides))
+            text = recipe_text(self.name).rstrip("\n")
+            print(template.describe_draws() if self.draws or self.overrides else text)
+        return 0
 
 
 class SheetOptions(Command):
@@ -465,7 +492,7 @@ COMMANDS = {
     "fit": FitOptions,
     "inspect": InspectOptions,
     "explain": ExplainOptions,
-    "recipes": recipes,
+    "recipes": RecipesOptions,
     "sheet": SheetOptions,
     "report": ReportOptions,
     "evaluate": EvaluateOptions,

@@ -29,6 +29,7 @@ from augment.views import render_view
 from recipes.fields import replaced
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
+from recipes.template import RecipeTemplate
 from tools.output import compiling_noted, fill
 
 FRAME = "frame"  # the whole view
@@ -162,7 +163,7 @@ def _short(value: Any) -> str:
 
 
 def explain_recipe(
-    recipe: str, scene_uri: str, variant: int = 0, *, times: bool = True
+    recipe: str | RecipeTemplate, scene_uri: str, variant: int = 0, *, times: bool = True
 ) -> dict[str, Any]:
     """Resolved numbers, plan and scene facts that decide what is rendered, and, with times, where
     the time of a few rendered views went.
@@ -170,7 +171,7 @@ def explain_recipe(
     A quality that has still to choose its settings does so with times, which also takes rendering;
     without, the plan is that of reference.
     """
-    template = load_recipe(recipe)
+    template = load_recipe(recipe) if isinstance(recipe, str) else recipe
     if variant >= (count := template.variants):
         there = f"{count} variants, 0 to {count - 1}" if count > 1 else "one variant, 0"
         raise ClimateGSError(f"--variant {variant}: {template.name} has {there}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from augment.reconstruct.config import FitConfig
 from tools.output import JsonFile, write_json
@@ -22,6 +22,7 @@ DEFAULT_MINUTES = 10.0
 DEPTH_KINDS = ("sparse", "metric", "relative")
 Device = Literal["cpu", "cuda"]
 _Value = TypeVar("_Value")
+Overrides = Annotated[tuple[str, ...], UseAppendAction, arg(name="set", metavar="FIELD=VALUE")]
 
 
 class Command(BaseModel):
@@ -68,6 +69,17 @@ class SceneCommand(Command):
     """
 
     cache: bool = True
+
+
+class RecipeCommand(SceneCommand):
+    """A command that takes recipes.
+
+    Args:
+        overrides: Replace a field of each recipe: weather.smog.visibility_m=60, or of a range
+            "weather.smog.visibility_m={uniform: [40, 80]}"; weather.smog=null takes the effect out.
+    """
+
+    overrides: Overrides = ()
 
 
 class FitOptions(FitConfig, SceneCommand):

@@ -46,7 +46,7 @@ from augment.sky import CubemapSky
 from augment.views import render_view
 from recipes.fields import found
 from recipes.job import load_job, load_job_recipes, scaled_recipe
-from recipes.load import load_recipe
+from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video
 from tools.export import mirror_outputs, recipes_for_source
@@ -316,7 +316,7 @@ def _size(count: float) -> str:
 def render_recipes(options: RenderOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
     out, backend = options.out, options.backend
-    recipes = resolve_recipes(options.recipes, options.variants, options.scale)
+    recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
     with compiling_noted(on_gpu=renders_on_gpu(backend)):
         warm_up(tried, backend)
@@ -375,7 +375,10 @@ def render_recipes(options: RenderOptions) -> int:
 
 
 def resolve_recipes(
-    names: Sequence[str], variants: int | None = None, scale: float = 1.0
+    names: Sequence[str],
+    variants: int | None = None,
+    scale: float = 1.0,
+    overrides: Sequence[str] = (),
 ) -> list[Recipe]:
     """The recipes' variants in numbers, at `scale` times each recipe's resolution.
 
@@ -385,7 +388,7 @@ def resolve_recipes(
     """
     resolved, known = [], dict[str, str]()
     for asked in names:
-        template = load_recipe(asked)
+        template = load_recipe(asked, read_overrides(overrides))
         if template.name in known:
             raise ClimateGSError(
                 f"the recipes {known[template.name]} and {asked} are both called "

@@ -428,7 +428,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             project's, or data of another scene. What is left out is in Scene.problems.
         SceneError: no usable Gaussians.
     """
-    options = RunOptions.from_query(query)
+    options = RunOptions.from_query("drivestudio", query)
     run = find_run(Path(path), options)
     numbers = options.frames.select(run.frames, where=f"drivestudio:{path}").numbers
     content = load_checkpoint(run.checkpoint)
@@ -492,7 +492,7 @@ def drivestudio_labels(path: str, query: dict[str, str]) -> DriveStudioLabels:
     Raises:
         AdapterError: as for open_drivestudio, as far as config and data are concerned.
     """
-    return DriveStudioLabels(find_run(Path(path), RunOptions.from_query(query)))
+    return DriveStudioLabels(find_run(Path(path), RunOptions.from_query("drivestudio", query)))
 
 
 def _actors(

@@ -33,11 +33,11 @@ from pydantic import (
 from adapters.camera_files.camera_files import Number, validate
 from adapters.plain_files import array_of, inside, read_json, read_numbers, read_pose, read_yaml
 from adapters.raw_drive import DriveOptions, stored_records
-from adapters.uri import check_query
+from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.files.checkpoints import section, taken, tensor
+from augment.files.checkpoints import finite_numbers, section
 from augment.files.image_size import read_image_header
 from augment.geometry import invert_rigid, quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
@@ -107,33 +107,25 @@ class RunConfig(BaseModel):
 
 # ---- What a drivestudio URI may ask for, as in `drivestudio:<run>?data=DIR&frames=0:50` ----------
 
-_KEYS = {
-    "data": "the processed scene's folder, such as data/waymo/processed/training/023",
-    "checkpoint": "the name of a checkpoint in the run, such as checkpoint_15000.pth",
-    "frames": "first:stop, numbers of the data's frames, either of them left out at will",
-}
+_DATA = "the processed scene's folder, such as data/waymo/processed/training/023"
+_Text = Annotated[str, Field(min_length=1)]
 
 
-@dataclass(frozen=True)
-class RunOptions:
+def _frames_option(text: object) -> DriveOptions:
+    return DriveOptions.from_query("drivestudio", {"frames": str(text)})
+
+
+class RunOptions(UriOptions):
     """Options of one opening; None where the run decides."""
 
-    data: str | None = None
-    checkpoint: str | None = None
-    frames: DriveOptions = field(default_factory=DriveOptions)
-
-    @staticmethod
-    def from_query(query: dict[str, str]) -> RunOptions:
-        check_query("drivestudio", query, _KEYS)
-        for key in ("data", "checkpoint"):
-            if query.get(key) == "":
-                raise AdapterError(f"drivestudio: {key} must be {_KEYS[key]}; got ''")
-        frames = {"frames": query["frames"]} if "frames" in query else {}
-        return RunOptions(
-            query.get("data"),
-            query.get("checkpoint"),
-            DriveOptions.from_query("drivestudio", frames),
-        )
+    data: _Text | None = Field(None, description=_DATA)
+    checkpoint: _Text | None = Field(
+        None, description="the name of a checkpoint in the run, such as checkpoint_15000.pth"
+    )
+    frames: Annotated[DriveOptions, BeforeValidator(_frames_option)] = Field(
+        DriveOptions(),
+        description="first:stop, numbers of the data's frames, either of them left out at will",
+    )
 
 
 # ---- What the processed data of each dataset means: cameras, axes, worlds, LiDAR columns ---------
@@ -325,7 +317,7 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions) -> 
     if options.data is not None:
         data = Path(options.data).expanduser()
         if not data.is_dir():
-            raise AdapterError(f"data={options.data}: no such folder; give {_KEYS['data']}")
+            raise AdapterError(f"data={options.data}: no such folder; give {_DATA}")
         return data
     root, scene = lookup(config, "data.data_root"), lookup(config, "data.scene_idx")
     reason = "its config.yaml does not say where the data is"
@@ -410,8 +402,8 @@ def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCo
 
 
 def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> ImageCorrections:
-    embedding = _numbers(content, "embedding.weight", (count, None), where)
-    hidden = _numbers(content, "decoder.0.weight", (None, None), where)
+    embedding = finite_numbers(content, "embedding.weight", (count, None), where)
+    hidden = finite_numbers(content, "decoder.0.weight", (None, None), where)
     width, inputs = hidden.shape
     if inputs == embedding.shape[1] + 2:
         problem = (
@@ -424,9 +416,9 @@ def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> Imag
             f"{where}: decoder.0.weight must take the {embedding.shape[1]} numbers of "
             f"embedding.weight; it takes {inputs}"
         )
-    hidden_bias = _numbers(content, "decoder.0.bias", (width,), where)
-    output = _numbers(content, "decoder.2.weight", (12, width), where)
-    output_bias = _numbers(content, "decoder.2.bias", (12,), where)
+    hidden_bias = finite_numbers(content, "decoder.0.bias", (width,), where)
+    output = finite_numbers(content, "decoder.2.weight", (12, width), where)
+    output_bias = finite_numbers(content, "decoder.2.bias", (12,), where)
 
     def decoded(embedding: np.ndarray) -> np.ndarray:
         values = np.maximum(embedding @ hidden.T + hidden_bias, 0) @ output.T + output_bias
@@ -441,7 +433,7 @@ def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndar
     The 6, of which the identity's were taken off, are its first two rows before Gram and Schmidt
     (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks", sec. B).
     """
-    values = _numbers(content, "embeds.weight", (count, 9), where)
+    values = finite_numbers(content, "embeds.weight", (count, 9), where)
     first = values[:, 3:6] + [1.0, 0, 0]
     second = values[:, 6:9] + [0, 1.0, 0]
     with np.errstate(all="ignore"):
@@ -454,15 +446,6 @@ def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndar
     if not np.isfinite(changes).all():
         raise AdapterError(f"{where}: embeds.weight holds rows that are no rotation")
     return changes
-
-
-def _numbers(
-    content: Mapping[str, Any], name: str, shape: tuple[int | None, ...], where: str
-) -> np.ndarray:
-    values = taken(tensor(content, name, shape, where)).double().numpy()
-    if not np.isfinite(values).all():
-        raise AdapterError(f"{where}: {name} holds NaN or infinite numbers")
-    return values
 
 
 # ---- Where car and cameras were ------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from adapters.lidar_scene.split import FLOOR_M, SKIN_M, Motion, inside_box
 from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.labels import EGO_VEHICLE, LidarSweep
+from augment.labels import EGO_VEHICLE, ClassifiesLidar, LidarSweep
 from augment.scene import Scene
 
 _NEAR_M = 0.1
@@ -59,22 +58,45 @@ def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
     return column.astype(np.int64)
 
 
-def project_points(
-    points: np.ndarray, camera: Camera, *, near_m: float, margin_px: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Indices of the points [N, 3] beyond near_m that the camera sees, not within margin_px of its
-    border; their columns and rows, int64 [M]; and depths, float64 [M]."""
-    transform = camera.camera_from_world.numpy()
-    local = points @ transform[:3, :3].T + transform[:3, 3]
-    index = np.flatnonzero(local[:, 2] > near_m)
-    x, y, z = local[index].T
-    u, v = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
-    inside = (u >= margin_px) & (u < camera.width - margin_px)
-    inside &= (v >= margin_px) & (v < camera.height - margin_px)
-    return index[inside], u[inside].astype(np.int64), v[inside].astype(np.int64), z[inside]
+@dataclass(frozen=True, eq=False)
+class DepthPixels:
+    """What is known of the depth at M pixels of one image. pixels: int32 [M], flat indices (row W +
+    column), increasing. depth_m: float32 [M], along the optical axis. weight: float32 [M], how much
+    it is trusted."""
+
+    pixels: np.ndarray
+    depth_m: np.ndarray
+    weight: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @staticmethod
+    def of(pixels: np.ndarray, depth_m: np.ndarray, weight: float = 1.0) -> DepthPixels:
+        """Of pixels in any order, some of them several times: the nearest depth of each remains."""
+        return DepthPixels._at(_nearest_of_each(pixels, depth_m), pixels, depth_m, weight)
+
+    @staticmethod
+    def _at(
+        index: np.ndarray, pixels: np.ndarray, depth_m: np.ndarray, weight: float
+    ) -> DepthPixels:
+        return DepthPixels(
+            pixels[index].astype(np.int32),
+            depth_m[index].astype(np.float32),
+            np.full(len(index), weight, np.float32),
+        )
+
+    def select(self, keep: np.ndarray) -> DepthPixels:
+        return DepthPixels(self.pixels[keep], self.depth_m[keep], self.weight[keep])
+
+    def image(self, camera: Camera) -> np.ndarray:
+        """float32 [H, W], 0 where nothing is known."""
+        out = np.zeros((camera.height, camera.width), np.float32)
+        out.reshape(-1)[self.pixels] = self.depth_m
+        return out
 
 
-def nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+def _nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     """Indices of the nearest of each pixel, in order of pixels; of equal depths the first."""
     order = np.lexsort((depth_m, pixels))
     first = np.ones(len(order), dtype=bool)
@@ -82,17 +104,28 @@ def nearest_of_each(pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     return order[first]
 
 
-@dataclass(frozen=True, eq=False)
-class SparseDepth:
-    """Depth at M pixels of one image, at most one a pixel, by rows. uv: int32 [M, 2], column and
-    row. depth_m: float32 [M], along the optical axis. timestamp_ns: int64 [M], of the return."""
-
-    uv: np.ndarray
-    depth_m: np.ndarray
-    timestamp_ns: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.depth_m)
+def project_points(
+    points: np.ndarray, camera: Camera, *, near_m: float, margin_px: int = 0
+) -> tuple[DepthPixels, np.ndarray]:
+    """The points [N, 3] beyond near_m as the camera sees them, the nearest of each pixel, none
+    within margin_px of the image's border; and their indices, int64 [M]. A pixel may show the depth
+    of something that a nearer object hides from the camera."""
+    transform = camera.camera_from_world.numpy()
+    local = points @ transform[:3, :3].T + transform[:3, 3]
+    index = np.flatnonzero(local[:, 2] > near_m)
+    x, y, z = local[index].T
+    u, v = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+    inside = (u >= margin_px) & (u < camera.width - margin_px)
+    inside &= (v >= margin_px) & (v < camera.height - margin_px)
+    u, v, z, index = (
+        u[inside].astype(np.int64),
+        v[inside].astype(np.int64),
+        z[inside],
+        index[inside],
+    )
+    pixels = v * camera.width + u
+    nearest = _nearest_of_each(pixels, z)
+    return DepthPixels._at(nearest, pixels, z, 1.0), index[nearest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,24 +140,26 @@ class FrameReturns:
     timestamps_ns: np.ndarray
     carried: tuple[tuple[Motion, np.ndarray, np.ndarray], ...]
 
-
-def lidar_depth(scene: Scene, frame_index: int, camera: Camera) -> SparseDepth:
-    """The frame's sweep as the camera would see it, the nearest return of each pixel; none without.
-
-    Returns on a moving object are carried along its track to the camera's time, and left out if it
-    is not there then; the lowest FLOOR_M of its box counts as ground. A pixel may show the depth of
-    something that a nearer object hides from the camera."""
-    returns = read_returns(scene, frame_index)
-    if returns is None:
-        return SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
-    return depth_seen(returns, camera)
+    def seen_by(self, camera: Camera) -> DepthPixels:
+        """The sweep as the camera would see it: returns on a moving object are carried along its
+        track to the camera's time, and left out if it is not there then; the lowest FLOOR_M of its
+        box counts as ground."""
+        points = self.points.copy()
+        present = np.ones(len(points), dtype=bool)
+        for motion, own, local in self.carried:
+            pose = motion.pose_at(camera.timestamp_ns)
+            if pose is None:
+                present[own] = False
+            else:
+                points[own] = local @ pose[:3, :3].T + pose[:3, 3]
+        return project_points(points[present], camera, near_m=_NEAR_M)[0]
 
 
 def read_returns(
-    scene: Scene, frame_index: int, *, without_semantic: Collection[int] = ()
+    scene: Scene, frame_index: int, *, of_surfaces: bool = False
 ) -> FrameReturns | None:
-    """The part of `lidar_depth` that all cameras of a frame share; None without a sweep.
-    without_semantic: class numbers of returns that are no surface, such as mirror images."""
+    """The frame's sweep; None without one. of_surfaces: without returns that no surface made, such
+    as mirror images, where the labels tell."""
     sweep = scene.lidar(frame_index)
     if sweep is None:
         return None
@@ -137,8 +172,9 @@ def read_returns(
     if times is None:
         times = np.full(len(sweep), frame_ns, np.int64)
     keep = np.isfinite(points).all(axis=1)
-    if without_semantic and "semantic" in sweep.columns:
-        keep &= ~np.isin(sweep.columns["semantic"], list(without_semantic))
+    if of_surfaces and isinstance(scene.labels, ClassifiesLidar):
+        classes = scene.labels.lidar_classes(sweep)
+        keep &= True if classes is None else classes >= 0
     points, times = points[keep], times[keep]
     carried = []
     for actor in scene.actors:
@@ -151,20 +187,3 @@ def read_returns(
         if own.any():
             carried.append((motion, near[own], local[own]))
     return FrameReturns(points, times, tuple(carried))
-
-
-def depth_seen(returns: FrameReturns, camera: Camera) -> SparseDepth:
-    """The part of `lidar_depth` that is the camera's own."""
-    points = returns.points.copy()
-    present = np.ones(len(points), dtype=bool)
-    for motion, own, local in returns.carried:
-        pose = motion.pose_at(camera.timestamp_ns)
-        if pose is None:
-            present[own] = False
-        else:
-            points[own] = local @ pose[:3, :3].T + pose[:3, 3]
-    seen, u, v, z = project_points(points[present], camera, near_m=_NEAR_M)
-    depth_m, uv = z.astype(np.float32), np.stack([u, v], 1).astype(np.int32)
-    chosen = nearest_of_each(v * camera.width + u, depth_m)
-    times = returns.timestamps_ns[present][seen]
-    return SparseDepth(uv[chosen], depth_m[chosen], times[chosen])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -104,13 +105,16 @@ def indices_between(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """One moving object. motion: the track again, for moving points."""
+    """One moving object."""
 
     track_id: str
     label: str
     track: Track
-    motion: Motion
     size_m: np.ndarray
+
+    @cached_property
+    def motion(self) -> Motion:
+        return Motion.of(self.track)
 
 
 def join_tracks(samples: Sequence[BoxSample]) -> tuple[ObjectTrack, ...]:
@@ -158,7 +162,7 @@ def _join(name: str, group: list[BoxSample]) -> ObjectTrack:
         torch.stack([pose for _, pose in kept]),
     )
     size_m = np.mean([s.size_m for s in group], axis=0)
-    return ObjectTrack(name, group[0].label, track, Motion.of(track), size_m)
+    return ObjectTrack(name, group[0].label, track, size_m)
 
 
 def _mean_pose(boxes: list[BoxSample]) -> tuple[int, torch.Tensor]:

@@ -22,7 +22,6 @@ from adapters.lidar_scene.split import PointSet, is_flat
 from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians
-from augment.semantics import SemanticClass
 from augment.semantics import SemanticClass as Class
 
 NEAR_M = 6.0  # voxels have their given size up to this distance from the path
@@ -34,7 +33,7 @@ _MAX_LEVEL = 15
 NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
 _COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
 _STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
-_UPRIGHT = (SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.SIGN)
+_UPRIGHT = (Class.BUILDING, Class.BARRIER, Class.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 _GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
 _THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
@@ -93,18 +92,13 @@ def _levels(points, path):  # pragma: no cover - compiled
     return out
 
 
-@numba.njit(cache=True)
-def _keys(points, level, edges):  # pragma: no cover - compiled
+def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """4 bits of level, then 20 a coordinate: 20 km each way at the finest edge."""
-    out = np.empty(len(points), np.uint64)
-    mask = np.uint64((1 << 20) - 1)
-    for i in range(len(points)):
-        key = np.uint64(level[i])
-        for axis in range(3):
-            cell = np.int64(np.floor(np.float64(points[i, axis]) / edges[level[i]])) + (1 << 19)
-            key = (key << np.uint64(20)) | (np.uint64(cell) & mask)
-        out[i] = key
-    return out
+    keys = level.astype(np.uint64)
+    for axis in range(3):
+        cells = np.floor(points[:, axis] / edges[level]).astype(np.int64) + (1 << 19)
+        keys = keys << np.uint64(20) | cells.astype(np.uint64) & np.uint64((1 << 20) - 1)
+    return keys
 
 
 @numba.njit(cache=True)
@@ -186,12 +180,12 @@ def surfels_from_points(
         spacing = np.repeat(edge_m[:, None], 2, 1).astype(np.float32)
         isolated, neighbours = np.ones(count, bool), np.zeros((count, 0), int)
         return Surfels(points, frame[:, 2], frame[:, 0], spacing, isolated, neighbours)
+    if semantic is None:
+        semantic = np.full(count, Class.UNKNOWN, np.int16)
     index, distance = find_neighbours(points, edge_m)
     axes = _principal_axes(points, index, semantic)
-    if semantic is None:
-        semantic = np.zeros(count, np.int16)
     endless = is_flat(semantic)
-    firm = endless | _is_upright(semantic) | (semantic == SemanticClass.UNKNOWN)
+    firm = endless | _is_upright(semantic) | (semantic == Class.UNKNOWN)
     stretch = np.where(firm, _STRETCH_FIRM, _STRETCH).astype(np.float32) * edge_m
     spacing = _spacing(points, index, axes[:, 0], axes[:, 2], edge_m, stretch, endless)
     # On a surface thinned to edge_m the fourth neighbour is a little over one edge away.
@@ -210,19 +204,16 @@ def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray,
     return np.concatenate([near, sample[far]], axis=1), distance
 
 
-def _principal_axes(
-    points: np.ndarray, index: np.ndarray, semantic: np.ndarray | None
-) -> np.ndarray:
+def _principal_axes(points: np.ndarray, index: np.ndarray, semantic: np.ndarray) -> np.ndarray:
     """Axis of largest variance, middle one, and normal of every point, float32 [N, 3 axes, 3]."""
     values, vectors = np.linalg.eigh(_covariances(points, index))
     major, normal = vectors[:, :, 2], vectors[:, :, 0]
-    if semantic is not None:
-        on_line = (values[:, 1] < _LINE * values[:, 2]) & (np.abs(major[:, 2]) < 0.9)
-        sideways = np.cross(major, np.array([0.0, 0.0, 1.0]))
-        hints = [(is_flat(semantic), np.cross(sideways, major)), (_is_upright(semantic), sideways)]
-        for mask, hint in hints:
-            hint = hint / np.maximum(np.linalg.norm(hint, axis=1, keepdims=True), 1e-9)
-            normal = np.where((mask & on_line)[:, None], hint, normal)
+    on_line = (values[:, 1] < _LINE * values[:, 2]) & (np.abs(major[:, 2]) < 0.9)
+    sideways = np.cross(major, np.array([0.0, 0.0, 1.0]))
+    hints = [(is_flat(semantic), np.cross(sideways, major)), (_is_upright(semantic), sideways)]
+    for mask, hint in hints:
+        hint = hint / np.maximum(np.linalg.norm(hint, axis=1, keepdims=True), 1e-9)
+        normal = np.where((mask & on_line)[:, None], hint, normal)
     return np.stack([major, np.cross(normal, major), normal], axis=1).astype(np.float32)
 
 
@@ -249,6 +240,26 @@ def _covariances(points, index):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True)
+def _tangent(offset, e1, n):  # pragma: no cover - compiled
+    """An offset along e1, along n x e1 and along n; and which half axis it lies nearest to:
+    e1, -e1, n x e1 or its opposite."""
+    e2x = n[1] * e1[2] - n[2] * e1[1]
+    e2y = n[2] * e1[0] - n[0] * e1[2]
+    e2z = n[0] * e1[1] - n[1] * e1[0]
+    dx, dy, dz = offset
+    u = dx * e1[0] + dy * e1[1] + dz * e1[2]
+    v = dx * e2x + dy * e2y + dz * e2z
+    w = dx * n[0] + dy * n[1] + dz * n[2]
+    side = (0 if u > 0 else 1) if abs(u) >= abs(v) else (2 if v > 0 else 3)
+    return u, v, w, side
+
+
+@numba.njit(cache=True)
+def _offset(points, i, j):  # pragma: no cover - compiled
+    return (points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2])
+
+
+@numba.njit(cache=True)
 def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma: no cover - compiled
     """Mean over both sides of the gap to the nearest neighbour on the plane within 45 degrees of
     each tangent half axis. With one side far emptier this is the surface's rim, or one of two
@@ -257,24 +268,14 @@ def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma:
     out = np.empty((len(points), 2), np.float32)
     gaps = np.empty(4)
     for i in range(len(points)):
-        e1, n = major[i], normals[i]
-        e2x = n[1] * e1[2] - n[2] * e1[1]
-        e2y = n[2] * e1[0] - n[0] * e1[2]
-        e2z = n[0] * e1[1] - n[1] * e1[0]
         gaps[:] = np.inf
         for j in index[i]:
-            dx = points[j, 0] - points[i, 0]
-            dy = points[j, 1] - points[i, 1]
-            dz = points[j, 2] - points[i, 2]
-            u = dx * e1[0] + dy * e1[1] + dz * e1[2]
-            v = dx * e2x + dy * e2y + dz * e2z
-            w = dx * n[0] + dy * n[1] + dz * n[2]
+            u, v, w, side = _tangent(_offset(points, i, j), major[i], normals[i])
             reach = np.sqrt(u * u + v * v)
             # Nearer than half an edge is the same sample seen from the next voxel.
             # Steeper than 1 in 2 off the plane is another surface.
             if reach < 0.5 * edge_m[i] or abs(w) > 0.5 * reach:
                 continue
-            side = (0 if u > 0 else 1) if abs(u) >= abs(v) else (2 if v > 0 else 3)
             gaps[side] = min(gaps[side], reach)
         for axis in range(2):
             a, b = gaps[2 * axis], gaps[2 * axis + 1]
@@ -302,19 +303,15 @@ class SplatShape:
 
 
 def gaussians_from_surfels(
-    surfels: Surfels,
-    colours: np.ndarray,
-    semantic: np.ndarray | None = None,
-    shape: SplatShape = SplatShape(),
+    surfels: Surfels, colours: np.ndarray, semantic: np.ndarray, shape: SplatShape = SplatShape()
 ) -> Gaussians:
     """Degree-0 Gaussians flattened along the surfels' normals.
 
-    colours: float32 [N, 3] in [0, 1]. semantic: int16 [N] or None."""
+    colours: float32 [N, 3] in [0, 1]. semantic: int16 [N]."""
     second = np.cross(surfels.normals, surfels.major)
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
     sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
-    if semantic is not None:
-        sigma[is_flat(semantic)] = _GROUND_SIGMA_PER_SPACING
+    sigma[is_flat(semantic)] = _GROUND_SIGMA_PER_SPACING
     tangent = surfels.spacing * sigma[:, None]
     thin = np.maximum(tangent.min(axis=1) * _THICKNESS, _MIN_THICKNESS_M)
     scales = np.concatenate([tangent, thin[:, None]], axis=1).astype(np.float32)
@@ -324,7 +321,7 @@ def gaussians_from_surfels(
         scales=torch.from_numpy(scales),
         opacities=torch.full((len(surfels),), shape.opacity),
         sh=((torch.from_numpy(colours).float() - 0.5) / SH_C0)[:, None, :],
-        semantic=None if semantic is None else torch.from_numpy(semantic.astype(np.int16)),
+        semantic=torch.from_numpy(semantic.astype(np.int16)),
     )
 
 
@@ -380,9 +377,23 @@ def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointS
         return PointSet(points.points[:0], points.semantic[:0])
     column = _columns(some, edges)
     order = np.lexsort((some[:, 2], column))
-    return PointSet(
-        *_fill(some[order], edges[order], classes[order], column[order], MAX_WALL_GAP_M, _SPARSER)
-    )
+    some, edges, classes, column = some[order], edges[order], classes[order], column[order]
+    gap, longest = np.diff(some[:, 2]), _SPARSER * edges[:-1].astype(np.float64)
+    is_open = (column[:-1] == column[1:]) & (longest < gap) & (gap <= MAX_WALL_GAP_M)
+    below = np.flatnonzero(is_open)
+    pair, along = _cuts(np.ceil(gap[below] / longest[below]).astype(np.int64))
+    below = below[pair]
+    new = some[below] * (1 - along.astype(np.float64)) + some[below + 1] * along
+    return PointSet(new.astype(np.float32), classes[below])
+
+
+def _cuts(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of pairs of points with so many pieces between them, int64 [P]: the pair of each cut, int64
+    [M], and its part of the way, float32 [M, 1]."""
+    inner = np.maximum(pieces - 1, 0)
+    pair = np.repeat(np.arange(len(pieces)), inner)
+    step = np.arange(len(pair)) - np.repeat(np.cumsum(inner) - inner, inner) + 1
+    return pair, (step / pieces[pair]).astype(np.float32)[:, None]
 
 
 def _columns(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -391,29 +402,6 @@ def _columns(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     level = np.round(4 * np.log2(size)).astype(np.int64) + 64
     cell = np.floor(points[:, :2] / size[:, None]).astype(np.int64) + (1 << 23)
     return (level << 48) | (cell[:, 0] << 24) | cell[:, 1]
-
-
-@numba.njit(cache=True)
-def _fill(points, edges, classes, column, widest, sparser):  # pragma: no cover - compiled
-    total = 0
-    for i in range(len(points) - 1):
-        gap = points[i + 1, 2] - points[i, 2]
-        if column[i] == column[i + 1] and sparser * edges[i] < gap <= widest:
-            total += int(np.ceil(gap / (sparser * edges[i]))) - 1
-    out = np.empty((total, 3), np.float32)
-    out_class = np.empty(total, np.int16)
-    n = 0
-    for i in range(len(points) - 1):
-        gap = points[i + 1, 2] - points[i, 2]
-        if column[i] == column[i + 1] and sparser * edges[i] < gap <= widest:
-            pieces = int(np.ceil(gap / (sparser * edges[i])))
-            for k in range(1, pieces):
-                f = np.float32(k / pieces)
-                for a in range(3):
-                    out[n, a] = points[i, a] * (1 - f) + points[i + 1, a] * f
-                out_class[n] = classes[i]
-                n += 1
-    return out, out_class
 
 
 def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
@@ -426,11 +414,7 @@ def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> Point
         edge_m, widest,
     )  # fmt: skip
     length = np.linalg.norm(points.points[a] - points.points[b], axis=1)
-    pieces = np.ceil(length / edge_m[a]).astype(np.int64)
-    inner = np.maximum(pieces - 1, 0)
-    pair = np.repeat(np.arange(len(a)), inner)
-    step = np.arange(len(pair)) - np.repeat(np.cumsum(inner) - inner, inner) + 1
-    along = (step / pieces[pair]).astype(np.float32)[:, None]
+    pair, along = _cuts(np.ceil(length / edge_m[a]).astype(np.int64))
     new = points.points[a[pair]] * (1 - along) + points.points[b[pair]] * along
     return PointSet(new, points.semantic[a[pair]])
 
@@ -445,18 +429,10 @@ def _find_bridges(
     count = 0
     gaps, who = np.empty(4), np.empty(4, np.int64)
     for i in range(len(points)):
-        n, e1 = normals[i], major[i]
-        e2x = n[1] * e1[2] - n[2] * e1[1]
-        e2y = n[2] * e1[0] - n[0] * e1[2]
-        e2z = n[0] * e1[1] - n[1] * e1[0]
         gaps[:] = np.inf
         for j in index[i]:
-            dx = points[j, 0] - points[i, 0]
-            dy = points[j, 1] - points[i, 1]
-            dz = points[j, 2] - points[i, 2]
-            u = dx * e1[0] + dy * e1[1] + dz * e1[2]
-            v = dx * e2x + dy * e2y + dz * e2z
-            w = dx * n[0] + dy * n[1] + dz * n[2]
+            dx, dy, dz = _offset(points, i, j)
+            _, _, w, side = _tangent((dx, dy, dz), major[i], normals[i])
             m = normals[j]
             wj = dx * m[0] + dy * m[1] + dz * m[2]
             reach = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -465,7 +441,6 @@ def _find_bridges(
             # Further off either tangent plane than a quarter of the way is another surface.
             if max(abs(w), abs(wj)) > 0.25 * reach:
                 continue
-            side = (0 if u > 0 else 1) if abs(u) >= abs(v) else (2 if v > 0 else 3)
             if reach < gaps[side]:
                 gaps[side], who[side] = reach, j
         for side in range(4):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -41,26 +39,20 @@ def value_noise(points: np.ndarray, seed: int = 0) -> np.ndarray:
     base = np.floor(points)
     share = (points - base).astype(np.float32)
     share = share * share * (3 - 2 * share)
-    steps = _STEPS[: points.shape[1]]
-    index = base.astype(np.int64) @ steps + seed * 7919
+    index = sum(base[:, k].astype(np.int64) * _STEPS[k] for k in range(points.shape[1]))
+    index = index + seed * 7919
 
     def blend(offset: int, axes: int) -> np.ndarray:
         if axes == 0:
-            return _table()[(index + offset) & (TABLE_SIZE - 1)]
-        low, high = blend(offset, axes - 1), blend(offset + int(steps[axes - 1]), axes - 1)
+            return _TABLE[(index + offset) & (len(_TABLE) - 1)]
+        low, high = blend(offset, axes - 1), blend(offset + _STEPS[axes - 1], axes - 1)
         return low + share[:, axes - 1] * (high - low)
 
     return blend(0, points.shape[1])
 
 
-TABLE_SIZE = 1 << 16
-_STEPS = np.array([1, 40503, 12289])  # far apart in the table, whichever few cells are compared
-
-
-@lru_cache(maxsize=1)
-def _table() -> np.ndarray:
-    integers = np.arange(TABLE_SIZE, dtype=np.int32)[:, None]
-    return 2 * hashed(integers, 1) - 1
+_TABLE = 2 * hashed(np.arange(1 << 16, dtype=np.int32)[:, None], 1) - 1
+_STEPS = (1, 40503, 12289)  # far apart in the table, whichever few cells are compared
 
 
 def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray:
@@ -115,13 +107,13 @@ class Spots(NamedTuple):
 
 def albedo(shapes: Shapes, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
     """Linear albedo [N, 3] on shapes [N] at local coordinates [N, 3]."""
-    material, points = shapes.material[shape], shapes.points(shape, local)
-    out = shapes.rgb[shape]
+    material, out = shapes.material[shape], shapes.rgb[shape]
     for value in np.unique(material):
         if rule := _RULES.get(Material(int(value))):
             here = np.flatnonzero(material == value)
-            variation = shapes.variation[shape[here]]
-            out[here] = rule(Spots(out[here], variation, local[here], points[here]))
+            own, at = shape[here], local[here]
+            points = shapes.points(own, at)
+            out[here] = rule(Spots(out[here], shapes.variation[own], at, points))
     return np.clip(out, 0.0, 1.0)
 
 
@@ -246,69 +238,76 @@ ALL_EDGES = U0 | U1 | V0 | V1
 OPEN_DIAGONAL = 16
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """What a surface looks like. rgb: linear albedo. ambient: share of sky light that reaches it.
     spacing: its splats' distance relative to other surfaces as far away. backed: whether half a
     metre of nothing lies behind it, where a second layer of splats may stand."""
 
-    rgb: tuple[float, float, float]
+    rgb: Sequence[float] | np.ndarray
     semantic: SemanticClass
     material: Material = Material.PLAIN
     ambient: float = 1.0
     spacing: float = 1.0
     backed: bool = False
 
-    def tinted(self, rgb: Sequence[float]) -> Look:
-        return dataclasses.replace(self, rgb=tuple(float(c) for c in rgb))
+    def tinted(self, rgb: Sequence[float] | np.ndarray) -> Look:
+        return self._replace(rgb=rgb)
 
 
-@dataclass(frozen=True, eq=False)
-class Shapes:
-    """P shapes. origin [P, 3], axes [P, 3, 3] (rows u, v, w), metres.
+class Shapes(np.recarray):
+    """P shapes: an array of records, each field an attribute. origin [P, 3], axes [P, 3, 3] (rows
+    u, v, w), metres.
 
     shading: [P, 3, 3], of flat kinds and leaves: what light takes for the normal is
     shading[0] + u shading[1] + v shading[2]. variation [P]: in [0, 1), tells equal shapes apart.
     """
 
-    kind: np.ndarray
-    origin: np.ndarray
-    axes: np.ndarray
-    shading: np.ndarray
-    rgb: np.ndarray
-    material: np.ndarray
-    semantic: np.ndarray
-    edges: np.ndarray
-    ambient: np.ndarray
-    spacing: np.ndarray
-    backed: np.ndarray
-    variation: np.ndarray
+    FIELDS = np.dtype([
+        ("origin", "3f8"), ("axes", "(3,3)f8"), ("shading", "(3,3)f8"), ("rgb", "3f8"),
+        ("ambient", "f8"), ("spacing", "f8"), ("variation", "f8"),
+        ("material", "i2"), ("semantic", "i2"), ("kind", "i1"), ("edges", "u1"), ("backed", "?"),
+    ], align=True)  # fmt: skip
 
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def select(self, index: np.ndarray) -> Shapes:
-        return Shapes(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
+    @classmethod
+    def of(
+        cls,
+        kind: Kind,
+        origin: np.ndarray,
+        axes: Sequence[np.ndarray],
+        look: Look,
+        edges: np.ndarray | int = 0,
+        shading: Sequence[np.ndarray] | None = None,
+    ) -> Shapes:
+        """Shapes of one kind and look. origin, and the vectors u, v, w of axes: [P, 3] or [1, 3].
+        shading: its three vectors; the normal w unless given."""
+        count = max(len(values) for values in (origin, *axes))
+        out = np.zeros(count, cls.FIELDS)
+        for name, value in zip(Look._fields, look, strict=True):
+            out[name] = value
+        out["kind"], out["origin"], out["edges"] = kind, origin, edges
+        for row, vector in enumerate(axes):
+            out["axes"][:, row] = vector
+        for row, vector in enumerate(shading or axes[2:]):
+            out["shading"][:, row] = vector
+        out["variation"] = (np.arange(count) * 0.618034 + 0.37) % 1.0
+        return out.view(cls)
 
     def moved(self, translation: Sequence[float], yaw_rad: float = 0.0) -> Shapes:
         """The shapes turned about z, then shifted."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # rows: images of x, y, z
-        return dataclasses.replace(
-            self,
-            origin=self.origin @ turn + np.asarray(translation, np.float64),
-            axes=self.axes @ turn,
-            shading=self.shading @ turn,
-        )
+        out = self.copy()
+        out["origin"] = self.origin @ turn + np.asarray(translation, np.float64)
+        out["axes"], out["shading"] = self.axes @ turn, self.shading @ turn
+        return out
 
     def repeated(self, translations: np.ndarray) -> Shapes:
         """A copy at each translation [M, 3]."""
-        count, copies = len(self), len(translations)
-        index = np.tile(np.arange(count), copies)
-        shifts = np.repeat(np.asarray(translations, np.float64), count, axis=0)
-        copied = self.select(index)
-        variation = (copied.variation + np.repeat(np.arange(copies) * 0.618034, count)) % 1.0
-        return dataclasses.replace(copied, origin=copied.origin + shifts, variation=variation)
+        out = join([self] * len(translations))
+        out["origin"] += np.repeat(translations, len(self), axis=0)
+        step = np.repeat(np.arange(len(translations)) * 0.618034, len(self))
+        out["variation"] = (out.variation + step) % 1.0
+        return out
 
     def points(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Positions [N, 3] of local coordinates [N, 3] on shapes [N]."""
@@ -323,55 +322,31 @@ class Shapes:
             q[self.kind[chosen] == Kind.CYLINDER, 2] = 0
             axes = self.axes[chosen]
             gradient = np.einsum("nk,nkj->nj", q / (axes**2).sum(2), axes)  # axes are orthogonal
-            normals[curved] = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+            normals[curved] = unit(gradient)
         return normals
 
     def shading_normals(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Unit normals [N, 3] that light sees: smooth across the panels of a mesh."""
         normals = self.normals(shape, local)
         flat = (self.kind[shape] < Kind.ELLIPSOID) | (self.material[shape] == Material.LEAF)
-        bent = self.shading[shape[flat]]
-        q = local[flat]
-        smooth = bent[:, 0] + q[:, :1] * bent[:, 1] + q[:, 1:2] * bent[:, 2]
-        normals[flat] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+        bent, q = self.shading[shape[flat]], local[flat]
+        normals[flat] = unit(bent[:, 0] + q[:, :1] * bent[:, 1] + q[:, 1:2] * bent[:, 2])
         return normals
 
 
 def join(parts: Sequence[Shapes]) -> Shapes:
     """All parts in one."""
-    return Shapes(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Shapes))
-    )
+    return np.concatenate(parts).view(Shapes)
 
 
-def make_shapes(
-    kind: Kind,
-    origin: np.ndarray,
-    axes: np.ndarray,
-    look: Look,
-    *,
-    edges: np.ndarray | int = 0,
-    shading: np.ndarray | None = None,
-) -> Shapes:
-    """Shapes of one kind and look, from origin [P, 3] and axes [P, 3, 3]."""
-    count = len(origin)
-    if shading is None:
-        shading = np.zeros((count, 3, 3))
-        shading[:, 0] = axes[:, 2]
-    return Shapes(
-        kind=np.full(count, kind, np.int8),
-        origin=np.asarray(origin, np.float64),
-        axes=np.asarray(axes, np.float64),
-        shading=shading,
-        rgb=np.tile(np.asarray(look.rgb, np.float64), (count, 1)),
-        material=np.full(count, look.material, np.int16),
-        semantic=np.full(count, look.semantic, np.int16),
-        edges=np.broadcast_to(np.asarray(edges, np.uint8), (count,)).copy(),
-        ambient=np.full(count, look.ambient),
-        spacing=np.full(count, look.spacing),
-        backed=np.full(count, look.backed),
-        variation=(np.arange(count) * 0.618034 + 0.37) % 1.0,
-    )
+def joined(build: Callable[..., Iterable[Shapes]]) -> Callable[..., Shapes]:
+    """Makes of a builder that yields parts one that returns them in one."""
+    return functools.wraps(build)(lambda *args, **options: join([*build(*args, **options)]))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors [N, 3] at length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 # ---- Cutting rectangles around holes, so that splats line up with every edge between colours -----
@@ -448,18 +423,22 @@ def xyz(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float) -> 
     return np.stack(np.broadcast_arrays(x, y, z), -1)
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products [..., 3]: what np.cross gives, in half its time."""
+    (ax, ay, az), (bx, by, bz) = (np.moveaxis(v, -1, 0) for v in (a, b))
+    return xyz(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+
+
 def _rows(values: Vectors) -> np.ndarray:
-    return np.atleast_2d(np.asarray(values, np.float64))
+    return np.asarray(values, np.float64).reshape(-1, 3)
 
 
 def parallelograms(
     origin: Vectors, u: Vectors, v: Vectors, look: Look, *, edges: np.ndarray | int = ALL_EDGES
 ) -> Shapes:
     """Flat panels with corner `origin` and sides u, v; they face u x v."""
-    origin, u, v = np.broadcast_arrays(_rows(origin), _rows(u), _rows(v))
-    normal = np.cross(u, v)
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    return make_shapes(Kind.PARALLELOGRAM, origin, np.stack([u, v, normal], 1), look, edges=edges)
+    origin, u, v = _rows(origin), _rows(u), _rows(v)
+    return Shapes.of(Kind.PARALLELOGRAM, origin, (u, v, unit(cross(u, v))), look, edges)
 
 
 def boxes(
@@ -471,44 +450,37 @@ def boxes(
     edges: int = ALL_EDGES,
 ) -> Shapes:
     """Axis-aligned boxes between corners low and high; the named faces only."""
-    low, high = np.broadcast_arrays(_rows(low), _rows(high))
-    sides = []
-    for face in faces:
-        axis, outward = "xyz".index(face[1]), face[0] == "+"
-        first, second = ((axis + 1) % 3, (axis + 2) % 3)[:: 1 if outward else -1]
-        corner, u, v = low.copy(), np.zeros_like(low), np.zeros_like(low)
-        if outward:
-            corner[:, axis] = high[:, axis]
-        u[:, first] = (high - low)[:, first]
-        v[:, second] = (high - low)[:, second]
-        sides.append((corner, u, v))
-    joined = (np.concatenate(part) for part in zip(*sides, strict=True))
-    return parallelograms(*joined, look, edges=edges)
+    low, high = _rows(low), _rows(high)
+    along = np.eye(3)[["xyz".index(face[1]) for face in faces], None]  # [F, 1, 3]
+    outward = np.array([face[0] == "+" for face in faces])[:, None, None]
+    corner = np.where((along > 0) & outward, high, low)  # [F, B, 3]
+    second, third = np.roll(along, 1, -1) * (high - low), np.roll(along, 2, -1) * (high - low)
+    u, v = np.where(outward, second, third), np.where(outward, third, second)
+    return parallelograms(corner, u, v, look, edges=edges)
 
 
 def disc(centre: Sequence[float], normal: Sequence[float], radius_m: float, look: Look) -> Shapes:
     """A flat round plate."""
     u, v, w = _frame(np.asarray(normal, np.float64))
-    axes = np.stack([u * radius_m, v * radius_m, w])[None]
-    return make_shapes(Kind.DISC, _rows(centre), axes, look)
+    return Shapes.of(Kind.DISC, _rows(centre), _each(u * radius_m, v * radius_m, w), look)
 
 
 def tube(start: Sequence[float], end: Sequence[float], radius_m: float, look: Look) -> Shapes:
     """A round tube between two points, open at its ends."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     u, v, _ = _frame(b - a)
-    axes = np.stack([u * radius_m, v * radius_m, (b - a) / 2])[None]
-    return make_shapes(Kind.CYLINDER, _rows((a + b) / 2), axes, look)
+    axes = _each(u * radius_m, v * radius_m, (b - a) / 2)
+    return Shapes.of(Kind.CYLINDER, _rows((a + b) / 2), axes, look)
 
 
-def ellipsoids(centres: np.ndarray, axes: np.ndarray, look: Look) -> Shapes:
+def ellipsoids(centres: Vectors, axes: np.ndarray, look: Look) -> Shapes:
     """Ellipsoids with orthogonal semi-axes axes [P, 3, 3] (rows), metres."""
-    return make_shapes(Kind.ELLIPSOID, _rows(centres), axes, look)
+    return Shapes.of(Kind.ELLIPSOID, _rows(centres), axes.transpose(1, 0, 2), look)
 
 
 def ball(centre: Sequence[float], radii: Sequence[float], look: Look) -> Shapes:
     """One ellipsoid along the coordinate axes."""
-    return ellipsoids(_rows(centre), np.diag(np.asarray(radii, np.float64))[None], look)
+    return ellipsoids(centre, np.diag(np.asarray(radii, np.float64))[None], look)
 
 
 def quads(corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None) -> Shapes:
@@ -520,39 +492,35 @@ def quads(corners: np.ndarray, look: Look, *, normals: np.ndarray | None = None)
     corners = np.asarray(corners, np.float64)
     slack = np.abs(corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]).max(1)
     whole = (slack < 1e-9) & (normals is None)
-    parts = []
-    if whole.any():
-        a, b, _, d = corners[whole].transpose(1, 0, 2)
-        parts.append(parallelograms(a, b - a, d - a, look, edges=0))
-    if not whole.all():
-        c = corners[~whole]
-        for (i, j, k), flag in (((0, 1, 3), 0), ((2, 3, 1), OPEN_DIAGONAL)):
-            shading = None
-            if normals is not None:
-                n0, n1, n2 = normals[:, i], normals[:, j], normals[:, k]
-                shading = np.stack([n0, n1 - n0, n2 - n0], 1)
-            parts.append(_triangles(c[:, i], c[:, j], c[:, k], look, flag, shading))
+    a, b, _, d = corners[whole].transpose(1, 0, 2)
+    c = corners[~whole]
+    parts = [parallelograms(a, b - a, d - a, look, edges=0)]
+    for (i, j, k), flag in (((0, 1, 3), 0), ((2, 3, 1), OPEN_DIAGONAL)):
+        shading = None
+        if normals is not None:
+            shading = normals[:, i], normals[:, j] - normals[:, i], normals[:, k] - normals[:, i]
+        parts.append(triangles(c[:, i], c[:, j], c[:, k], look, flag, shading))
     return join(parts)
 
 
-def triangle(corners: np.ndarray, look: Look) -> Shapes:
-    """One triangle [3, 3], facing (c1 - c0) x (c2 - c0)."""
-    return _triangles(*np.asarray(corners, np.float64)[:, None], look)
-
-
-def _triangles(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, look: Look, edges: int = 0, shading=None
-) -> Shapes:
+def triangles(
+    a: Vectors, b: Vectors, c: Vectors, look: Look, edges: int = 0,
+    shading: Sequence[np.ndarray] | None = None,
+) -> Shapes:  # fmt: skip
+    """Triangles, facing (b - a) x (c - a)."""
+    a = _rows(a)
     u, v = b - a, c - a
-    w = np.cross(u, v)
-    axes = np.stack([u, v, w / np.linalg.norm(w, axis=1, keepdims=True)], 1)
-    return make_shapes(Kind.TRIANGLE, a, axes, look, edges=edges, shading=shading)
+    return Shapes.of(Kind.TRIANGLE, a, (u, v, unit(cross(u, v))), look, edges, shading)
 
 
 def _frame(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit u, v, w, right-handed, with w along the direction."""
     w = direction / np.linalg.norm(direction)
     helper = np.array([1.0, 0.0, 0.0]) if abs(w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    u = np.cross(helper, w)
+    u = cross(helper, w)
     u /= np.linalg.norm(u)
-    return u, np.cross(w, u), w
+    return u, cross(w, u), w
+
+
+def _each(*vectors: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(vector[None] for vector in vectors)

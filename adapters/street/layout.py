@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -83,8 +84,7 @@ TERRAIN_REACH_M = 230.0
 TERRAIN_Z_M = 0.03
 
 
-@dataclass(frozen=True)
-class Plot:
+class Plot(NamedTuple):
     """One building or garden. side: +1 left, -1 right of the street."""
 
     x0: float
@@ -94,12 +94,10 @@ class Plot:
     is_garden: bool
 
 
-@dataclass(frozen=True)
-class Mover:
+class Mover(NamedTuple):
     """Something that goes straight along x at a steady speed (negative: towards -x)."""
 
-    name: str
-    kind: str  # "car" or "pedestrian"
+    name: str  # car-0, pedestrian-1
     x_m: float  # at the first frame
     y_m: float
     speed_mps: float
@@ -113,13 +111,13 @@ class Layout:
     parameters: StreetParameters
     x0: float
     x1: float
-    plots: tuple[Plot, ...]
+    zebra_x: float
+    plots: list[Plot]
     trees: np.ndarray  # [T, 2]
     lamps: np.ndarray  # [L, 2]
     signs: np.ndarray  # [S, 2]
     parked: np.ndarray  # [C, 2]
-    zebra_x: float
-    movers: tuple[Mover, ...]
+    movers: list[Mover]
 
 
 def road_z(y: np.ndarray | float) -> np.ndarray | float:
@@ -141,43 +139,36 @@ def stream(parameters: StreetParameters, *key: int) -> np.random.Generator:
 def draw_layout(parameters: StreetParameters) -> Layout:
     """The plan of a street."""
     length = parameters.path_length_m
-    x0, x1 = -62.0, length + 86.0
-    zebra_x = length + 15.0
-    lamps = _lamps(x0, x1)
+    x0, x1, zebra_x = -62.0, length + 86.0, length + 15.0
+    y = ROAD_HALF_M + 0.55
+    rows = (np.arange(x0 + 10.0, x1 - 4.0, 26.0), y), (np.arange(x0 + 23.0, x1 - 4.0, 26.0), -y)
+    lamps = np.concatenate([np.stack([x, np.full_like(x, side)], 1) for x, side in rows])
     return Layout(
-        parameters=parameters,
-        x0=x0,
-        x1=x1,
-        plots=tuple(_plots(stream(parameters, 1), x0, x1)),
+        parameters,
+        x0,
+        x1,
+        zebra_x,
+        plots=_plots(stream(parameters, 1), x0, x1),
         trees=_trees(stream(parameters, 2), x0, x1, lamps, zebra_x),
         lamps=lamps,
         signs=_signs(stream(parameters, 3), zebra_x, length),
         parked=_parked(stream(parameters, 4), parameters.parked, length, zebra_x),
-        zebra_x=zebra_x,
-        movers=tuple(_movers(stream(parameters, 5), parameters)),
+        movers=_movers(stream(parameters, 5), parameters),
     )
 
 
 def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[Plot]:
     plots = []
     for side in (1, -1):
-        x, last_was_garden = x0 - 2.0, True
+        x, garden = x0 - 2.0, True
         while x < x1 - 3.0:
-            garden = not last_was_garden and x < x1 - 20 and rng.random() < 0.13
-            width = rng.uniform(4.5, 7.5) if garden else rng.uniform(7.5, 13.0)
-            end = x + width
+            garden = not garden and x < x1 - 20 and rng.random() < 0.13  # never two in a row
+            end = x + (rng.uniform(4.5, 7.5) if garden else rng.uniform(7.5, 13.0))
             if x1 + 1.0 - end < 7.0:
-                end = x1 + 1.0
-                garden = False
+                end, garden = x1 + 1.0, False
             plots.append(Plot(x, end, side, int(rng.integers(2**31)), garden))
-            x, last_was_garden = end, garden
+            x = end
     return plots
-
-
-def _lamps(x0: float, x1: float) -> np.ndarray:
-    y = ROAD_HALF_M + 0.55
-    rows = (np.arange(x0 + 10.0, x1 - 4.0, 26.0), y), (np.arange(x0 + 23.0, x1 - 4.0, 26.0), -y)
-    return np.concatenate([np.stack([x, np.full_like(x, side)], 1) for x, side in rows])
 
 
 def _trees(
@@ -203,35 +194,33 @@ def _signs(rng: np.random.Generator, zebra_x: float, length: float) -> np.ndarra
 
 
 def _parked(rng: np.random.Generator, count: int, length: float, zebra_x: float) -> np.ndarray:
-    slots = []
-    for side in (1, -1):
-        for x in np.arange(-26.0, length + 58.0, 6.1):
-            if abs(x - zebra_x) > 5.5:
-                slots.append((x + rng.uniform(-0.4, 0.4), side * PARKED_Y_M))
+    slots = [
+        (x + rng.uniform(-0.4, 0.4), side * PARKED_Y_M)
+        for side in (1, -1)
+        for x in np.arange(-26.0, length + 58.0, 6.1)
+        if abs(x - zebra_x) > 5.5
+    ]
     chosen = rng.permutation(len(slots))[:count]
     return np.array([slots[i] for i in sorted(chosen)]).reshape(-1, 2)
 
 
+# x at the first frame, side of the road, speed; of the ego car's where it drives the same way.
+CARS = (
+    (17.0, -1, 0.6), (34.0, 1, -9.0), (-13.0, -1, -0.4),
+    (62.0, 1, -8.2), (-24.0, 1, -9.5), (33.0, -1, 0.9),
+)  # fmt: skip
+
+
 def _movers(rng: np.random.Generator, parameters: StreetParameters) -> list[Mover]:
-    ego, lane = parameters.speed_mps, LANE_M / 2
-    cars = [
-        (17.0, -lane, ego + 0.6),
-        (34.0, lane, -9.0),
-        (-13.0, -lane, ego - 0.4),
-        (62.0, lane, -8.2),
-        (-24.0, lane, -9.5),
-        (33.0, -lane, ego + 0.9),
-    ]
-    movers = [
-        Mover(f"car-{i}", "car", x, y, v, int(rng.integers(2**31)))
-        for i, (x, y, v) in enumerate(cars[: parameters.moving])
-    ]
+    movers = []
+    for i, (x, side, speed) in enumerate(CARS[: parameters.moving]):
+        speed += parameters.speed_mps if side < 0 else 0.0
+        movers.append(Mover(f"car-{i}", x, side * LANE_M / 2, speed, int(rng.integers(2**31))))
     for i in range(parameters.pedestrians):
         side, direction = (-1, 1)[i % 2], (1, -1)[(i // 2 + i) % 2]
         x = rng.uniform(7, 10) + 4.5 * i + parameters.path_length_m * 0.25
         y, speed = side * rng.uniform(7.7, 8.5), direction * rng.uniform(1.2, 1.6)
-        seed = int(rng.integers(2**31))
-        movers.append(Mover(f"pedestrian-{i}", "pedestrian", x, y, speed, seed))
+        movers.append(Mover(f"pedestrian-{i}", x, y, speed, int(rng.integers(2**31))))
     return movers
 
 
@@ -270,12 +259,6 @@ def camera_path(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.n
     return ego_pose(parameters, timestamps_ns)[0] + np.array([0.0, 0.0, CAMERA_Z_M])
 
 
-def world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
-    """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
-    positions, yaws = ego_pose(parameters, np.array([timestamp_ns]))
-    return _rigid(positions[0], float(yaws[0]))
-
-
 def frame_time_ns(index: int) -> int:
     return START_NS + index * FRAME_NS
 
@@ -286,36 +269,32 @@ def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
     for index in range(parameters.frames):
         time = frame_time_ns(index)
         cameras = {name: _camera(parameters, name, time) for name in MOUNTS}
-        pose = torch.from_numpy(world_from_ego(parameters, time))
+        pose = torch.from_numpy(_world_from_ego(parameters, time))
         frames.append(Frame(index, time, pose, cameras))
     return tuple(frames)
 
 
+def _world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
+    """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
+    positions, yaws = ego_pose(parameters, np.array([timestamp_ns]))
+    return _rigid(positions[0], float(yaws[0]))
+
+
 def camera_offset_ns(name: str) -> int:
     """How long after the frame's time a camera fires."""
-    return round(-MOUNTS[name][2] / 360 * FRAME_NS) % FRAME_NS - (
-        FRAME_NS if MOUNTS[name][2] > 0 and name != "back" else 0
-    )
+    yaw_deg = MOUNTS[name][2]
+    before = FRAME_NS if yaw_deg > 0 and name != "back" else 0
+    return round(-yaw_deg / 360 * FRAME_NS) % FRAME_NS - before
 
 
 def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
     forward, left, yaw_deg = MOUNTS[name]
-    time = frame_ns + camera_offset_ns(name)
+    time, width, height = frame_ns + camera_offset_ns(name), parameters.width, parameters.height
     mount = _rigid(np.array([forward, left, CAMERA_Z_M]), math.radians(yaw_deg))
     mount[:3, :3] = mount[:3, :3] @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
-    world_from_camera = world_from_ego(parameters, time) @ mount
-    focal_px = parameters.width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
-    return Camera(
-        name=name,
-        width=parameters.width,
-        height=parameters.height,
-        fx=focal_px,
-        fy=focal_px,
-        cx=parameters.width / 2,
-        cy=parameters.height / 2,
-        camera_from_world=torch.from_numpy(invert_pose(world_from_camera)),
-        timestamp_ns=time,
-    )
+    pose = torch.from_numpy(invert_pose(_world_from_ego(parameters, time) @ mount))
+    focal_px = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
+    return Camera(name, width, height, focal_px, focal_px, width / 2, height / 2, pose, time)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,12 +331,10 @@ def motion_of(mover: Mover, layout: Layout, height_m: float, ground_z: float) ->
     on_street = (x > layout.x0 + 3) & (x < layout.x1 - 3)
     if not on_street.any():
         on_street[0] = True
-    frames, x = frames[on_street], x[on_street]
-    centres = np.stack(
-        [x, np.full_like(x, mover.y_m), np.full_like(x, ground_z + height_m / 2)], -1
-    )
+    y, z = np.full((2, len(x)), [[mover.y_m], [ground_z + height_m / 2]])
     yaw = 0.0 if mover.speed_mps >= 0 else math.pi
-    return Motion(START_NS + frames.astype(np.int64) * FRAME_NS, centres, yaw)
+    times = START_NS + frames[on_street].astype(np.int64) * FRAME_NS
+    return Motion(times, np.stack([x, y, z], -1)[on_street], yaw)
 
 
 def _rigid(translation: np.ndarray, yaw_rad: float) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -83,8 +84,10 @@ class Body:
         for place in places:
             base += albedo(shapes, shape, place)
         points, smooth = shapes.points(shape, local), shapes.shading_normals(shape, local)
-        facing = np.maximum(self._facing_sun(shape, local), 0)
-        sun = facing * self._sun_share(shape, places) * lighting.sunlit
+        facing = smooth @ lighting.to_sun
+        leaf = shapes.material[shape] == Material.LEAF  # light also comes through from behind
+        facing = np.maximum(np.where(leaf, 0.35 + 0.65 * np.abs(facing), facing), 0)
+        sun = facing * self._sun_share(shape, places, facing > 0) * lighting.sunlit
         sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
         upward = 0.5 + 0.5 * smooth[:, 2]
         ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
@@ -99,18 +102,17 @@ class Body:
         veil = 1 - np.exp(-np.maximum(distance - 25, 0) / 260)
         return encode_display(radiance * (1 - veil)[:, None] + veil[:, None] * HAZE_RGB * 0.8)
 
-    def _sun_share(self, shape: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Share of the sun's disc that is seen, [N], averaged over the places (G divides
-        SUN_SAMPLES). Half of the rays are cast first; the others only where those disagree."""
+    def _sun_share(self, shape: np.ndarray, places: np.ndarray, lit: np.ndarray) -> np.ndarray:
+        """Share of the sun's disc that is seen where shapes are lit, [N], averaged over the places
+        (G divides SUN_SAMPLES). Half of the rays are cast first; the others only where those
+        disagree."""
         directions = self.lighting.sun_directions()
-        seen = np.zeros(len(shape))
-        index = np.flatnonzero(self._facing_sun(shape, places[0]) > 0)
+        seen, index = np.zeros(len(shape)), np.flatnonzero(lit)
         for half in range(2):
             for number in range(half, SUN_SAMPLES, 2):
                 local = places[(number // 2) % len(places), index]
                 origins = self._off_surface(shape[index], local)
-                rays = np.broadcast_to(directions[number], origins.shape)
-                seen[index] += ~self.tree.occluded(origins, rays)
+                seen[index] += ~self.tree.occluded(origins, directions[number])
             if half == 0:
                 doubtful = (seen[index] > 0) & (seen[index] < SUN_SAMPLES / 2)
                 seen[index[~doubtful]] *= 2
@@ -125,12 +127,6 @@ class Body:
         size = np.linalg.norm(shapes.axes[shape[leaf]], axis=2).max(1, keepdims=True)
         points[leaf] = shapes.origin[shape[leaf]] + 1.05 * size * self.lighting.to_sun
         return points
-
-    def _facing_sun(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Cosine of the sun's angle of incidence; light also comes through leaves from behind."""
-        facing = self.shapes.shading_normals(shape, local) @ self.lighting.to_sun
-        leaf = self.shapes.material[shape] == Material.LEAF
-        return np.where(leaf, 0.35 + 0.65 * np.abs(facing), facing)
 
 
 def _sky_share(lighting: Lighting, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -207,8 +203,19 @@ CLOUD_SHADE_RGB = np.array([0.62, 0.67, 0.74])
 CLOUD_HEIGHT = 1.0  # clouds lie on a plane; its height only sets their size against the noise
 
 
-def build_sky(seed: int, to_sun: np.ndarray) -> CubemapSky:
-    """A cubemap of display-encoded colours."""
+def direction_to_sun(seed: int) -> np.ndarray:
+    """Unit vector to the sun: behind one shoulder of the driver, high enough to reach the road."""
+    rng = np.random.default_rng([seed, 6])
+    azimuth = np.radians(rng.uniform(118, 150)) * rng.choice([-1, 1])
+    height = np.radians(rng.uniform(43, 54))
+    flat = np.cos(height)
+    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(height)])
+
+
+@lru_cache(maxsize=2)
+def build_sky(seed: int) -> CubemapSky:
+    """A cubemap of display-encoded colours; the last two are kept."""
+    to_sun = direction_to_sun(seed)
     directions = directions_of_cubemap(FACE_SIZE).numpy().reshape(-1, 3)
     faces = np.empty_like(directions)
     above = directions[:, 2] > -0.03

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,6 +35,37 @@ BLEND_LEAD = 0.62
 BACKED_BLEND_LEAD = 0.41
 
 
+@dataclass(frozen=True, eq=False)
+class SplatPlan:
+    """Surfaces of one body, split where they are long, ready to be sampled at any coarseness.
+
+    spacing [P, 2]: of splats along both axes, metres per unit of coarseness. sink [P]: how far
+    below its surface splats lie, in spacings, so that their blend is seen on it. hidden [P]: no
+    camera sees it, so that its splats may be few but must keep clear of rims.
+    """
+
+    body: Body
+    shapes: Shapes
+    spacing: np.ndarray
+    sink: np.ndarray
+    hidden: np.ndarray
+
+    def counts(self, coarseness: float) -> np.ndarray:
+        """Cells of the first layer along both axes, [P, 2]."""
+        along = np.maximum(self.spacing * coarseness, MIN_M)
+        return cell_counts(self.shapes, along, self.hidden)
+
+    def backing(self, counts: np.ndarray) -> np.ndarray:
+        """Cells of the second layer, [P, 2]; none where there is no such layer."""
+        is_backed = self.shapes.backed & ~self.hidden & (counts.min(1) >= BACKED_FROM)
+        return np.where(is_backed[:, None], -(-counts // BACKING), 0)
+
+    def total(self, coarseness: float) -> int:
+        counts = self.counts(coarseness)
+        first = total_cells(self.shapes, counts, self.hidden)
+        return first + int(self.backing(counts).prod(1).sum())
+
+
 def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
     """The same surfaces, long parallelograms halved until one spacing suits all of each."""
     done = []
@@ -44,48 +76,39 @@ def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
         built = shapes.semantic != SemanticClass.TERRAIN
         limit[built] = np.minimum(limit, SPLIT_M[1])[built]
         split = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
-        done.append(shapes.select(np.flatnonzero(~split)))
-        shapes = _halved(shapes.select(np.flatnonzero(split)), sides[split].argmax(1))
+        done.append(shapes[~split])
+        shapes = _halved(shapes[split], sides[split].argmax(1))
     return join(done)
 
 
 def _halved(shapes: Shapes, axis: np.ndarray) -> Shapes:
     """Both halves of each parallelogram along its axis; only outer edges stay crisp."""
-    rows = np.arange(len(shapes))
-    first, second = shapes.select(rows), shapes.select(rows)
-    for half in (first, second):
-        half.axes[rows, axis] *= 0.5
+    rows, first = np.arange(len(shapes)), shapes.copy()
+    first.axes[rows, axis] *= 0.5
+    second = first.copy()
     second.origin[:] += second.axes[rows, axis]
-    low, high = np.array([U0, V0], np.uint8)[axis], np.array([U1, V1], np.uint8)[axis]
-    first.edges[:] &= ~high
-    second.edges[:] &= ~low
+    first.edges[:] &= ~np.array([U1, V1], np.uint8)[axis]
+    second.edges[:] &= ~np.array([U0, V0], np.uint8)[axis]
     return join([first, second])
 
 
-def plan_spacing(
-    shapes: Shapes, tree: Tree, eyes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How densely shapes seen from eyes [E, 3], in the shapes' frame, are to be covered. tree: what
-    may hide them.
-
-    Returns spacing along [P, 2] both axes, metres per unit of coarseness; how far below its surface
-    splats lie, in spacings, so that their blend is seen on it [P]; and hidden [P]: no camera sees
-    it, so that its splats may be few but must keep clear of rims.
-    """
+def plan_splats(body: Body, eyes: np.ndarray) -> SplatPlan:
+    """How a body seen from eyes [E, 3] (its frame) is to be sampled."""
+    shapes = split_long(body.shapes, eyes)
     distance, view = _sightings(shapes, eyes)
-    unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
-    cosine = np.einsum("epk,pak->epa", view, unit)
+    sides = shapes.axes[:, :2]
+    sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+    cosine = np.einsum("epk,pak->epa", view, sides)
     stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MAX_STRETCH**2))
     along = (distance[..., None] * stretch).min(0)
     flat = shapes.kind <= Kind.DISC
-    slant = np.abs(np.einsum("epk,pk->ep", view, shapes.axes[:, 2]))
-    facing = np.einsum("epk,pk->ep", view, shapes.axes[:, 2]) < 0
+    slant = np.einsum("epk,pk->ep", view, shapes.axes[:, 2])
     tuft = shapes.material == Material.LEAF
-    hidden = ((shapes.kind != Kind.ELLIPSOID) | tuft) & ~_in_sight(shapes, tree, eyes)
+    hidden = ((shapes.kind != Kind.ELLIPSOID) | tuft) & ~_in_sight(shapes, body.tree, eyes)
     along[hidden & flat] *= HIDDEN_STRETCH
     along *= shapes.spacing[:, None]
-    sink = np.where(flat, _sink(distance, slant, facing, cosine, along, shapes.backed), 0.25)
-    return along, sink, hidden
+    sink = np.where(flat, _sink(distance, slant, cosine, along, shapes.backed), 0.25)
+    return SplatPlan(body, shapes, along, sink, hidden)
 
 
 def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
@@ -135,15 +158,15 @@ def _sightings(shapes: Shapes, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.maximum(length, np.abs(nearest[..., 2]) / STEEPEST), view
 
 
-def _sink(distance, slant, facing, cosine, along, backed) -> np.ndarray:
+def _sink(distance, slant, cosine, along, backed) -> np.ndarray:
     """Depth below the surface [P], per unit of spacing, that puts the blend on it in the mean.
 
-    distance, slant, facing [E, P] and cosine [E, P, 2]: of the eyes. along [P, 2], backed [P]. A
-    splat that lies h below the surface is seen h / slant further along the ray; blending brings it
-    some part of a spacing nearer along the surface. No depth suits all eyes: the weighted median
-    makes the error least where most pixels are spent on the surface.
+    distance, slant [E, P] (negative: facing the eye) and cosine [E, P, 2]: of the eyes. along
+    [P, 2], backed [P]. A splat that lies h below the surface is seen h / slant further along the
+    ray; blending brings it some part of a spacing nearer along the surface. No depth suits all
+    eyes: the weighted median makes the error least where most pixels are spent on the surface.
     """
-    slant = np.clip(slant, 0.04, 1)
+    facing, slant = slant < 0, np.clip(np.abs(slant), 0.04, 1)
     level = np.sqrt(1 - slant**2)
     reach = np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6)
     lead = np.where(backed, BACKED_BLEND_LEAD, BLEND_LEAD)
@@ -172,25 +195,19 @@ HIDDEN_TUFTS_DROPPED = 0.6
 FINE_FROM = 7  # cells along a side from which its crisp edges get two more rows, not one
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
+class Cells(NamedTuple):
     """shape [N]; local [N, 3]: the cell's middle; sides [N, 2, 3]: its sides in the shape's local
-    coordinates; edges [N, 2, 3]: the same in metres."""
+    coordinates."""
 
     shape: np.ndarray
     local: np.ndarray
     sides: np.ndarray
-    edges: np.ndarray
-
-    def select(self, index: np.ndarray) -> Cells:
-        return Cells(self.shape[index], self.local[index], self.sides[index], self.edges[index])
 
     def places(self) -> np.ndarray:
         """Four places in each cell, local coordinates [4, N, 3]."""
         a, b = self.sides[:, 0] / 4, self.sides[:, 1] / 4
-        return np.stack(
-            [self.local + i * a + j * b for i, j in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
-        )
+        around = ((-1, -1), (1, 1), (-1, 1), (1, -1))
+        return np.stack([self.local + i * a + j * b for i, j in around])
 
 
 def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -206,10 +223,11 @@ def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.n
     counts[disc, 1] = np.ceil(round_length / spacing.min(1))[disc]
     counts[tube, 0] = np.maximum(MIN_ROUND, np.ceil(round_length / spacing.min(1)))[tube]
     counts[tube, 1] = np.maximum(2, np.ceil(2 * length[:, 2] / spacing.max(1)))[tube]
-    counts[blob, 0] = np.maximum(MIN_BLOB, np.ceil(_area(length) / spacing.min(1) ** 2))[blob]
-    counts[blob, 1] = 1
     tuft = shapes.material == Material.LEAF
     counts[tuft] = 1
+    blob &= ~tuft
+    each = np.ceil(_area(length[blob]) / spacing[blob].min(1) ** 2)
+    counts[blob] = xyz(np.maximum(MIN_BLOB, each), 1, 0)[:, :2]
     counts = np.maximum(counts, 1)
     panel = shapes.kind == Kind.PARALLELOGRAM
     counts[hidden & panel & (length[:, :2].max(1) < MIN_HIDDEN_M)] = 0
@@ -220,30 +238,23 @@ def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.n
 
 def total_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> int:
     """How many cells these counts come to, nearly (triangles and discs are estimated)."""
-    m = counts + _graded(shapes, np.arange(len(shapes)), counts, hidden).sum(2)
-    each = (m[:, 0] * m[:, 1]).astype(np.float64)
-    each[shapes.kind == Kind.TRIANGLE] *= 0.5
-    each[shapes.kind == Kind.DISC] *= 0.5
-    tube = shapes.kind == Kind.CYLINDER
-    each[tube] = (counts[:, 0] * (counts[:, 1] + 2))[tube]
-    return int(each.sum())
+    m = counts + _graded(shapes, slice(None), counts, hidden).sum(2)
+    m[:, 1] += 2 * (shapes.kind == Kind.CYLINDER)
+    share = np.where(np.isin(shapes.kind, (Kind.TRIANGLE, Kind.DISC)), 0.5, 1.0)
+    return int((share * m.prod(1)).sum())
 
 
 def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
     """All cells of all shapes; counts [P, 2] and hidden [P] as in cell_counts."""
     parts = []
-    for kinds, build in (
-        ((Kind.PARALLELOGRAM, Kind.TRIANGLE), _flat_cells),
-        ((Kind.DISC,), _disc_cells),
-        ((Kind.CYLINDER,), _tube_cells),
-        ((Kind.ELLIPSOID,), _blob_cells),
+    for build, *kinds in (
+        (_flat_cells, Kind.PARALLELOGRAM, Kind.TRIANGLE),
+        (_disc_cells, Kind.DISC),
+        (_tube_cells, Kind.CYLINDER),
+        (_blob_cells, Kind.ELLIPSOID),
     ):
         index = np.flatnonzero(np.isin(shapes.kind, kinds) & (counts[:, 0] > 0))
-        if len(index):
-            parts.append(build(shapes, index, counts[index], hidden))
-    if not parts:
-        none = np.zeros((0, 2, 3))
-        return Cells(np.zeros(0, np.int64), np.zeros((0, 3)), none, none)
+        parts.append(build(shapes, index, counts[index], hidden))
     shape, local, sides = (np.concatenate(p) for p in zip(*parts, strict=True))
     # Splats of hidden panels keep away from their crisp edges.
     index = np.flatnonzero(hidden[shape] & (shapes.kind[shape] == Kind.PARALLELOGRAM))
@@ -253,17 +264,15 @@ def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
         low, high = margin * ((edges & low_bit) > 0), margin * ((edges & high_bit) > 0)
         local[index, axis] = low + local[index, axis] * (1 - low - high)
         sides[index, axis] *= (1 - low - high)[:, None]
-    return Cells(shape, local, sides, np.einsum("nak,nkj->naj", sides, shapes.axes[shape]))
+    return Cells(shape, local, sides)
 
 
-def _graded(
-    shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray
-) -> np.ndarray:
+def _graded(shapes: Shapes, index, counts: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """Rows added at both ends of both axes, [I, 2 axes, 2 ends], for the shapes at index."""
     bits = np.array([[U0, U1], [V0, V1]], np.uint8)
-    flagged = (shapes.edges[index, None, None] & bits) > 0
+    flagged = (shapes.edges[index][:, None, None] & bits) > 0
     rows = (counts >= 2).astype(np.int64) + (counts >= FINE_FROM)
-    rows *= ((shapes.kind == Kind.PARALLELOGRAM) & ~hidden)[index, None]
+    rows *= ((shapes.kind == Kind.PARALLELOGRAM) & ~hidden)[index][:, None]
     return flagged * rows[:, :, None]
 
 
@@ -398,14 +407,10 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     origin = -(counts - 1) * CELL_M / 2
     x, y = (origin[k] + CELL_M * np.arange(counts[k]) for k in range(2))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    points = np.concatenate([grid, np.full((len(grid), 1), mover.ground_z)], 1)
-    directions = lighting.sun_directions()
-    shaded = np.zeros(len(points))
-    for direction in directions:
-        rays = np.broadcast_to(direction, points.shape)
-        shaded += mover.body.tree.occluded(points, rays)
+    points = np.concatenate([grid, np.full((len(grid), 1), lighting.ground_z)], 1)
+    shaded = [mover.body.tree.occluded(points, d) for d in lighting.sun_directions()]
     full_sun = lighting.sunlit * lighting.to_sun[2] * SUN_RGB.mean()
-    sun = (1 - shaded / len(directions)) * full_sun
+    sun = (1 - np.sum(shaded, axis=0) / len(shaded)) * full_sun
     rounding = 0.8 * half.min()
     outside = np.linalg.norm(np.maximum(np.abs(grid) - half + rounding, 0), axis=1) - rounding
     hidden = 0.8 / (1 + np.exp((outside - 0.02) / (0.11 * half.min() / 0.9)))
@@ -414,7 +419,7 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     cover = 1 - ((sun + sky) / lit) ** 0.45  # the display's encoding of that ratio, nearly
     rim = np.min(np.minimum(grid - origin, -origin - grid), axis=1)  # fade out before the grid ends
     cover = np.minimum(cover, MAX_COVER) * np.clip(rim / 0.3, 0, 1)
-    return ContactShadow(cover.reshape(counts), origin, mover.ground_z)
+    return ContactShadow(cover.reshape(counts), origin, lighting.ground_z)
 
 
 # ---- Gaussians of cells --------------------------------------------------------------------------
@@ -437,47 +442,13 @@ SHADOW_SPACING_M = 0.10
 SHADOW_HEIGHT_M = 0.035
 
 
-@dataclass(frozen=True, eq=False)
-class SplatPlan:
-    """Surfaces of one body, ready to be sampled at any coarseness; see plan_spacing."""
-
-    body: Body
-    shapes: Shapes
-    spacing: np.ndarray
-    sink: np.ndarray
-    hidden: np.ndarray
-
-    def counts(self, coarseness: float) -> np.ndarray:
-        """Cells of the first layer along both axes, [P, 2]."""
-        along = np.maximum(self.spacing * coarseness, MIN_M)
-        return cell_counts(self.shapes, along, self.hidden)
-
-    def backing(self, counts: np.ndarray) -> np.ndarray:
-        """Cells of the second layer, [P, 2]; none where there is no such layer."""
-        is_backed = self.shapes.backed & ~self.hidden & (counts.min(1) >= BACKED_FROM)
-        return np.where(is_backed[:, None], -(-counts // BACKING), 0)
-
-    def total(self, coarseness: float) -> int:
-        counts = self.counts(coarseness)
-        first = total_cells(self.shapes, counts, self.hidden)
-        return first + int(self.backing(counts).prod(1).sum())
-
-
-def plan_splats(body: Body, eyes: np.ndarray) -> SplatPlan:
-    """How a body seen from eyes [E, 3] (its frame) is to be sampled."""
-    shapes = split_long(body.shapes, eyes)
-    return SplatPlan(body, shapes, *plan_spacing(shapes, body.tree, eyes))
-
-
 def coarseness_for(plans: list[SplatPlan], target: int) -> float:
     """Spacing per metre of distance at which all plans together come to the target."""
     low, high = 1e-3, 0.2
     for _ in range(12):
         middle = float(np.sqrt(low * high))
-        if sum(plan.total(middle) for plan in plans) > target:
-            low = middle
-        else:
-            high = middle
+        too_many = sum(plan.total(middle) for plan in plans) > target
+        low, high = (middle, high) if too_many else (low, middle)
     return high
 
 
@@ -485,18 +456,14 @@ def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
     """The Gaussians of a body."""
     counts = plan.counts(coarseness)
     backing = plan.backing(counts)
-    cells = make_cells(plan.shapes, counts, plan.hidden)
-    cells = _uncovered(plan, cells)
+    cells = _uncovered(plan, make_cells(plan.shapes, counts, plan.hidden))
     share = _sigma_per_side(plan, counts, backing)[cells.shape]
     first = _gaussians(plan, cells, share, plan.sink[cells.shape])
     # Under the ground the second layer may run on past an edge; behind a wall's it would be seen.
     upright = plan.shapes.semantic == SemanticClass.BUILDING
     below = make_cells(plan.shapes, backing, upright & (backing[:, 0] > 0))
-    count = len(below.shape)
-    if count == 0:
-        return first
-    share = np.full((count, 2), SIGMA_PER_SIDE)
-    return join_gaussians([first, _gaussians(plan, below, share, np.ones(count))])
+    share = np.full((len(below.shape), 2), SIGMA_PER_SIDE)
+    return join_gaussians([first, _gaussians(plan, below, share, np.ones(len(share)))])
 
 
 def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) -> np.ndarray:
@@ -523,7 +490,7 @@ def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
         normals = plan.shapes.normals(shape, local[index])
         points = plan.shapes.points(shape, local[index]) + 0.003 * normals
         covered[index] = plan.body.tree.occluded(points, normals, BURIED_M)
-    return cells.select(np.flatnonzero(~covered))
+    return Cells(*(values[~covered] for values in cells))
 
 
 def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarray) -> Gaussians:
@@ -534,8 +501,9 @@ def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarra
     places[:, curved] = cells.local[curved]
     rgb = replace(plan.body, shapes=shapes).colors(shape, places)
     normals = shapes.normals(shape, cells.local)
-    frames, sigmas = _flat_covariance(cells.edges * share[:, :, None], normals)
-    sides = np.linalg.norm(cells.edges, axis=2)
+    edges = np.einsum("nak,nkj->naj", cells.sides, shapes.axes[shape])  # metres
+    frames, sigmas = _flat_covariance(edges * share[:, :, None], normals)
+    sides = np.linalg.norm(edges, axis=2)
     depth = sink * np.where(curved, sides.min(1), sides.max(1))
     means = shapes.points(shape, cells.local) - depth[:, None] * normals
     thin = np.clip(0.1 * sigmas.min(1), 0.002, 0.02)

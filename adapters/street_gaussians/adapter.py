@@ -33,10 +33,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.lidar_scene.scene import build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.scene import without_points
 from adapters.lidar_scene.split import join_tracks
 from adapters.plain_files import read_pose
-from adapters.raw_drive import BoxSample, DriveOptions, Sweep, objects_that_travel
+from adapters.raw_drive import (
+    BoxSample,
+    DriveOptions,
+    RawDrive,
+    Sweep,
+    is_in_box,
+    objects_that_travel,
+    scene_of_drive,
+)
 from adapters.safe_pickle import check_holds_object, stream_arrays
 from adapters.street_gaussians.data import (
     CAMERA_NAMES,
@@ -63,7 +71,6 @@ from adapters.street_gaussians.model import (
     read_checkpoint,
     read_ply_model,
 )
-from adapters.training_views.byte_cache import ByteCache
 from adapters.uri import format_uri
 from adapters.world import with_class_of
 from augment.cameras import Camera, Frame
@@ -71,8 +78,8 @@ from augment.errors import AdapterError
 from augment.files.pickles import PickleError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.memo import SceneMemo
 from augment.scene import Actor, ColorWaves, Scene, Track
-from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky
 
 
@@ -88,7 +95,7 @@ def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:
     """
     if is_dataset(Path(path)):
         return open_raw(Path(path), query)
-    options = ModelOptions.from_query(query)
+    options = ModelOptions.from_query(SCHEME, query)
     files = find_model(Path(path), options)
     data = read_data(files.data, files.config)
     recorded = frames_of(data)
@@ -101,7 +108,7 @@ def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:
     by_camera, by_image = color_maps(model.color_maps, data, files.config, str(model.file))
     recorded = [frame for frame in recorded if frame.index in chosen.numbers]
     frames = _with_model_cameras(recorded, data, changes, options.width)
-    actors, problems = _actors(data, model, changes, files.config, options.rotation_bug)
+    actors, problems = _actors(data, model, changes, files.config, options.rotation_bug == "1")
     sky = ConstantSky(torch.full((3,), float(files.config.white_background)))
     if model.sky is not None:
         sky = CubemapSky(model.sky)
@@ -136,7 +143,7 @@ def street_gaussians_labels(path: str, query: dict[str, str]) -> LabelSource | N
     """
     if is_dataset(Path(path)):
         return labels_of(Path(path))
-    return labels_of(find_model(Path(path), ModelOptions.from_query(query)).data)
+    return labels_of(find_model(Path(path), ModelOptions.from_query(SCHEME, query)).data)
 
 
 def _actors(
@@ -489,31 +496,29 @@ class PointCloud:
     points: np.ndarray
     projections: np.ndarray | None
 
-    @property
-    def nbytes(self) -> int:
-        return self.points.nbytes + (0 if self.projections is None else self.projections.nbytes)
-
 
 class _Reader:
     """One file being read forward, and the frames that were last passed by."""
 
     def __init__(self, path: Path, state: tuple[int, ...]) -> None:
         self.path, self.state = path, state
-        self._recent: ByteCache[PointCloud] = ByteCache(_KEPT_BYTES)
+        self._recent = SceneMemo(_KEPT_BYTES)
         self._all: set[int] | None = None  # frames of the file, known after a whole pass
         self._passed: set[int] = set()
         self._clouds = _clouds(path)
 
     def read(self, frame: int) -> PointCloud | None:
-        found = self._recent.get(frame)
-        if found is not None or (self._all is not None and frame not in self._all):
-            return found
+        return self._recent.get(frame, lambda: self._read_on(frame))
+
+    def _read_on(self, frame: int) -> PointCloud | None:
+        if self._all is not None and frame not in self._all:
+            return None
         if frame in self._passed:
             self.rewind()
         try:
             for number, cloud in self._clouds:
                 self._passed.add(number)
-                self._recent.put(number, cloud, cloud.nbytes)
+                self._recent.put(number, cloud)
                 if number == frame:
                     return cloud
         except BaseException:
@@ -715,8 +720,7 @@ def _table(path: Path, mtime_ns: int, size: int) -> TrackTable:
 # Waymo's uppermost LiDAR looks up by 2.4 degrees; those at the sides see further up, but not far.
 _LIDAR_TOP_DEG = 2.4
 # The recording car in its own frame, whose origin is below its rear axle, on the ground.
-_EGO_LOW_M = np.array([-1.4, -1.15, 0.1])
-_EGO_HIGH_M = np.array([4.2, 1.15, 2.4])
+_EGO_M = np.array([[-1.4, -1.15, 0.1], [4.2, 1.15, 2.4]])
 _STANDING = ("sign",)  # classes that never move
 
 
@@ -726,7 +730,7 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
     query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
     Opening is deterministic: the same files and options give the same bits.
     """
-    options = DriveOptions.from_query("street_gaussians", query)
+    options = DriveOptions.from_query(SCHEME, query)
     cams = calibrated_cameras(root)
     if not cams:
         raise AdapterError(
@@ -734,37 +738,29 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
         )
     data = read_data(root, ModelConfig(cameras=cams))
     frames = frames_of(data)
-    chosen = options.select([f.index for f in frames], where=f"street_gaussians:{root}")
+    chosen = options.select([f.index for f in frames], where=f"{SCHEME}:{root}")
     frames = tuple(frame for frame in frames if frame.index in set(chosen.numbers))
-    used = [frame for frame in frames if frame.index not in chosen.held_out]
-    if not any(frame.image_paths for frame in used):
-        raise AdapterError(
-            f"{root / 'images'} holds no usable image of the frames that are not held out "
-            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
-        )
-    sweeps, sweep_problems = _sweeps(root, used)
-    problems = data.problems + chosen.problems + sweep_problems
+    sweeps, sweep_problems = _sweeps(root, [f for f in frames if f.index not in chosen.held_out])
     table = read_track_table(track_files(root, use_tracker=False)[0])
-    tracks = join_tracks(_moving_samples(table, frames))
-    scene = build_lidar_scene(
-        sweeps,
-        tracks,
-        views_of(used),
-        options,
-        lidar_top_deg=_LIDAR_TOP_DEG,
+    drive = RawDrive(
         name=root.absolute().name,
-        source=format_uri("street_gaussians", root, query),
+        source=format_uri(SCHEME, root, query),
         frames=frames,
+        held_out=chosen.held_out,
+        sweeps=sweeps,
+        boxes=_moving_samples(table, frames),
         labels=StreetGaussiansLabels(root),
         world_origin_m=data.world_origin_m,
-        problems=problems,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        problems=(*data.problems, *chosen.problems, *sweep_problems),
     )
-    missing = without_points(tracks, scene)
-    faults = scene.problems[len(problems) :]
-    return dataclasses.replace(scene, problems=problems + missing + faults)
+    scene = scene_of_drive(drive, options)
+    missing = without_points(join_tracks(drive.boxes), scene)
+    faults = scene.problems[len(drive.problems) :]
+    return dataclasses.replace(scene, problems=drive.problems + missing + faults)
 
 
-def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, ...]]:
+def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
     """The usable returns of the frames in the scene's world, without the recording car's own, and a
     sentence where frames have none."""
     by_number = {frame.index: frame for frame in used}
@@ -773,30 +769,20 @@ def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, 
         frame = by_number.get(number)
         if frame is None:
             continue
-        own = ((cloud.points > _EGO_LOW_M) & (cloud.points < _EGO_HIGH_M)).all(axis=1)
+        own = is_in_box(cloud.points, *_EGO_M)
         points = cloud.points[~own & np.isfinite(cloud.points).all(axis=1)]
         pose = frame.world_from_ego.numpy()
-        sweeps[number] = Sweep(
-            (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32),
-            np.full(len(points), frame.timestamp_ns, np.int64),
-            np.full(len(points), SemanticClass.UNKNOWN, np.int16),
+        world = points @ pose[:3, :3].T + pose[:3, 3]
+        sweeps[number] = Sweep.of_unknown_class(world, frame.timestamp_ns)
+    problems = ()
+    if missing := sorted(set(by_number) - set(sweeps)):
+        problems = (
+            f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too",
         )
-    if not any(len(sweep) for sweep in sweeps.values()):
-        raise AdapterError(
-            f"{root / FILE} holds no returns of frames {used[0].index} to {used[-1].index}, or is "
-            f"missing; a scene cannot be built without them. Make it with the converter's LiDAR "
-            f"step, or give a trained model's folder"
-        )
-    missing = sorted(set(by_number) - set(sweeps))
-    found = [sweeps[number] for number in sorted(sweeps)]
-    if not missing:
-        return found, ()
-    return found, (
-        f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too",
-    )
+    return tuple(sweeps[number] for number in sorted(sweeps)), problems
 
 
-def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSample]:
+def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> tuple[BoxSample, ...]:
     """The boxes of the objects that move within the frames, by frame."""
     samples: list[BoxSample] = []
     for frame in frames:
@@ -816,4 +802,4 @@ def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSampl
             if table.labels[row] not in _STANDING
         ]
     moving = objects_that_travel((s.object_id, s.world_from_box[:3, 3]) for s in samples)
-    return [sample for sample in samples if sample.object_id in moving]
+    return tuple(sample for sample in samples if sample.object_id in moving)

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_yaml
 from adapters.raw_drive import DriveOptions
-from adapters.street_gaussians.data import ModelConfig
-from adapters.uri import check_query, choice_of, whole_number_of
+from adapters.street_gaussians.data import ModelConfig, Number
+from adapters.uri import UriOptions
 from augment.errors import AdapterError, SceneError
-from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
-from augment.files.ply import (
-    PlyElement,
-    PlyHeader,
-    count_surplus_bytes,
-    iterate_rows,
-    read_ply_header,
+from augment.files.checkpoints import (
+    finite_numbers,
+    load_checkpoint,
+    release,
+    section,
+    taken,
+    tensor,
 )
+from augment.files.ply import SEMANTIC, PlyElement, PlyHeader, read_columns, read_ply_header
 from augment.geometry import rotmat_from_quat
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, is_drawable
 
@@ -33,50 +35,45 @@ from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, 
 
 SCHEME = "street_gaussians"
 DEFAULT_WIDTH = 1600
-_KEYS = {
-    "data": "the dataset's folder, where it is not where the configuration says",
-    "iteration": "which of the saved iterations, a number; the newest without it",
-    "weights": "pth or ply; the .pth where there is one",
-    "width": f"images are at most so many pixels wide, {DEFAULT_WIDTH} without it; 0 as recorded",
-    "frames": "first:stop, frame numbers with stop excluded, either side may be empty",
-    "rotation_bug": "0 or 1; actors turned as an older release of the project turned them",
-}
 
 
-@dataclass(frozen=True)
-class ModelOptions:
-    """Options of one opening; see _KEYS. width: 0 for as recorded."""
+def _frames(text: object) -> DriveOptions:
+    return DriveOptions.from_query(SCHEME, {"frames": str(text)})
 
-    data: Path | None = None
-    iteration: int | None = None
-    weights: str | None = None
-    width: int = DEFAULT_WIDTH
-    frames: DriveOptions = field(default_factory=DriveOptions)
-    rotation_bug: bool = False
 
-    @staticmethod
-    def from_query(query: dict[str, str]) -> ModelOptions:
-        check_query(SCHEME, query, _KEYS)
-        frames = {"frames": query["frames"]} if "frames" in query else {}
-        return ModelOptions(
-            data=Path(query["data"]).expanduser() if "data" in query else None,
-            iteration=whole_number_of(SCHEME, query, "iteration"),
-            weights=choice_of(SCHEME, query, "weights", ("pth", "ply")),
-            width=whole_number_of(SCHEME, query, "width", DEFAULT_WIDTH),
-            frames=DriveOptions.from_query(SCHEME, frames),
-            rotation_bug=choice_of(SCHEME, query, "rotation_bug", ("0", "1")) == "1",
-        )
+class ModelOptions(UriOptions):
+    """Options of one opening."""
+
+    data: Annotated[Path, BeforeValidator(lambda text: Path(text).expanduser())] | None = Field(
+        None, description="the dataset's folder, where it is not where the configuration says"
+    )
+    iteration: Number | None = Field(
+        None, description="a whole number, which of the saved iterations; the newest without it"
+    )
+    weights: Literal["pth", "ply"] | None = Field(
+        None, description="pth or ply; the .pth where there is one"
+    )
+    width: Number = Field(
+        DEFAULT_WIDTH,
+        description=f"a whole number of pixels, which images are at most wide, {DEFAULT_WIDTH} "
+        f"without it; 0 as recorded",
+    )
+    frames: Annotated[DriveOptions, BeforeValidator(_frames)] = Field(
+        DriveOptions(),
+        description="first:stop, frame numbers with stop excluded, either side may be empty",
+    )
+    rotation_bug: Literal["0", "1"] = Field(
+        "0", description="0 or 1; actors turned as an older release of the project turned them"
+    )
 
 
 # ---- The configuration that a model was trained with: configs/config_{iteration:06d}.yaml --------
-
-_NAME = re.compile(r"config_(\d+)\.yaml")
 
 
 def newest_config(model: Path) -> Path:
     """The configuration of a model's folder; of several the one of the latest iteration."""
     files = (model / "configs").glob("config_*.yaml")
-    found = {int(match[1]): path for path in files if (match := _NAME.fullmatch(path.name))}
+    found = {int(m[1]): p for p in files if (m := re.fullmatch(r"config_(\d+)\.yaml", p.name))}
     if not found:
         raise AdapterError(
             f"{model / 'configs'} holds no config_*.yaml; which column of the actors' poses "
@@ -106,7 +103,6 @@ def read_config(path: Path) -> ModelConfig:
 
 # ---- Where the files of a trained model are ------------------------------------------------------
 
-_PTH, _PLY = re.compile(r"iteration_(\d+)\.pth"), re.compile(r"iteration_(\d+)")
 _DATA_FOLDERS = ("ego_pose", "extrinsics", "track")
 
 
@@ -129,7 +125,8 @@ def is_dataset(path: Path) -> bool:
 
 def find_model(path: Path, options: ModelOptions) -> ModelFiles:
     """The files of a model, given its folder or its weights."""
-    folder, weights, iteration = _find_weights(path, options)
+    find_weights = _weights_of_file if path.is_file() else _weights_of_folder
+    folder, weights, iteration = find_weights(path, options)
     config_file = newest_config(folder)
     config = read_config(config_file)
     data = options.data or Path(config.source_path)
@@ -143,24 +140,21 @@ def find_model(path: Path, options: ModelOptions) -> ModelFiles:
     return ModelFiles(folder, weights, iteration, config_file, config, data)
 
 
-def _find_weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
+def _weights_of_file(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
     """The model's folder, its weights and their iteration, where their name says it."""
-    if path.is_file():
-        if options.iteration is not None or options.weights is not None:
-            raise AdapterError(
-                f"{path} is one file, so iteration= and weights= say nothing; give the model's "
-                f"folder or leave them out"
-            )
-        match path.suffix.lower():
-            case ".pth":
-                named = _PTH.fullmatch(path.name)
-            case ".ply":
-                named = _PLY.fullmatch(path.parent.name)
-            case _:
-                raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
-        folders = path.absolute().parents[:3]
-        folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
-        return folder, path, int(named[1]) if named else None
+    if options.iteration is not None or options.weights is not None:
+        raise AdapterError(
+            f"{path} is one file, so iteration= and weights= say nothing; give the model's "
+            f"folder or leave them out"
+        )
+    if path.suffix.lower() not in (".pth", ".ply"):
+        raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
+    folders = path.absolute().parents[:3]
+    folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
+    return folder, path, _iteration_of(path)
+
+
+def _weights_of_folder(path: Path, options: ModelOptions) -> tuple[Path, Path, int]:
     saved = _saved(path)
     if not saved:
         raise AdapterError(
@@ -168,28 +162,36 @@ def _find_weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | 
             f"trained_model/iteration_N.pth or point_cloud/iteration_N/point_cloud.ply in it, or "
             f"{', '.join(f'{name}/' for name in _DATA_FOLDERS)}"
         )
-    kind = options.weights or ("pth" if any(kind == "pth" for kind, _ in saved) else "ply")
-    of_kind = {number: file for (k, number), file in saved.items() if k == kind}
-    if not of_kind:
+    kind = options.weights or ("pth" if "pth" in saved else "ply")
+    if kind not in saved:
         raise AdapterError(f"{path} holds no .{kind} of a saved iteration; give the other weights=")
-    iteration = max(of_kind) if options.iteration is None else options.iteration
-    if iteration not in of_kind:
-        known = ", ".join(map(str, sorted(of_kind)))
+    iteration = max(saved[kind]) if options.iteration is None else options.iteration
+    if iteration not in saved[kind]:
+        known = ", ".join(map(str, sorted(saved[kind])))
         raise AdapterError(f"{path} has no .{kind} of iteration {iteration}; it has {known}")
-    return path, of_kind[iteration], iteration
+    return path, saved[kind][iteration], iteration
 
 
-def _saved(folder: Path) -> dict[tuple[str, int], Path]:
-    """Weights by kind and iteration."""
-    files = [("pth", file, file.name) for file in folder.glob("trained_model/iteration_*.pth")]
-    for file in folder.glob("point_cloud/iteration_*/point_cloud.ply"):
-        files.append(("ply", file, file.parent.name))
-    pattern = {"pth": _PTH, "ply": _PLY}
-    return {(k, int(m[1])): file for k, file, name in files if (m := pattern[k].fullmatch(name))}
+def _saved(folder: Path) -> dict[str, dict[int, Path]]:
+    """Weights by kind, then iteration."""
+    saved: dict[str, dict[int, Path]] = {}
+    for pattern in ("trained_model/iteration_*.pth", "point_cloud/iteration_*/point_cloud.ply"):
+        for file in folder.glob(pattern):
+            if (iteration := _iteration_of(file)) is not None:
+                saved.setdefault(file.suffix[1:], {})[iteration] = file
+    return saved
 
 
-# ---- Tables of a trained model beside its Gaussians: poses, sky, colour and pose correction ------
+def _iteration_of(weights: Path) -> int | None:
+    named = weights.stem if weights.suffix.lower() == ".pth" else weights.parent.name
+    match = re.fullmatch(r"iteration_(\d+)", named)
+    return int(match[1]) if match else None
 
+
+# ---- One trained part, the background or an actor: from the numbers in a file to Gaussians -------
+
+_ROWS = 1 << 15  # Gaussians changed at a time: temporaries of a few megabytes
+_BACKGROUND = "background"
 _ACTOR = re.compile(r"obj_(\d{3,9})")
 
 
@@ -200,169 +202,12 @@ def actor_id(name: str) -> int | None:
     return number if number is not None and name == f"obj_{number:03d}" else None
 
 
-class Parameters:
-    """Networks and tables of a checkpoint beside its Gaussians, with sentences about them."""
-
-    def __init__(
-        self, content: Mapping[str, Any], path: Path, config: ModelConfig, problems: list[str]
-    ) -> None:
-        self.path, self.config, self.problems = path, config, problems
-        self._content = content
-        self.seen = {"background", "iter"}
-
-    def of(self, name: str, switch: str) -> Mapping[str, Any] | None:
-        """The table `params` of an entry. switch: what of the configuration says if it is used."""
-        self.seen.add(name)
-        key = ModelConfig.model_fields[switch].alias
-        if not getattr(self.config, switch):
-            if self._content.get(name):
-                self.problems.append(
-                    f"{self.path}: {name} is left out, as the configuration has not {key}"
-                )
-            return None
-        if name not in self._content:
-            raise AdapterError(
-                f"{self.path} lacks {name!r}, although the configuration has {key}; it holds "
-                f"{', '.join(map(str, list(self._content)[:12]))}. Copy the model and its "
-                f"configs/ from the same training"
-            )
-        entry = section(self._content, name, str(self.path))
-        return section(entry, "params", f"{self.path}, {name}")
-
-    def numbers(
-        self, params: Mapping[str, Any], name: str, key: str, shape: Sequence[int | None]
-    ) -> np.ndarray:
-        """A small table, float64."""
-        where = f"{self.path}, {name}.params"
-        found = tensor(params, key, shape, where).double().numpy()
-        if not np.isfinite(found).all():
-            raise AdapterError(f"{where}: {key} holds NaN or infinite numbers")
-        return found
-
-    def report_unknown(self) -> None:
-        names = [name for name in self._content if name not in self.seen]
-        names = [str(name) for name in names if actor_id(str(name)) is None]
-        if names:
-            self.problems.append(
-                f"{self.path} also holds {', '.join(names[:8])}, which is not used: expected "
-                f"background, obj_000 ..., actor_pose, sky_cubemap, color_correction, "
-                f"pose_correction and iter"
-            )
-
-
-class PoseChanges(NamedTuple):
-    """What training added to the poses of each frame and column of the tracklets.
-
-    positions: float64 [F, M, 3], metres, vehicle frame. half_turns: float64 [F, M], radians about
-    the object's z; it turns by twice as much.
-    """
-
-    positions: np.ndarray
-    half_turns: np.ndarray
-
-
-def read_pose_changes(parameters: Parameters, *, has_actors: bool) -> PoseChanges | None:
-    """What training added to the actors' poses; None where it left them."""
-    if not has_actors:
-        parameters.seen.add("actor_pose")
-        return None
-    params = parameters.of("actor_pose", "opt_track")
-    if params is None:
-        return None
-    positions = parameters.numbers(params, "actor_pose", "opt_trans", (None, None, 3))
-    shape = (*positions.shape[:2], 1)
-    half_turns = parameters.numbers(params, "actor_pose", "opt_rots", shape)
-    return PoseChanges(positions, half_turns[..., 0])
-
-
-def read_sky(parameters: Parameters) -> Tensor | None:
-    """Faces of the sky, float32 [6, R, R, 3] in [0, 1]; None where there is none that can be used.
-
-    The project clamps what it looks up; clamped texels are the same but between texels of which
-    only some are out of range.
-    """
-    params = parameters.of("sky_cubemap", "include_sky")
-    if params is None:
-        return None
-    where = f"{parameters.path}, sky_cubemap.params"
-    if any(str(key) == "sky_codebook" or str(key).startswith("mlp_shader") for key in params):
-        parameters.problems.append(
-            f"{where}: a sky made of a codebook and a network is not supported; the sky has the "
-            f"background's colour instead"
-        )
-        return None
-    faces = tensor(params, "sky_cube_map", (6, None, None, 3), where)
-    if faces.shape[1] != faces.shape[2] or faces.shape[1] == 0:
-        raise AdapterError(
-            f"{where}: sky_cube_map must be float32 [6, R, R, 3]; got {list(faces.shape)}"
-        )
-    own = torch.empty(faces.shape)
-    for face in range(6):
-        taken(faces[face], own[face])
-    if not np.isfinite([own.numpy().min(), own.numpy().max()]).all():
-        raise AdapterError(f"{where}: sky_cube_map holds NaN or infinite numbers")
-    return own.clamp_(0, 1)
-
-
-def read_color_maps(parameters: Parameters) -> Tensor | None:
-    """Colour maps float32 [n, 3, 4]; None where there are none that can be used."""
-    name = "color_correction"
-    params = parameters.of(name, "use_color_correction")
-    if params is None:
-        return None
-    is_network = any(str(key).startswith("affine_trans.") for key in params)
-    if parameters.config.color_correction_mlp or is_network:
-        parameters.problems.append(
-            f"{parameters.path}, {name}: colour correction by a network is not supported and left "
-            f"out; images have the scene's own colours"
-        )
-        return None
-    maps = parameters.numbers(params, name, "affine_trans", (None, 3, 4))
-    return torch.from_numpy(maps.astype(np.float32))
-
-
-def read_camera_changes(parameters: Parameters) -> np.ndarray | None:
-    """What the background is moved by before an image is taken, float64 [n, 4, 4]."""
-    name = "pose_correction"
-    params = parameters.of(name, "use_pose_correction")
-    if params is None:
-        return None
-    centres = parameters.numbers(params, name, "pose_correction_trans", (None, 3))
-    quats = parameters.numbers(params, name, "pose_correction_rots", (len(centres), 4))
-    if (np.linalg.norm(quats, axis=1) == 0).any():
-        raise AdapterError(
-            f"{parameters.path}, {name}.params: pose_correction_rots holds a quaternion of zeros"
-        )
-    changes = np.tile(np.eye(4), (len(centres), 1, 1))
-    changes[:, :3, :3] = rotmat_from_quat(torch.from_numpy(quats)).numpy()
-    changes[:, :3, 3] = centres
-    return changes
-
-
-# ---- One trained part, the background or an actor: from the numbers in a file to Gaussians -------
-
-_ROWS = 1 << 15  # Gaussians changed at a time: temporaries of a few megabytes
-
-
 @dataclass(frozen=True, eq=False)
 class Part:
     """terms [N, F - 1, 3]: further Fourier terms of the colours; None where F is 1."""
 
     gaussians: Gaussians
     terms: Tensor | None
-
-
-def allocate(count: int, sh_count: int, term_count: int) -> tuple[dict[str, Tensor], Tensor | None]:
-    """Memory of a part's numbers, to be filled as they stand in a file: log scales, opacity logits,
-    quaternions of any length. Named as in Gaussians; the second are the terms."""
-    arrays = {
-        "means": torch.empty(count, 3),
-        "quats": torch.empty(count, 4),
-        "scales": torch.empty(count, 3),
-        "opacities": torch.empty(count),
-        "sh": torch.empty(count, sh_count, 3),
-    }
-    return arrays, torch.empty(count, term_count - 1, 3) if term_count > 1 else None
 
 
 def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> None:
@@ -378,13 +223,18 @@ def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> N
         raise AdapterError(f"{where}: feature_dc must have {expected}; got {terms}")
 
 
-def finish_part(
-    arrays: Mapping[str, Tensor], terms: Tensor | None, where: str, *, is_background: bool
-) -> tuple[Part | None, tuple[str, ...]]:
-    """Activate the numbers in place and leave out what cannot be drawn, with a sentence each.
+def make_part(
+    arrays: dict[str, Tensor], where: str, problems: list[str], *, is_background: bool
+) -> Part | None:
+    """Activate the numbers of a file in place (log scales, opacity logits, quaternions of any
+    length, and further `terms` of the colours) and leave out what cannot be drawn.
 
     None for an actor of which nothing usable remains; of a background that is an error.
     """
+    terms = arrays.pop("terms")
+    if len(terms) == 0 and not is_background:
+        problems.append(f"{where}: it has no Gaussians and is left out")
+        return None
     arrays["scales"].exp_()
     arrays["opacities"].sigmoid_()
     means, quats = arrays["means"].numpy(), arrays["quats"].numpy()
@@ -394,21 +244,23 @@ def finish_part(
         lengths = np.sqrt(np.einsum("ni,ni->n", quats[rows], quats[rows], dtype=np.float64))
         lengths[lengths == 0] = 1  # such a quaternion is left out later
         quats[rows] /= lengths[:, None]
-        if terms is not None:  # colours that are not numbers at some time cannot be drawn
-            means[rows][~np.isfinite(terms[rows].numpy()).all((1, 2))] = np.nan
-    gaussians = Gaussians(**arrays)
+        # Colours that are not numbers at some time cannot be drawn.
+        means[rows][~np.isfinite(terms[rows].numpy()).all((1, 2))] = np.nan
+    gaussians, has_terms = Gaussians(**arrays), terms.shape[1] > 0
     if len(gaussians) and is_drawable(gaussians):
-        return Part(gaussians, terms), ()
+        return Part(gaussians, terms if has_terms else None)
     try:
-        kept, problems = check_gaussians(gaussians, where=where)
+        kept, found = check_gaussians(gaussians, where=where)
     except SceneError as error:
         if is_background:
             raise AdapterError(str(error)) from None
-        return None, (f"{error} It is left out",)
-    return Part(kept, None if terms is None else terms[drawable_rows(gaussians)]), problems
+        problems.append(f"{error} It is left out")
+        return None
+    problems += found
+    return Part(kept, terms[drawable_rows(gaussians)] if has_terms else None)
 
 
-# ---- A whole model -------------------------------------------------------------------------------
+# ---- trained_model/iteration_N.pth ---------------------------------------------------------------
 
 _TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
 _TRAINING = (
@@ -416,6 +268,17 @@ _TRAINING = (
     "optimizer",
 )  # fmt: skip
 _PIECE = 1 << 18  # numbers copied at a time
+
+
+class PoseChanges(NamedTuple):
+    """What training added to the poses of each frame and column of the tracklets.
+
+    positions: float64 [F, M, 3], metres, vehicle frame. half_turns: float64 [F, M], radians about
+    the object's z; it turns by twice as much.
+    """
+
+    positions: np.ndarray
+    half_turns: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,43 +303,48 @@ class TrainedModel:
 def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
     """Read a .pth. Nothing in it is run; the optimiser's state is not looked at."""
     content = load_checkpoint(path)
-    if "background" not in content:
+    if _BACKGROUND not in content:
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
         raise AdapterError(
             f"{path} lacks 'background', so it is no Street Gaussians model of a known version; it "
             f"holds {keys}. Expected background, obj_000 ..., actor_pose, sky_cubemap"
         )
     problems: list[str] = []
-    background, found = _read_part(section(content, "background", str(path)), path, "background")
-    problems += found
-    actors = {}
-    for name in content:
-        number = actor_id(name) if isinstance(name, str) else None
-        if number is None:
-            continue
-        part, found = _read_part(section(content, name, str(path)), path, name)
-        problems += found
-        if part is not None:
-            actors[number] = part
-    assert background is not None
-    parameters = Parameters(content, path, config, problems)
+    parts = {}
+    for name in (_BACKGROUND, *(name for name in content if actor_id(str(name)) is not None)):
+        where, is_background = f"{path}, {name}", name == _BACKGROUND
+        entry = section(content, name, str(path))
+        arrays = _part_arrays(entry, where, problems, is_background=is_background)
+        parts[name] = make_part(arrays, where, problems, is_background=is_background)
+    background, actors = _told_apart(parts)
+    tables = _Tables(content, path, config, problems)
     model = TrainedModel(
         file=path,
         background=background,
         actors=actors,
-        pose_changes=read_pose_changes(parameters, has_actors=bool(actors)),
-        sky=read_sky(parameters),
-        color_maps=read_color_maps(parameters),
-        camera_changes=read_camera_changes(parameters),
+        pose_changes=_read_pose_changes(tables, has_actors=bool(actors)),
+        sky=_read_sky(tables),
+        color_maps=_read_color_maps(tables),
+        camera_changes=_read_camera_changes(tables),
         problems=problems,
     )
-    parameters.report_unknown()
+    tables.report_unknown()
     return model
 
 
-def _read_part(content: Mapping[str, Any], path: Path, name: str) -> tuple[Part | None, list[str]]:
-    """A part, None for an actor without usable Gaussians, and sentences."""
-    where = f"{path}, {name}"
+def _told_apart(parts: dict[str, Part | None]) -> tuple[Part, dict[int, Part]]:
+    """Background, and the actors that are left by number."""
+    background = parts.pop(_BACKGROUND)
+    assert background is not None
+    return background, {
+        int(name.removeprefix("obj_")): part for name, part in parts.items() if part is not None
+    }
+
+
+def _part_arrays(
+    content: Mapping[str, Any], where: str, problems: list[str], *, is_background: bool
+) -> dict[str, Tensor]:
+    """Copies of a part's tensors, as `make_part` takes them."""
     means = tensor(content, "xyz", (None, 3), where)
     count = len(means)
     colours = tensor(content, "feature_dc", (count, None, 3), where)
@@ -484,165 +352,208 @@ def _read_part(content: Mapping[str, Any], path: Path, name: str) -> tuple[Part 
     scales = tensor(content, "scaling", (count, 3), where)
     quats = tensor(content, "rotation", (count, 4), where)
     logits = tensor(content, "opacity", (count, 1), where)
-    is_background = name == "background"
     check_counts(where, rest.shape[1], colours.shape[1], is_background=is_background)
-    problems = []
     semantic = content.get("semantic")
     if isinstance(semantic, Tensor) and semantic.dim() == 2 and semantic.shape[1] > 0:
         problems.append(f"{where}: its semantic features are not used")
     if unknown := [str(key) for key in content if key not in (*_TENSORS, *_TRAINING)]:
         problems.append(f"{where}: it also holds {', '.join(unknown[:8])}, which is not used")
-    if count == 0 and not is_background:
-        return None, [*problems, f"{where}: it has no Gaussians and is left out"]
-    arrays, terms = allocate(count, 1 + rest.shape[1], colours.shape[1])
-    for name, source in (("means", means), ("scales", scales), ("quats", quats)):
-        taken(source, arrays[name])
-    taken(logits, arrays["opacities"][:, None])
-    _split(colours, arrays["sh"][:, :1], terms)
-    _split(rest, arrays["sh"][:, 1:], None)
-    part, found = finish_part(arrays, terms, where, is_background=is_background)
-    return part, [*problems, *found]
-
-
-def _split(source: Tensor, first: Tensor, further: Tensor | None) -> None:
-    """Copy [N, T, 3] into two, memory given back as it goes. first takes as many as fit."""
-    count = first.shape[1]
-    rows = max(1, _PIECE // max(1, source[:1].numel()))
-    for start in range(0, len(source), rows):
-        piece = source[start : start + rows]
-        first[start : start + rows] = piece[:, :count]
-        if further is not None:
-            further[start : start + rows] = piece[:, count:]
+    sh, terms = torch.empty(count, 1 + rest.shape[1], 3), torch.empty_like(colours[:, 1:])
+    arrays = {"means": taken(means), "quats": taken(quats), "scales": taken(scales)}
+    arrays["opacities"] = taken(logits)[:, 0]
+    taken(rest, sh[:, 1:])
+    rows = max(1, _PIECE // max(1, colours[:1].numel()))
+    for start in range(0, count, rows):  # memory is given back as it goes
+        piece = colours[start : start + rows]
+        sh[start : start + rows, :1] = piece[:, :1]
+        terms[start : start + rows] = piece[:, 1:]
         if piece.is_contiguous():
             release(piece)
+    return arrays | {"sh": sh, "terms": terms}
+
+
+# ---- Tables of a checkpoint beside its Gaussians: poses, sky, colour and pose correction ---------
+
+
+class _Tables:
+    """Networks and tables of a checkpoint, with sentences about them."""
+
+    def __init__(
+        self, content: Mapping[str, Any], path: Path, config: ModelConfig, problems: list[str]
+    ) -> None:
+        self.path, self.config, self.problems = path, config, problems
+        self._content = content
+        self.seen = {_BACKGROUND, "iter"}
+
+    def of(self, name: str, switch: str) -> Mapping[str, Any] | None:
+        """The table `params` of an entry. switch: what of the configuration says if it is used."""
+        self.seen.add(name)
+        key = ModelConfig.model_fields[switch].alias
+        if not getattr(self.config, switch):
+            if self._content.get(name):
+                self.problems.append(
+                    f"{self.path}: {name} is left out, as the configuration has not {key}"
+                )
+            return None
+        if name not in self._content:
+            raise AdapterError(
+                f"{self.path} lacks {name!r}, although the configuration has {key}; it holds "
+                f"{', '.join(map(str, list(self._content)[:12]))}. Copy the model and its "
+                f"configs/ from the same training"
+            )
+        return section(section(self._content, name, str(self.path)), "params", self.where(name))
+
+    def where(self, name: str) -> str:
+        return f"{self.path}, {name}.params"
+
+    def report_unknown(self) -> None:
+        names = [str(name) for name in self._content if name not in self.seen]
+        if names := [name for name in names if actor_id(name) is None]:
+            self.problems.append(
+                f"{self.path} also holds {', '.join(names[:8])}, which is not used: expected "
+                f"background, obj_000 ..., actor_pose, sky_cubemap, color_correction, "
+                f"pose_correction and iter"
+            )
+
+
+def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | None:
+    """What training added to the actors' poses; None where it left them."""
+    if not has_actors:
+        tables.seen.add("actor_pose")
+        return None
+    params = tables.of("actor_pose", "opt_track")
+    if params is None:
+        return None
+    positions = finite_numbers(params, "opt_trans", (None, None, 3), tables.where("actor_pose"))
+    half_turns = finite_numbers(
+        params, "opt_rots", (*positions.shape[:2], 1), tables.where("actor_pose")
+    )
+    return PoseChanges(positions, half_turns[..., 0])
+
+
+def _read_sky(tables: _Tables) -> Tensor | None:
+    """Faces of the sky, float32 [6, R, R, 3] in [0, 1]; None where there is none that can be used.
+
+    The project clamps what it looks up; clamped texels are the same but between texels of which
+    only some are out of range.
+    """
+    params = tables.of("sky_cubemap", "include_sky")
+    if params is None:
+        return None
+    where = tables.where("sky_cubemap")
+    if any(str(key) == "sky_codebook" or str(key).startswith("mlp_shader") for key in params):
+        tables.problems.append(
+            f"{where}: a sky made of a codebook and a network is not supported; the sky has the "
+            f"background's colour instead"
+        )
+        return None
+    faces = tensor(params, "sky_cube_map", (6, None, None, 3), where)
+    if faces.shape[1] != faces.shape[2] or faces.shape[1] == 0:
+        raise AdapterError(
+            f"{where}: sky_cube_map must be float32 [6, R, R, 3]; got {list(faces.shape)}"
+        )
+    faces = taken(faces)
+    if not np.isfinite([faces.numpy().min(), faces.numpy().max()]).all():
+        raise AdapterError(f"{where}: sky_cube_map holds NaN or infinite numbers")
+    return faces.clamp_(0, 1)
+
+
+def _read_color_maps(tables: _Tables) -> Tensor | None:
+    """Colour maps float32 [n, 3, 4]; None where there are none that can be used."""
+    name = "color_correction"
+    params = tables.of(name, "use_color_correction")
+    if params is None:
+        return None
+    is_network = any(str(key).startswith("affine_trans.") for key in params)
+    if tables.config.color_correction_mlp or is_network:
+        tables.problems.append(
+            f"{tables.path}, {name}: colour correction by a network is not supported and left "
+            f"out; images have the scene's own colours"
+        )
+        return None
+    maps = finite_numbers(params, "affine_trans", (None, 3, 4), tables.where(name))
+    return torch.from_numpy(maps.astype(np.float32))
+
+
+def _read_camera_changes(tables: _Tables) -> np.ndarray | None:
+    """What the background is moved by before an image is taken, float64 [n, 4, 4]."""
+    name = "pose_correction"
+    params = tables.of(name, "use_pose_correction")
+    if params is None:
+        return None
+    centres = finite_numbers(params, "pose_correction_trans", (None, 3), tables.where(name))
+    quats = finite_numbers(params, "pose_correction_rots", (len(centres), 4), tables.where(name))
+    if (np.linalg.norm(quats, axis=1) == 0).any():
+        raise AdapterError(
+            f"{tables.where(name)}: pose_correction_rots holds a quaternion of zeros"
+        )
+    changes = np.tile(np.eye(4), (len(centres), 1, 1))
+    changes[:, :3, :3] = rotmat_from_quat(torch.from_numpy(quats)).numpy()
+    changes[:, :3, 3] = centres
+    return changes
 
 
 # ---- point_cloud/iteration_N/point_cloud.ply: an element for each part, such as vertex_obj_003 ---
 # It has no sky, no colour correction and not what training added to poses.
-
-_PREFIX = "vertex_"
-_FIXED = (
-    *"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
-)  # fmt: skip
-_NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(0|[1-9]\d{0,6})")
 
 
 def read_ply_model(path: Path, config: ModelConfig) -> TrainedModel:
     """Read a .ply in pieces."""
     try:
         header = read_ply_header(path)
-        elements = {e.name.removeprefix(_PREFIX): e for e in header.elements if _is_part(e)}
-        if "background" not in elements:
-            names = [element.name for element in header.elements]
+        names = {e.name: e.name.removeprefix("vertex_") for e in header.elements}
+        elements = {
+            name: header.element(full)
+            for full, name in names.items()
+            if full != name and (name == _BACKGROUND or actor_id(name) is not None)
+        }
+        if _BACKGROUND not in elements:
             hint = ""
             if "vertex" in names:
                 hint = f". A .ply with one element 'vertex' opens as gaussians:{path}"
             raise AdapterError(
                 f"{path} is no Street Gaussians model: expected an element vertex_background and "
                 f"one such as vertex_obj_003 for each actor; found "
-                f"{', '.join(names[:12]) or 'none'}{hint}"
+                f"{', '.join(list(names)[:12]) or 'none'}{hint}"
             )
-        trained = {
-            "the actors' learnt poses": config.opt_track,
-            "the sky": config.include_sky,
-            "the colour correction": config.use_color_correction,
-            "the pose correction": config.use_pose_correction,
-        }
-        problems = [f"{path}: a .ply holds Gaussians only"]
-        if lost := ", ".join(name for name, was_trained in trained.items() if was_trained):
-            problems[0] += f"; left out: {lost}. They are in trained_model/iteration_N.pth"
-        others = [e.name for e in header.elements if not _is_part(e)]
-        if others:
+        problems = _lost_in_ply(path, config)
+        if others := [full for full, name in names.items() if name not in elements]:
             problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
-        parts: dict[str, Part] = {}
-        for name, element in elements.items():
-            part, found = _read_ply_part(header, element, name)
-            problems += found
-            if part is not None:
-                parts[name] = part
-    except AdapterError:
-        raise
+        parts = {
+            name: _read_ply_part(header, element, problems, is_background=name == _BACKGROUND)
+            for name, element in elements.items()
+        }
     except SceneError as error:
         raise AdapterError(str(error)) from None
-    surplus = count_surplus_bytes(header)
-    if surplus:
-        problems.append(f"{path}: {surplus} bytes follow its rows and were ignored")
-    background = parts.pop("background")
-    actors = {int(name.removeprefix("obj_")): part for name, part in parts.items()}
-    return TrainedModel(path, background, actors, problems=problems)
+    background, actors = _told_apart(parts)
+    return TrainedModel(path, background, actors, problems=[*problems, *header.surplus_problems()])
 
 
-def _is_part(element: PlyElement) -> bool:
-    name = element.name.removeprefix(_PREFIX)
-    return element.name.startswith(_PREFIX) and (name == "background" or actor_id(name) is not None)
+def _lost_in_ply(path: Path, config: ModelConfig) -> list[str]:
+    trained = {
+        "the actors' learnt poses": config.opt_track,
+        "the sky": config.include_sky,
+        "the colour correction": config.use_color_correction,
+        "the pose correction": config.use_pose_correction,
+    }
+    lost = ", ".join(name for name, was_trained in trained.items() if was_trained)
+    where_else = f"; left out: {lost}. They are in trained_model/iteration_N.pth" if lost else ""
+    return [f"{path}: a .ply holds Gaussians only{where_else}"]
 
 
 def _read_ply_part(
-    header: PlyHeader, element: PlyElement, name: str
-) -> tuple[Part | None, list[str]]:
-    """A part, None for an actor without usable Gaussians, and sentences."""
-    where, is_background = f"{header.path}, {element.name}", name == "background"
-    colours, rest, semantic = _count_columns(element, where)
-    check_counts(where, rest, colours, is_background=is_background)
-    problems = [f"{where}: its semantic features are not used"] if semantic else []
-    if element.count == 0 and not is_background:
-        return None, [*problems, f"{where}: it has no Gaussians and is left out"]
-    arrays: dict[str, Tensor] = {}
-    terms: Tensor | None = None
-    done = 0
-    for rows in iterate_rows(header, element.name):
-        if not arrays:  # only now is the file known to be as long as its header says
-            arrays, terms = allocate(element.count, 1 + rest, colours)
-        _scatter(rows, arrays, terms, slice(done, done + len(rows)))
-        done += len(rows)
-    if not arrays:
-        arrays, terms = allocate(0, 1 + rest, colours)
-    part, found = finish_part(arrays, terms, where, is_background=is_background)
-    return part, [*problems, *found]
-
-
-def _count_columns(element: PlyElement, where: str) -> tuple[int, int, int]:
-    """Colour terms F, coefficients above the constant one, and semantic columns."""
-    missing = [name for name in _FIXED if name not in element.names]
-    numbers: dict[str, list[int]] = {"f_dc": [], "f_rest": [], "semantic": []}
-    for name in element.names:
-        if match := _NUMBERED.fullmatch(name):
-            numbers[match[1]].append(int(match[2]))
-    if missing or not numbers["f_dc"]:
-        lost = [*missing[:8], *([] if numbers["f_dc"] else ["f_dc_0"])]
-        raise AdapterError(
-            f"{where}: not the Gaussians of a model: {', '.join(lost)} "
-            f"missing; it has {', '.join(element.names[:12]) or 'no properties'}"
-        )
-    for name in ("f_dc", "f_rest"):
-        found = numbers[name]
-        if len(found) % 3 or sorted(found) != list(range(len(found))):
-            raise AdapterError(
-                f"{where}: {name}_0, {name}_1, … must be a multiple of 3 in number (a channel's "
-                f"values after the other's) and without gaps; got {len(found)}"
-            )
-    return len(numbers["f_dc"]) // 3, len(numbers["f_rest"]) // 3, len(numbers["semantic"])
-
-
-def _scatter(
-    rows: np.ndarray, arrays: dict[str, Tensor], terms: Tensor | None, where: slice
-) -> None:
-    """Copy the columns of some rows to their places; no activation yet."""
-    values = {name: array.numpy()[where] for name, array in arrays.items()}
-    colours = values["sh"][:, :1]
-    if terms is not None:
-        colours = np.concatenate([colours, terms.numpy()[where]], 1)
-    rest = values["sh"][:, 1:]
-    with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinite
-        for axis, name in enumerate("xyz"):
-            values["means"][:, axis] = rows[name]
-            values["scales"][:, axis] = rows[f"scale_{axis}"]
-        for axis in range(4):
-            values["quats"][:, axis] = rows[f"rot_{axis}"]
-        values["opacities"][:] = rows["opacity"]
-        for prefix, numbers in (("f_dc", colours), ("f_rest", rest)):
-            count = numbers.shape[1]  # a channel's values after the other's
-            for index in range(3 * count):
-                numbers[:, index % count, index // count] = rows[f"{prefix}_{index}"]
-    if terms is not None:
-        values["sh"][:, :1], terms.numpy()[where] = colours[:, :1], colours[:, 1:]
+    header: PlyHeader, element: PlyElement, problems: list[str], *, is_background: bool
+) -> Part | None:
+    where = f"{header.path}, {element.name}"
+    if any(name.startswith("semantic_") for name in element.columns):
+        problems.append(f"{where}: its semantic features are not used")
+    columns = read_columns(header, element, has_terms=True)
+    columns.pop(SEMANTIC, None)
+    rest, terms = columns["sh"].shape[1] - 1, 1 + columns["terms"].shape[1]
+    check_counts(where, rest, terms, is_background=is_background)
+    with np.errstate(over="ignore"):  # doubles beyond float32 become infinite
+        arrays = {
+            name: torch.from_numpy(values.astype(np.float32, copy=False))
+            for name, values in columns.items()
+        }
+    return make_part(arrays, where, problems, is_background=is_background)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from adapters.lidar_scene.depth import SparseDepth, nearest_of_each, project_points
+from adapters.lidar_scene.depth import project_points
 from adapters.training_views.depth_priors import visible
 from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
@@ -84,7 +84,7 @@ class Returns(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Returns in one image: columns, rows int64 [M], intensity [M]; grey uint8 [H, W]."""
+    """Returns in one image: columns, rows int32 [M], intensity [M]; grey uint8 [H, W]."""
 
     columns: np.ndarray
     rows: np.ndarray
@@ -178,12 +178,10 @@ def project_returns(
     camera = _compared(camera)
     grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    seen, u, v, z = project_points(returns.points, camera, near_m=near_m, margin_px=reach)
-    chosen = nearest_of_each(v * camera.width + u, z)
-    uv = np.stack([u, v], 1)[chosen].astype(np.int32)
-    front = visible(SparseDepth(uv, z[chosen].astype(np.float32), chosen), camera)
-    kept = chosen[front]
-    return Points(u[kept], v[kept], returns.intensity[seen[kept]], grey)
+    seen, index = project_points(returns.points, camera, near_m=near_m, margin_px=reach)
+    front = visible(seen, camera)
+    rows, columns = np.divmod(seen.pixels[front], camera.width)
+    return Points(columns, rows, returns.intensity[index[front]], grey)
 
 
 def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:

@@ -10,18 +10,18 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numba
 import numpy as np
 
-from adapters.lidar_scene.depth import SparseDepth, depth_seen, nearest_of_each, read_returns
-from adapters.pandaset import PandaSetLabels
+from adapters.lidar_scene.depth import DepthPixels, read_returns
 from adapters.plain_files import decode_image
 from adapters.safe_pickle import read_array, read_array_dict
-from adapters.training_views.byte_cache import ByteCache
 from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.memo import SceneMemo
 from augment.reconstruct.view import ViewKey
 from augment.render.threads import kernel_threads
 from augment.scene import Scene
@@ -153,66 +153,19 @@ def _check_folder(folder: Path) -> None:
         raise AdapterError(f"{folder}: no such folder; depth maps were to be read from it")
 
 
-@dataclass(frozen=True, eq=False)
-class PriorPixels:
-    """pixels: int32 [M], flat indices, increasing. depth_m: float32 [M]. weight: float32 [M]."""
-
-    pixels: np.ndarray
-    depth_m: np.ndarray
-    weight: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    @property
-    def nbytes(self) -> int:
-        return self.pixels.nbytes + self.depth_m.nbytes + self.weight.nbytes
-
-    @staticmethod
-    def empty() -> PriorPixels:
-        return PriorPixels(np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32))
-
-    @staticmethod
-    def of(pixels: np.ndarray, depth_m: np.ndarray) -> PriorPixels:
-        """Of weight 1. Pixels come in any order, some of them several times: the nearest depth of
-        each remains."""
-        chosen = nearest_of_each(pixels, depth_m)
-        return PriorPixels(
-            pixels[chosen].astype(np.int32),
-            depth_m[chosen].astype(np.float32),
-            np.ones(len(chosen), np.float32),
-        )
-
-    def select(self, keep: np.ndarray) -> PriorPixels:
-        return PriorPixels(self.pixels[keep], self.depth_m[keep], self.weight[keep])
-
-    def weighing(self, weight: float) -> PriorPixels:
-        """The same with another weight."""
-        return PriorPixels(self.pixels, self.depth_m, np.full(len(self), weight, np.float32))
-
-    def image(self, camera: Camera) -> np.ndarray:
-        """float32 [H, W], 0 where nothing is known."""
-        out = np.zeros(camera.height * camera.width, np.float32)
-        out[self.pixels] = self.depth_m
-        return out.reshape(camera.height, camera.width)
-
-
-def join_priors(priors: Sequence[PriorPixels]) -> PriorPixels:
-    """All of them; where several know a pixel, the first in the sequence is believed."""
+def join_priors(priors: Sequence[DepthPixels]) -> DepthPixels:
+    """All of them, at least one; where several know a pixel, the first in the sequence counts."""
     names = ("pixels", "depth_m", "weight")
-    empty = PriorPixels.empty()
-    parts = {name: np.concatenate([getattr(p, name) for p in (empty, *priors)]) for name in names}
-    _, first = np.unique(parts["pixels"], return_index=True)  # the first occurrence, in order
-    return PriorPixels(*(parts[name][first] for name in names))
+    parts = [np.concatenate([getattr(prior, name) for prior in priors]) for name in names]
+    _, first = np.unique(parts[0], return_index=True)  # the first occurrence, in order
+    return DepthPixels(*parts).select(first)
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """1 / z = scale relative + shift, in 1/m; correlation: of the two, robustly weighted."""
+class Alignment(NamedTuple):
+    """1 / z = scale relative + shift, in 1/m."""
 
     scale: float
     shift: float
-    correlation: float
 
     def depth_m(self, relative: np.ndarray) -> np.ndarray:
         """Depth of relative values, float32; NaN where it is too near or far to be believed."""
@@ -257,10 +210,10 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
     correlation = covariance / max((variance * spread_y) ** 0.5, 1e-12)
     if correlation < _MIN_CORRELATION:
         return None
-    return Alignment(scale / unit, shift - scale * middle / unit, correlation)
+    return Alignment(scale / unit, shift - scale * middle / unit)
 
 
-def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
+def sparse_prior(path: Path, camera: Camera) -> DepthPixels:
     """Street Gaussians' depth, of a larger image, at the pixels it falls on."""
     mask, value = read_sparse(path)
     check_aspect(path, mask.shape, camera)
@@ -269,10 +222,10 @@ def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
     columns = (columns + 0.5) * camera.width / mask.shape[1]
     pixels = rows.astype(np.int64) * camera.width + columns.astype(np.int64)
     usable = (value > _NEAREST_IN_FILE_M) & (value < _FURTHEST_IN_FILE_M)  # NaN is neither
-    return PriorPixels.of(pixels[usable], value[usable])
+    return DepthPixels.of(pixels[usable], value[usable])
 
 
-def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> PriorPixels:
+def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> DepthPixels:
     """A dense map in metres at the pixels of a grid, 0 and sky left out."""
     depth = read_metric(path)
     check_aspect(path, depth.shape, camera)
@@ -282,12 +235,12 @@ def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> PriorPixels:
     x = ((columns + 0.5) * depth.shape[1] / camera.width).astype(np.int64)
     at = depth[y, x]
     usable = (at > _NEAREST_IN_FILE_M) & (at < _FURTHEST_IN_FILE_M) & ~sky[rows, columns]
-    return PriorPixels.of((rows * camera.width + columns)[usable], at[usable])
+    return DepthPixels.of((rows * camera.width + columns)[usable], at[usable])
 
 
 def relative_prior(
     path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray
-) -> PriorPixels:
+) -> DepthPixels:
     """A dense inverse depth map, aligned to the reference depth [H, W] (0 where unknown), at the
     pixels of a grid."""
     relative = read_relative(path)
@@ -306,16 +259,17 @@ def relative_prior(
     rows, columns = _grid(camera)
     at = found.depth_m(relative[rows, columns])
     usable = np.isfinite(at) & ~sky[rows, columns]
-    return PriorPixels.of((rows * camera.width + columns)[usable], at[usable])
+    pixels = (rows * camera.width + columns)[usable]
+    return DepthPixels.of(pixels, at[usable], _RELATIVE_WEIGHT)
 
 
-def beside(dense: PriorPixels, known: PriorPixels, camera: Camera) -> PriorPixels:
+def beside(dense: DepthPixels, known: DepthPixels, camera: Camera) -> DepthPixels:
     """The dense prior where no cell of its grid holds anything better known."""
     if len(known) == 0:
         return dense
     columns = -(-camera.width // _GRID_PX)
 
-    def cells(prior: PriorPixels) -> np.ndarray:
+    def cells(prior: DepthPixels) -> np.ndarray:
         row, column = prior.pixels // camera.width, prior.pixels % camera.width
         return row // _GRID_PX * columns + column // _GRID_PX
 
@@ -376,17 +330,13 @@ def hidden_returns(
     return out
 
 
-def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
+def visible(seen: DepthPixels, camera: Camera) -> np.ndarray:
     """Which returns the camera sees too, bool [M]: those without clearly nearer ones among their
     neighbours on three sides. Those hidden just behind an edge are not found."""
-    if len(seen) == 0:
-        return np.zeros(0, np.bool_)
-    pixels = seen.uv[:, 1] * np.int32(camera.width) + seen.uv[:, 0]
-    grid = np.zeros((camera.height, camera.width), np.float32)
-    grid.reshape(-1)[pixels] = seen.depth_m
     with kernel_threads():
         hidden = hidden_returns(
-            pixels, seen.depth_m, grid, _NEIGHBOURS, max(2, round(_WIDEST_PART * camera.width)),
+            seen.pixels, seen.depth_m, seen.image(camera), _NEIGHBOURS,
+            max(2, round(_WIDEST_PART * camera.width)),
             np.float32(_BEHIND_RATIO), np.float32(_BEHIND_M),
         )  # fmt: skip
     return ~hidden
@@ -426,53 +376,39 @@ class DepthSource:
         self._reference = reference
         self._has_sweeps = options.lidar and _has_sweeps(scene, cameras)
         self._maps = _find_all(scene, cameras, options, self.problems)
-        self._sweeps: ByteCache[PriorPixels] = ByteCache(cache_bytes // 2)
-        self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes - cache_bytes // 2)
+        self._memo = SceneMemo(cache_bytes)
         if not (self._has_sweeps or any(self._maps.values())):
             self.problems.append(
                 "no depth priors: the scene has no LiDAR sweeps and no depth maps were found, so "
                 "distances are learnt from the images alone"
             )
 
-    def lidar(self, key: ViewKey) -> PriorPixels:
+    def lidar(self, key: ViewKey) -> DepthPixels:
         """What the sweep of the view's frame says; it is read once for all cameras of the frame."""
-        if not self._has_sweeps:
-            return PriorPixels.empty()
-        found = self._sweeps.get(key)
-        if found is not None:
-            return found
-        labels = self._scene.labels
-        without = labels.no_surface_classes if isinstance(labels, PandaSetLabels) else ()
-        returns = read_returns(self._scene, key.frame, without_semantic=without)
-        priors = {}
-        for other, camera in self._cameras.items():
-            if other.frame != key.frame:
-                continue
-            priors[other] = PriorPixels.empty()
-            if returns is not None:
-                seen = depth_seen(returns, camera)
-                keep = visible(seen, camera)
-                pixels = seen.uv[keep, 1] * np.int32(camera.width) + seen.uv[keep, 0]
-                weight = np.ones(len(pixels), np.float32)
-                priors[other] = PriorPixels(pixels, seen.depth_m[keep], weight)
-            self._sweeps.put(other, priors[other], priors[other].nbytes)
-        return priors[key]
+        return self._memo.get(key.frame, lambda: self._read_frame(key.frame))[key.camera]
 
-    def load(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
+    def _read_frame(self, frame: int) -> dict[str, DepthPixels]:
+        cameras = {
+            key.camera: camera for key, camera in self._cameras.items() if key.frame == frame
+        }
+        returns = read_returns(self._scene, frame, of_surfaces=True) if self._has_sweeps else None
+        if returns is None:
+            nothing = DepthPixels.of(np.zeros(0, np.int32), np.zeros(0, np.float32))
+            return dict.fromkeys(cameras, nothing)
+        seen = {name: returns.seen_by(camera) for name, camera in cameras.items()}
+        return {name: seen[name].select(visible(seen[name], cameras[name])) for name in cameras}
+
+    def load(self, key: ViewKey, sky: np.ndarray) -> DepthPixels:
         """All that is known of the view. sky: bool [H, W], where dense maps are not believed."""
         if not any(self._maps.values()):
             return self.lidar(key)
-        found = self._cache.get(key)
-        if found is None:
-            found = self._combine(key, sky)
-            self._cache.put(key, found, found.nbytes)
-        return found
+        return self._memo.get(key, lambda: self._combine(key, sky))
 
-    def _combine(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
+    def _combine(self, key: ViewKey, sky: np.ndarray) -> DepthPixels:
         camera = self._cameras[key]
-        paths = {kind: maps.get(key) for kind, maps in self._maps.items()}
         known = self.lidar(key)
-        for kind, path in paths.items():  # in the order in which they are believed
+        for kind, maps in self._maps.items():  # in the order in which they are believed
+            path = maps.get(key)
             if path is None:
                 continue
             try:
@@ -484,9 +420,7 @@ class DepthSource:
                     reference = known.image(camera)
                     if len(known) == 0 and self._reference is not None:
                         reference = self._reference(key, camera)
-                    found = relative_prior(path, camera, reference, sky)
-                    found = found.weighing(_RELATIVE_WEIGHT)
-                    found = beside(found, known, camera)
+                    found = beside(relative_prior(path, camera, reference, sky), known, camera)
             except AdapterError as error:
                 sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
                 logger.warning("%s", sentence)

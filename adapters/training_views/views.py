@@ -6,6 +6,7 @@ import math
 import re
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,6 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.plain_files import ImageFault, decode_image, is_whole_jpeg
-from adapters.training_views.byte_cache import ByteCache
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
 from adapters.training_views.masks import (
     find_ego_mask,
@@ -24,6 +24,7 @@ from adapters.training_views.masks import (
 )
 from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.memo import SceneMemo
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Scene
 
@@ -76,41 +77,6 @@ def _can_be_reduced(full: Camera, scaled: Camera, step: int) -> bool:
     return divides and full.width // step >= scaled.width and full.height // step >= scaled.height
 
 
-class Images:
-    """All recorded images by view; as many as fit in `cache_bytes` stay decoded."""
-
-    def __init__(self, cache_bytes: int) -> None:
-        self._sources: dict[ViewKey, tuple[Path, Camera, Camera]] = {}
-        self._cache: ByteCache[np.ndarray] = ByteCache(cache_bytes)
-
-    def add(self, key: ViewKey, path: Path, full: Camera, scaled: Camera) -> np.ndarray:
-        """Decode an image for the first time, and keep it while there is room for all so far.
-
-        Raises:
-            ImageFault: it is unusable, and was not added."""
-        image = read_scaled(path, full, scaled)
-        self._sources[key] = (path, full, scaled)
-        if self._cache.has_room(image.nbytes):
-            self._cache.put(key, image, image.nbytes)
-        return image
-
-    def load(self, key: ViewKey) -> np.ndarray:
-        """uint8 [H, W, 3]; callers do not write into it."""
-        image = self._cache.get(key)
-        if image is not None:
-            return image
-        path, full, scaled = self._sources[key]
-        try:
-            image = read_scaled(path, full, scaled)
-        except ImageFault as fault:
-            raise AdapterError(
-                f"camera {key.camera}, frame {key.frame}: image {path} {fault}; it could be read "
-                f"when the scene was opened, leave the files as they are while they are in use"
-            ) from None
-        self._cache.put(key, image, image.nbytes)
-        return image
-
-
 def holdout_step(holdout: str) -> int | None:
     """N of "every-Nth", None of "none"."""
     if holdout == NONE:
@@ -158,9 +124,10 @@ class RecordedViews:
         names = _camera_names(scene, cameras)
         step = holdout_step(holdout)
         self._scene = scene
-        self._images = Images(cache_bytes)
+        self._images = SceneMemo(cache_bytes)
         self._problems: list[str] = []
-        self._cameras = self._read_all(scene, names, scale)
+        self._lock = threading.Lock()
+        self._cameras = self._read_all(names, scale)
         held_out = {f.index for f in scene.frames[step - 1 :: step]} if step else set()
         self.train = tuple(key for key in self._cameras if key.frame not in held_out)
         self.test = tuple(key for key in self._cameras if key.frame in held_out)
@@ -171,7 +138,6 @@ class RecordedViews:
         self._lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
         self.ego_masks = self._find_ego(names, masks_dir)
-        self._lock = threading.Lock()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -189,21 +155,28 @@ class RecordedViews:
 
     def image(self, key: ViewKey) -> np.ndarray:
         """The view's image alone, uint8 [H, W, 3]; callers do not write into it."""
-        self.camera(key)
-        with self._lock:
-            return self._images.load(key)
+        scaled = self.camera(key)
+        frame = self._scene.frame(key.frame)
+        path = Path(frame.image_paths[key.camera])
+        try:
+            read = partial(read_scaled, path, frame.cameras[key.camera], scaled)
+            return self._images.get(key, read)
+        except ImageFault as fault:
+            raise AdapterError(
+                f"camera {key.camera}, frame {key.frame}: image {path} {fault}; it could be read "
+                f"when the scene was opened, leave the files as they are while they are in use"
+            ) from None
 
     def load(self, key: ViewKey) -> RecordedView:
-        camera = self.camera(key)
+        camera, rgb = self.camera(key), self.image(key)
         with self._lock:
-            rgb = self._images.load(key)
             sky = self._sky(key, camera, rgb)
             prior = self._depth.load(key, sky)
-            ego = self._ego(camera)
-            if ego is not None:
-                prior = prior.select(~ego.reshape(-1)[prior.pixels])
-            weight = np.ones(sky.shape, np.float32)
-            return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
+        ego = self._ego(camera)
+        if ego is not None:
+            prior = prior.select(~ego.reshape(-1)[prior.pixels])
+        weight = np.ones(sky.shape, np.float32)
+        return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
 
     def _ego(self, camera: Camera) -> np.ndarray | None:
         """Where the camera sees the recording car; None if it does not."""
@@ -211,21 +184,18 @@ class RecordedViews:
         return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
 
     def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
-        packed = self._skies.get(key)
-        if packed is None:
+        size = (camera.height, camera.width)
+        if key not in self._skies:
             returns = self._depth.lidar(key).pixels
             mask = sky_mask(self._scene, camera, rgb, returns, self._lidar_top_rad)
             ego = self._ego(camera)
-            if ego is not None:
-                mask &= ~ego
-            self._skies[key] = np.packbits(mask)
-            return mask
-        count = camera.height * camera.width
-        bits = np.unpackbits(packed, count=count).view(np.bool_)
-        return bits.reshape(camera.height, camera.width)
+            self._skies[key] = np.packbits(mask if ego is None else mask & ~ego)
+        bits = np.unpackbits(self._skies[key], count=camera.height * camera.width)
+        return bits.view(np.bool_).reshape(size)
 
-    def _read_all(self, scene: Scene, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
+    def _read_all(self, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
         """The training camera of every view with a usable image, in order of frame and camera."""
+        scene = self._scene
         expected = [
             (ViewKey(frame.index, name), frame.cameras[name], frame.image_paths.get(name))
             for frame in scene.frames
@@ -239,13 +209,11 @@ class RecordedViews:
             _check_camera(key, full)
             scaled = full.scaled(scale)
             try:
-                self._images.add(key, Path(path), full, scaled)
+                self._images.put(key, read_scaled(Path(path), full, scaled))
+                cameras[key] = scaled
             except ImageFault as fault:
-                self._problems.append(
-                    f"camera {key.camera}, frame {key.frame}: image {path} {fault}; left out"
-                )
-                continue
-            cameras[key] = scaled
+                where = f"camera {key.camera}, frame {key.frame}"
+                self._problems.append(f"{where}: image {path} {fault}; left out")
         if not cameras:
             first = f" First: {self._problems[0]}." if self._problems else ""
             raise AdapterError(
@@ -287,7 +255,7 @@ class RecordedViews:
                     found[name] = read_ego_mask(path, views[0][1])
                 continue
             moving = [views[i] for i in moving_frames([camera for _, camera in views])]
-            images = [self._images.load(key) for key, _ in moving]
+            images = [self.image(key) for key, _ in moving]
             found[name] = find_ego_mask([camera for _, camera in moving], images)
         if masks_dir is not None and not found:
             raise AdapterError(

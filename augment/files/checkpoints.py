@@ -18,6 +18,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -110,7 +111,7 @@ def _read_zip(archive: zipfile.ZipFile, content: mmap.mmap) -> Any:
     storages = _Storages(content, partial(_place_in_zip, content, members))
     with archive.open(members["data.pkl"]) as opened:
         file: Any = opened  # a BufferedIOBase
-        return Pickle(_NAMES, storage=storages).read(file)
+        return Pickle(file, _NAMES, storage=storages).value()
 
 
 def _place_in_zip(
@@ -127,14 +128,14 @@ def _read_legacy(file: BufferedReader, content: mmap.mmap) -> Any:
     """Three pickles of what wrote it, one of the value, one of its storages' keys; then each one's
     length and numbers. The value is read twice, for where its numbers are stands behind it.
     """
-    if [Pickle({}).read(file) for _ in range(2)] != [_LEGACY_MAGIC, _LEGACY_PROTOCOL]:
+    if [Pickle(file, {}).value() for _ in range(2)] != [_LEGACY_MAGIC, _LEGACY_PROTOCOL]:
         raise PickleError("it is no whole checkpoint of torch")
-    Pickle({}).read(file)
+    Pickle(file, {}).value()
     start = file.tell()
     sizes: dict[str, tuple[int, int]] = {}
     storages = _Storages(None, lambda key, *size: (0, math.prod(sizes.setdefault(key, size))))
-    Pickle(_NAMES, storage=storages).read(file)
-    keys = Pickle({}).read(file)
+    Pickle(file, _NAMES, storage=storages).value()
+    keys = Pickle(file, {}).value()
     places: dict[str, tuple[int, int]] = {}
     at = file.tell()
     for key in keys:
@@ -144,7 +145,7 @@ def _read_legacy(file: BufferedReader, content: mmap.mmap) -> Any:
         places[key] = (at + 8, count * itemsize)
         at += 8 + count * itemsize
     file.seek(start)
-    return Pickle(_NAMES, storage=_Storages(content, lambda key, *_: places[key])).read(file)
+    return Pickle(file, _NAMES, storage=_Storages(content, lambda key, *_: places[key])).value()
 
 
 @dataclass(frozen=True)
@@ -294,6 +295,18 @@ def tensor(
             f"numbers; obtain the file again"
         )
     return found.detach()
+
+
+def finite_numbers(
+    content: Mapping[str, Any], name: str, shape: Sequence[int | None], where: str
+) -> np.ndarray:
+    """A small float32 tensor, checked, as float64. Raises AdapterError: as for `tensor`, or it
+    holds NaN or infinite numbers.
+    """
+    values = taken(tensor(content, name, shape, where)).double().numpy()
+    if not np.isfinite(values).all():
+        raise AdapterError(f"{where}: {name} holds NaN or infinite numbers")
+    return values
 
 
 def taken(source: Tensor, out: Tensor | None = None) -> Tensor:

@@ -10,13 +10,15 @@ below, and arrays are made of checked headers and of the bytes that are there.
 from __future__ import annotations
 
 import math
+import pickle
 import pickletools
 import re
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedIOBase
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -26,8 +28,16 @@ MAX_STREAMED_BYTES = 1 << 27  # for one array; a sweep of 200,000 points takes 5
 MAX_STREAMED_STEPS = 1 << 18  # a frame takes twenty
 MAX_INT_KEYS = 1 << 14  # of a dictionary: whole numbers can be chosen to collide
 _MAX_LINE = 1 << 12
-_OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
 _LONG_BYTES = 1 << 10  # longer ones are an array's own: nothing refers back to them
+_STEP_NAMES = {ord(opcode.code): opcode.name for opcode in pickletools.opcodes}
+_PLAIN_STEPS = (
+    "PROTO", "STOP", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1",
+    "BINFLOAT", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BINUNICODE", "SHORT_BINUNICODE",
+    "BINSTRING", "SHORT_BINSTRING", "MARK", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
+    "EMPTY_LIST", "EMPTY_DICT", "MEMOIZE", "BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET",
+    "GLOBAL", "STACK_GLOBAL", "REDUCE", "BINPERSID",
+)  # fmt: skip
+Order = Literal["C", "F"]
 _DTYPE = re.compile(r"[fiu][1248]|b1|O8?")
 _PLAIN_CELLS = (type(None), bool, int, float, str, np.generic)
 _NPY_HEADER = re.compile(
@@ -51,15 +61,20 @@ class Record(ABC):
 class Name:
     """A function or class that a pickle names. make: what stands for it here."""
 
-    text: str
     make: Callable[..., Any]
 
+    def __call__(self, *arguments: Any) -> Any:
+        return self.make(*arguments)
 
-class Pickle:
-    """One pickle, followed step by step."""
+
+class Pickle(pickle._Unpickler):
+    """One pickle, read step by step by Python's own reader, in Python (the one in C takes memory as
+    the file says), of which the steps that plain values need are left.
+    """
 
     def __init__(
         self,
+        file: BufferedIOBase,
         names: Mapping[tuple[str, str], Callable[..., Any]],
         *,
         storage: Callable[..., Any] | None = None,
@@ -69,98 +84,79 @@ class Pickle:
         a persistent id stands for, of the id. is_streamed: keep no long bytes once they are used,
         for files larger than memory; then nothing may refer back to them.
         """
-        self._names = names
-        self._storage = storage
-        self._is_streamed = is_streamed
-        self._held_bytes = 0  # of a streamed file's values that wait for their array
-        self._memo: dict[int, Any] = {}
+        self._source: Any = _Bounded(file, is_streamed)
+        super().__init__(self._source, encoding="latin-1")
+        self.read, self.readline = self._source.read, self._source.readline
+        self._names, self._storage, self._is_streamed = names, storage, is_streamed
+        self.memo: dict[int, Any] = _ShortMemo() if is_streamed else {}
+        self.metastack: list[list[Any]] = []
         self.stack: list[Any] = []
+        self.append = self.stack.append
+        self._built: Record | None = None
 
-    def read(self, file: BufferedIOBase) -> Any:
+    def value(self) -> Any:
         """The value of the pickle that starts at the file's position; reads no further."""
-        for _ in self.steps(file):
+        for _ in self.steps():
             pass
         return self.stack[-1]
 
-    def steps(self, file: BufferedIOBase) -> Iterator[Record]:
-        """As `read`, but comes up with every record that has been built. Its value is then the last
-        one on `stack`.
+    def steps(self) -> Iterator[Record]:
+        """As `value`, but comes up with every record that has been built. The value is then the
+        last one on `stack`.
         """
         most = MAX_STREAMED_STEPS if self._is_streamed else MAX_STEPS
+        count, code = 0, b""
         try:
-            for count, (step, argument) in enumerate(_steps_of(file)):
-                if count > most:
+            while code != pickle.STOP:
+                if (count := count + 1) > most:
                     raise PickleError(f"it takes more than {most} steps")
-                built = step(self, argument)
-                if built is not None:
-                    self._held_bytes = 0
+                if not (code := self.read(1)) or code[0] not in _STEP_NAMES:
+                    raise PickleError("it is cut short or damaged (no known step)")
+                if code[0] not in self.dispatch:
+                    name = _STEP_NAMES[code[0]]
+                    raise PickleError(f"it holds {name}, which plain values do not need")
+                if code != pickle.STOP:
+                    self.dispatch[code[0]](self)
+                if self._built is not None:
+                    self._source.held_bytes, built, self._built = 0, self._built, None
                     yield built
-            if len(self.stack) != 1 or self.stack[0] is _MARK:
+            if len(self.stack) != 1 or self.metastack:
                 raise PickleError("it is cut short or damaged (no single value)")
         except PickleError:
             raise
-        except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError,
+                struct.error, pickle.UnpicklingError) as error:  # fmt: skip
             raise PickleError(f"it is cut short or damaged ({error})") from error
 
-    def _push(self, value: Any) -> None:
-        if self._is_streamed and isinstance(value, bytes | bytearray | str):
-            self._held_bytes += len(value)
-            if self._held_bytes > MAX_STREAMED_BYTES:
-                raise PickleError(f"it holds {self._held_bytes} bytes that are in no array")
-        self.stack.append(bytes(value) if isinstance(value, bytearray) else value)
-
-    def _pop_to_mark(self) -> list[Any]:
-        at = len(self.stack) - 1
-        while self.stack[at] is not _MARK:
-            at -= 1
-            if at < 0:
-                raise PickleError("it is cut short or damaged (no mark)")
-        items = self.stack[at + 1 :]
-        del self.stack[at:]
-        return items
-
-    def _pop_tuple(self, count: int) -> None:
-        at = len(self.stack) - count
-        if at < 0:
-            raise PickleError("it is cut short or damaged (short stack)")
-        self.stack[at:] = [tuple(self.stack[at:])]
-
-    def _put(self, key: int) -> None:
-        value = self.stack[-1]
-        is_long = self._is_streamed and isinstance(value, bytes) and len(value) > _LONG_BYTES
-        self._memo[key] = _FORGOTTEN if is_long else value
-
-    def _get(self, key: int) -> None:
-        if self._memo[key] is _FORGOTTEN:
-            raise PickleError("it refers back to the bytes of an array")
-        self.stack.append(self._memo[key])
-
-    def _global(self, module: str, name: str) -> None:
-        make = self._names.get((module, name))
-        if make is None:
+    def find_class(self, module: str, name: str) -> Name:
+        if (module, name) not in self._names:
             raise PickleError(f"it asks for {module}.{name}, which is not needed")
-        self.stack.append(Name(f"{module}.{name}", make))
+        return Name(self._names[module, name])
 
-    def _global_by_stack(self) -> None:
-        name, module = self.stack.pop(), self.stack.pop()
-        if type(name) is not str or type(module) is not str:
-            raise PickleError("it names something by what is no text")
-        self._global(module, name)
+    def persistent_load(self, pid: Any) -> Any:
+        if self._storage is None:
+            raise PickleError("it refers to values outside of it")
+        return self._storage(pid)
+
+    def _frame(self) -> None:
+        self.read(8)  # what a frame holds is read like the rest
+
+    def _bytearray(self) -> None:
+        self.append(self.read(int.from_bytes(self.read(8), "little")))
 
     def _reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
         if type(function) is not Name or type(arguments) is not tuple:
             raise PickleError("it calls something that is no name, or without arguments")
-        self.stack.append(function.make(*arguments))
+        self.append(function(*arguments))
 
-    def _build(self) -> Record | None:
+    def _build(self) -> None:
         state, target = self.stack.pop(), self.stack[-1]
-        if type(target) is dict:  # of an OrderedDict: attributes beside its entries
-            return None
-        if not isinstance(target, Record):
+        if isinstance(target, Record):
+            target.build(state)
+            self._built = target
+        elif type(target) is not dict:  # an OrderedDict has attributes beside its entries
             raise PickleError("it fills something that takes no state")
-        target.build(state)
-        return target
 
     def _store(self, pairs: list[Any]) -> None:
         target = self.stack[-1]
@@ -179,78 +175,58 @@ class Pickle:
             raise PickleError("it adds items to something that is no list")
         self.stack[-1].extend(items)
 
-    def _persistent(self) -> None:
-        key = self.stack.pop()
-        if self._storage is None:
-            raise PickleError("it refers to values outside of it")
-        self.stack.append(self._storage(key))
+    dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
+        **{
+            code: step
+            for code, step in pickle._Unpickler.dispatch.items()
+            if _STEP_NAMES[code] in _PLAIN_STEPS
+        },
+        pickle.FRAME[0]: _frame,
+        pickle.BYTEARRAY8[0]: _bytearray,
+        pickle.REDUCE[0]: _reduce,
+        pickle.NEWOBJ[0]: _reduce,
+        pickle.BUILD[0]: _build,
+        pickle.SETITEM[0]: lambda self: self._store([self.stack.pop(-2), self.stack.pop()]),
+        pickle.SETITEMS[0]: lambda self: self._store(self.pop_mark()),
+        pickle.APPEND[0]: lambda self: self._extend([self.stack.pop()]),
+        pickle.APPENDS[0]: lambda self: self._extend(self.pop_mark()),
+    }
 
 
-_MARK = object()
+class _ShortMemo(dict[int, Any]):
+    """What a pickle refers back to, but for long bytes."""
+
+    def __setitem__(self, key: int, value: Any) -> None:
+        is_long = isinstance(value, bytes) and len(value) > _LONG_BYTES
+        super().__setitem__(key, _FORGOTTEN if is_long else value)
+
+    def __getitem__(self, key: int) -> Any:
+        if (value := super().__getitem__(key)) is _FORGOTTEN:
+            raise PickleError("it refers back to the bytes of an array")
+        return value
+
+
 _FORGOTTEN = object()
-
-_STEPS: dict[str, Callable[[Pickle, Any], Record | None]] = {
-    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda p, _: None),
-    **dict.fromkeys(
-        ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINBYTES", "SHORT_BINBYTES",
-         "BINBYTES8", "BYTEARRAY8", "BINUNICODE", "SHORT_BINUNICODE", "BINSTRING",
-         "SHORT_BINSTRING"),
-        Pickle._push,
-    ),
-    "NONE": lambda p, _: p._push(None),
-    "NEWTRUE": lambda p, _: p._push(True),
-    "NEWFALSE": lambda p, _: p._push(False),
-    "MARK": lambda p, _: p._push(_MARK),
-    "EMPTY_TUPLE": lambda p, _: p._push(()),
-    "EMPTY_LIST": lambda p, _: p._push([]),
-    "EMPTY_DICT": lambda p, _: p._push({}),
-    "TUPLE": lambda p, _: p._push(tuple(p._pop_to_mark())),
-    "TUPLE1": lambda p, _: p._pop_tuple(1),
-    "TUPLE2": lambda p, _: p._pop_tuple(2),
-    "TUPLE3": lambda p, _: p._pop_tuple(3),
-    "SETITEM": lambda p, _: p._store([p.stack.pop(-2), p.stack.pop()]),
-    "SETITEMS": lambda p, _: p._store(p._pop_to_mark()),
-    "APPEND": lambda p, _: p._extend([p.stack.pop()]),
-    "APPENDS": lambda p, _: p._extend(p._pop_to_mark()),
-    "MEMOIZE": lambda p, _: p._put(len(p._memo)),
-    **dict.fromkeys(("BINPUT", "LONG_BINPUT"), Pickle._put),
-    **dict.fromkeys(("BINGET", "LONG_BINGET"), Pickle._get),
-    "GLOBAL": lambda p, text: p._global(*text.split(" ", 1)),
-    "STACK_GLOBAL": lambda p, _: p._global_by_stack(),
-    **dict.fromkeys(("REDUCE", "NEWOBJ"), lambda p, _: p._reduce()),
-    "BUILD": lambda p, _: p._build(),
-    "BINPERSID": lambda p, _: p._persistent(),
-}  # fmt: skip
-
-
-def _steps_of(file: BufferedIOBase) -> Iterator[tuple[Callable[[Pickle, Any], Any], Any]]:
-    """Every step of a pickle and its argument. Not by pickletools.genops, which would decode the
-    arguments of steps that are refused, and imports codecs to do so.
-    """
-    source: Any = _Bounded(file)  # all that readers of arguments need of a file
-    while True:
-        code = source.read(1)
-        opcode = _OPCODES.get(code.decode("latin-1"))
-        if opcode is None:
-            raise PickleError("it is cut short or damaged (no known step)")
-        step = _STEPS.get(opcode.name)
-        if step is None:
-            raise PickleError(f"it holds {opcode.name}, which plain values do not need")
-        yield step, None if opcode.arg is None else opcode.arg.reader(source)
-        if opcode.name == "STOP":
-            return
 
 
 class _Bounded:
-    """A file that is read forward, in pieces of bounded size."""
+    """A file that is read forward, in pieces of bounded size. held_bytes: read since a record was
+    last built; bounded in streamed files.
+    """
 
-    def __init__(self, file: BufferedIOBase) -> None:
-        self._file = file
+    def __init__(self, file: BufferedIOBase, is_streamed: bool) -> None:
+        self._file, self._is_streamed, self.held_bytes = file, is_streamed, 0
 
     def read(self, count: int) -> bytes:
         if not 0 <= count <= MAX_VALUE_BYTES:
             raise PickleError(f"it states {count} bytes for one value")
-        return self._file.read(count)
+        self.held_bytes += count
+        if self._is_streamed and self.held_bytes > MAX_STREAMED_BYTES:
+            raise PickleError(f"it holds {self.held_bytes} bytes that are in no array")
+        data = self._file.read(count)
+        if len(data) < count:
+            raise PickleError("it is cut short or damaged (too few bytes)")
+        return data
 
     def readline(self) -> bytes:
         line = self._file.readline(_MAX_LINE)
@@ -277,16 +253,12 @@ class DtypeRecord(Record):
 
     def build(self, state: Any) -> None:
         """Takes the byte order; fields, sub-arrays, sizes and flags of one's own are refused."""
-        flags = 63 if self.is_object else 0
-        plain = type(state) is tuple and len(state) == 8 and type(state[1]) is str
-        if not plain or state[1] not in ("<", ">", "|", "="):
-            raise PickleError("it holds values in no known byte order")
-        rest = (state[0], *state[2:])
-        if any(type(value) not in (int, type(None)) for value in rest) or rest != (
-            3, None, None, None, -1, -1, flags
-        ):  # fmt: skip
-            raise PickleError("it describes values as something else than plain numbers")
-        self.order = state[1]
+        match state:
+            case (3, "<" | ">" | "|" | "=" as order, None, None, None, -1, -1, 0 | 63 as flags):
+                if (flags == 63) == self.is_object:
+                    self.order = order
+                    return
+        raise PickleError("it describes values as something else than plain numbers")
 
     @property
     def is_object(self) -> bool:
@@ -338,7 +310,7 @@ class ArrayRecord(Record):
         array.values = array.take().transpose(np.argsort(axes))
         return array
 
-    def _fill(self, shape: Any, dtype: Any, order: str, content: Any) -> None:
+    def _fill(self, shape: Any, dtype: Any, order: Order, content: Any) -> None:
         if type(dtype) is not DtypeRecord:
             raise PickleError("it holds an array without a type")
         sides = _checked_shape(shape)
@@ -356,19 +328,16 @@ class ArrayRecord(Record):
         return values
 
 
-def numbers(shape: tuple[int, ...], dtype: np.dtype, order: str, content: Any) -> np.ndarray:
+def numbers(shape: tuple[int, ...], dtype: np.dtype, order: Order, content: Any) -> np.ndarray:
     """An array of its own memory, in the machine's byte order."""
     if type(content) is not bytes or math.prod(shape) * dtype.itemsize != len(content):
         held = f"{len(content)} bytes" if type(content) is bytes else "no bytes"
         raise PickleError(f"it holds {held} for an array {list(shape)} of {dtype}")
-    flat = np.frombuffer(content, dtype)
-    return (
-        flat.reshape(shape, order="F" if order == "F" else "C")
-        .astype(dtype.newbyteorder("="), order="K")
-    )  # fmt: skip
+    array = np.frombuffer(content, dtype).reshape(shape, order=order)
+    return array.astype(dtype.newbyteorder("="), order="K")
 
 
-def _objects(shape: tuple[int, ...], order: str, content: Any) -> tuple[np.ndarray | None, Any]:
+def _objects(shape: tuple[int, ...], order: Order, content: Any) -> tuple[np.ndarray | None, Any]:
     """Texts, numbers and None; or, of a single object that is none of them, what it is."""
     if type(content) is not list or math.prod(shape) != len(content):
         raise PickleError(f"it holds an array {list(shape)} of objects without as many")
@@ -378,7 +347,7 @@ def _objects(shape: tuple[int, ...], order: str, content: Any) -> tuple[np.ndarr
         raise PickleError("it holds a cell that is neither a text nor a number")
     flat = np.empty(len(content), dtype=object)
     flat[:] = content
-    return flat.reshape(shape, order="F" if order == "F" else "C"), None
+    return flat.reshape(shape, order=order), None
 
 
 def _checked_shape(shape: Any) -> tuple[int, ...]:
@@ -431,7 +400,7 @@ class NpyHeader:
 
     shape: tuple[int, ...]
     dtype: np.dtype | None
-    order: str
+    order: Order
 
 
 def read_npy_header(file: BufferedIOBase) -> NpyHeader:

@@ -1,17 +1,16 @@
-"""The .ply container: its header, and rows of fixed size read in pieces.
+"""Gaussians in plain files: INRIA's .ply (SH degree 0 to 3) and .splat (32-byte records).
 
-Knows nothing of Gaussians. A header is not trusted: counts are compared with the size of the file
-before anything is allocated, so a damaged or hostile file costs a message and no memory.
+A header is not trusted: counts are compared with the size of the file before anything is allocated,
+so a damaged or hostile file costs a message and no memory.
 """
 
 from __future__ import annotations
 
 import itertools
 import logging
-import os
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from itertools import islice
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,11 +23,12 @@ from augment.jobs.atomic import replaced_file
 from augment.render.sh import SH_C0
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
-# ---- The container -------------------------------------------------------------------------------
+# ---- The container: a header, and tables of rows that are read in pieces -------------------------
 
 ROWS_PER_CHUNK = 16384  # about 4 MB of degree-3 rows: columns are picked out while in the cache
 _MAX_HEADER_BYTES = 1 << 20
-_MAX_COUNT_DIGITS = 18  # more than any file holds, few enough for int64
+_MAX_LINE_BYTES = 1 << 16  # of a row of text
+_COUNT = re.compile(r"[0-9]{1,18}")  # more than any file holds, few enough for int64
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "ascii"}
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -40,21 +40,14 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One table of the file. columns: names and numpy type codes without byte order, in order.
-    list_columns: names of properties whose length varies by row; such an element has no row size.
+    """One table of the file. columns: numpy type codes without byte order, by name in the file's
+    order. lists: names of properties whose length varies by row; such rows have no fixed size.
     """
 
     name: str
     count: int
-    columns: tuple[tuple[str, str], ...]
-    list_columns: tuple[str, ...] = ()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(name for name, _ in self.columns)
-
-    def row_dtype(self, byte_order: str) -> np.dtype:
-        return np.dtype([(name, byte_order + code) for name, code in self.columns])
+    columns: dict[str, str] = field(default_factory=dict)
+    lists: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -75,6 +68,30 @@ class PlyHeader:
         found = ", ".join(repr(e.name) for e in self.elements) or "none"
         raise SceneError(f"{self.path}: expected an element {name!r} in the .ply; found {found}")
 
+    def row_dtype(self, element: PlyElement) -> np.dtype:
+        """Of the rows that `iterate_rows` gives."""
+        if self.byte_order == "ascii":
+            return np.dtype([(name, "f8") for name in element.columns])
+        return np.dtype([(name, self.byte_order + code) for name, code in element.columns.items()])
+
+    def size_of(self, elements: tuple[PlyElement, ...]) -> int:
+        """Bytes of binary tables without lists."""
+        return sum(element.count * self.row_dtype(element).itemsize for element in elements)
+
+    def surplus_problems(self) -> tuple[str, ...]:
+        """A sentence where bytes follow the last row announced; in ascii, or after lists, that
+        cannot be known.
+        """
+        if self.byte_order == "ascii" or any(element.lists for element in self.elements):
+            return ()
+        end = self.body_offset + self.size_of(self.elements)
+        surplus = self.path.stat().st_size - end
+        if surplus <= 0:
+            return ()
+        return (
+            f"{self.path}: {surplus} bytes follow the rows its header announces and were ignored",
+        )
+
 
 def read_ply_header(path: str | Path) -> PlyHeader:
     """Read the header of a .ply file."""
@@ -84,26 +101,33 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     with path.open("rb") as file:
         lines = _header_lines(file, path)
         offset = file.tell()
-    byte_order = None
-    elements: list[PlyElement] = []
-    comments: list[str] = []
+    byte_order, elements, comments = None, [], []
     for number, line in enumerate(lines, start=2):
-        words = line.split()
-        if not words:
-            continue
-        if words[0] in ("comment", "obj_info"):
-            comments.append(line.partition(" ")[2].strip())
-        elif words[0] == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS:
-            byte_order = _BYTE_ORDERS[words[1]]
-        elif words[0] == "element":
-            digits = words[2] if len(words) == 3 else ""
-            if not (digits.isascii() and digits.isdigit() and len(digits) <= _MAX_COUNT_DIGITS):
-                raise _bad_line(path, number, " ".join(words))
-            elements.append(PlyElement(words[1], int(digits), ()))
-        elif words[0] == "property" and elements:
-            elements[-1] = _add_property(elements[-1], words, path, number)
-        else:
-            raise _bad_line(path, number, line)
+        match line.split():
+            case []:
+                pass
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.partition(" ")[2].strip())
+            case ["format", kind, _] if kind in _BYTE_ORDERS:
+                byte_order = _BYTE_ORDERS[kind]
+            case ["element", name, count] if _COUNT.fullmatch(count):
+                elements.append(PlyElement(name, int(count)))
+            case ["property", *kind, name] if elements and _is_type(kind):
+                last = elements[-1]
+                if name in last.columns or name in last.lists:
+                    raise SceneError(
+                        f"{path}: line {number} of the .ply header repeats the property {name!r} "
+                        f"of element {last.name!r}"
+                    )
+                if len(kind) == 1:
+                    last.columns[name] = _TYPES[kind[0]]
+                else:
+                    last.lists.append(name)
+            case _:
+                raise SceneError(
+                    f"{path}: line {number} of the .ply header cannot be used: {line[:80]!r}; "
+                    "expected 'element NAME COUNT' and 'property TYPE NAME' lines"
+                )
     if byte_order is None:
         raise SceneError(
             f"{path}: the .ply header names no format; expected a line 'format X 1.0' with X "
@@ -112,32 +136,9 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     return PlyHeader(path, byte_order, tuple(elements), tuple(comments), offset)
 
 
-def count_surplus_bytes(header: PlyHeader) -> int:
-    """Bytes after the last row announced; 0 where that cannot be known (ascii, lists)."""
-    if header.byte_order == "ascii" or any(e.list_columns for e in header.elements):
-        return 0
-    body = sum(e.count * e.row_dtype(header.byte_order).itemsize for e in header.elements)
-    return max(0, header.path.stat().st_size - header.body_offset - body)
-
-
-def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
-    """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order. Ascii values
-    arrive as float64, binary ones in the file's own types.
-    """
-    position = [e.name for e in header.elements].index(header.element(name).name)
-    before, element = header.elements[:position], header.elements[position]
-    for other in (*before, element):
-        if other.list_columns and (other is element or header.byte_order != "ascii"):
-            raise SceneError(
-                f"{header.path}: cannot read element {name!r}: element {other.name!r} has list "
-                f"properties ({', '.join(other.list_columns)}), so its rows have no fixed size; "
-                f"re-save the file with {name!r} first and without lists"
-            )
-    if header.byte_order == "ascii":
-        yield from _ascii_rows(header, element, skip=sum(e.count for e in before))
-    else:
-        skip = sum(e.count * e.row_dtype(header.byte_order).itemsize for e in before)
-        yield from _binary_rows(header, element, header.body_offset + skip)
+def _is_type(words: list[str]) -> bool:
+    types = words[1:] if len(words) == 3 and words[0] == "list" else words
+    return len(types) in (1, 2) and len(words) != 2 and all(word in _TYPES for word in types)
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:
@@ -158,177 +159,167 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
     )
 
 
-def _bad_line(path: Path, number: int, line: str) -> SceneError:
-    return SceneError(
-        f"{path}: line {number} of the .ply header cannot be used: {line[:80]!r}; expected "
-        "'element NAME COUNT' and 'property TYPE NAME' lines"
-    )
-
-
-def _add_property(element: PlyElement, words: list[str], path: Path, number: int) -> PlyElement:
-    line = " ".join(words)
-    name = words[-1]
-    if name in element.names or name in element.list_columns:
+def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
+    """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order. Ascii values
+    arrive as float64, binary ones in the file's own types.
+    """
+    element = header.element(name)
+    before = header.elements[: header.elements.index(element)]
+    is_ascii = header.byte_order == "ascii"
+    for other in (*before, element):
+        if other.lists and (other is element or not is_ascii):
+            raise SceneError(
+                f"{header.path}: cannot read element {name!r}: element {other.name!r} has list "
+                f"properties ({', '.join(other.lists)}), so its rows have no fixed size; "
+                f"re-save the file with {name!r} first and without lists"
+            )
+    if not element.columns:
+        return
+    dtype, width = header.row_dtype(element), len(element.columns)
+    skipped = 0 if is_ascii else header.size_of(before)
+    available = header.path.stat().st_size - header.body_offset - skipped
+    # Of text, a digit and a separator a value are the least.
+    row_bytes, there = (2 * width, available + 1) if is_ascii else (dtype.itemsize, available)
+    if element.count * row_bytes > there:
         raise SceneError(
-            f"{path}: line {number} of the .ply header repeats the property {name!r} of element "
-            f"{element.name!r}"
-        )
-    if len(words) == 3 and words[1] in _TYPES:
-        return replace(element, columns=(*element.columns, (name, _TYPES[words[1]])))
-    if len(words) == 5 and words[1] == "list" and words[2] in _TYPES and words[3] in _TYPES:
-        return replace(element, list_columns=(*element.list_columns, name))
-    raise _bad_line(path, number, line)
-
-
-def _binary_rows(header: PlyHeader, element: PlyElement, offset: int) -> Iterator[np.ndarray]:
-    dtype = element.row_dtype(header.byte_order)
-    available = os.stat(header.path).st_size - offset
-    if element.count * dtype.itemsize > available:
-        raise SceneError(
-            f"{header.path}: the header announces {element.count} rows of {element.name!r} "
-            f"({dtype.itemsize} bytes each), but the file ends after "
-            f"{max(0, available) // max(1, dtype.itemsize)} of them; it is truncated or its header "
-            "is wrong: copy or export it again"
+            f"{header.path}: the header announces {element.count} rows of {name!r}, at least "
+            f"{row_bytes} bytes each, but the file ends after {max(0, there) // row_bytes} of "
+            "them; it is truncated or its header is wrong: copy or export it again"
         )
     with header.path.open("rb") as file:
-        file.seek(offset)
+        file.seek(header.body_offset + skipped)
+        if is_ascii:
+            for _ in itertools.islice(file, sum(other.count for other in before)):
+                pass
         for start in range(0, element.count, ROWS_PER_CHUNK):
             count = min(ROWS_PER_CHUNK, element.count - start)
-            rows = np.fromfile(file, dtype=dtype, count=count)
+            if is_ascii:
+                rows = _parse_rows(file, count, dtype, f"{header.path}: {name!r}", start)
+            else:
+                rows = np.fromfile(file, dtype=dtype, count=count)
             if len(rows) < count:
-                raise SceneError(f"{header.path}: the file became shorter while it was read")
+                raise SceneError(
+                    f"{header.path}: the header announces {element.count} rows of {name!r}, but "
+                    f"the file ends after {start + len(rows)} of them"
+                )
             yield rows
 
 
-def _ascii_rows(header: PlyHeader, element: PlyElement, skip: int) -> Iterator[np.ndarray]:
-    dtype = np.dtype([(name, "f8") for name in element.names])
-    width = len(element.columns)
-    available = header.path.stat().st_size - header.body_offset
-    if element.count * 2 * width > available + 1:  # a digit and a separator a value, at the least
-        raise SceneError(
-            f"{header.path}: the header announces {element.count} rows of {width} values in "
-            f"{element.name!r}, more than the file's {available} bytes can hold; it is truncated "
-            "or its header is wrong: copy or export it again"
-        )
-    with header.path.open("rb") as file:
-        file.seek(header.body_offset)
-        for _ in islice(file, skip):
-            pass
-        for start in range(0, element.count, ROWS_PER_CHUNK):
-            count = min(ROWS_PER_CHUNK, element.count - start)
-            words = [line.split() for line in islice(file, count)]
-            for number, row in enumerate(words, start=start):
-                if len(row) != width:
-                    raise SceneError(
-                        f"{header.path}: row {number} of {element.name!r} must have {width} values "
-                        f"(one per property); got {len(row)}"
-                    )
-            if len(words) < count:
-                raise SceneError(
-                    f"{header.path}: the header announces {element.count} rows of "
-                    f"{element.name!r}, but the file ends after {start + len(words)} of them"
-                )
-            yield _parse_numbers(words, dtype, header.path, element.name, start)
-
-
-def _parse_numbers(
-    words: list[list[bytes]], dtype: np.dtype, path: Path, name: str, start: int
-) -> np.ndarray:
+def _parse_rows(file: BinaryIO, count: int, dtype: np.dtype, where: str, start: int) -> np.ndarray:
+    """The rows of `count` lines of text, fewer at the file's end. start: number of the first."""
+    lines = [line for _ in range(count) if (line := file.readline(_MAX_LINE_BYTES))]
+    width = len(dtype.names or ())
+    for number, line in enumerate(lines, start):
+        found = len(line.split(None, width))
+        if found != width or len(line) == _MAX_LINE_BYTES:
+            got = "more" if found > width else found
+            raise SceneError(
+                f"{where}, row {number} must have {width} values (one per property); got {got}"
+            )
     try:
-        values = np.array(words, dtype="S").astype(np.float64)
+        values = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if lines else np.empty(0)
     except ValueError as error:
-        raise SceneError(
-            f"{path}: rows {start} to {start + len(words) - 1} of {name!r} hold a value that is "
-            f"not a number ({error})"
-        ) from error
-    return values.view(dtype).reshape(len(words))
+        rows = f"rows {start} to {start + len(lines) - 1}"
+        raise SceneError(f"{where}, {rows}: a value is not a number ({error})") from error
+    return values.reshape(-1).view(dtype)
 
 
-# ---- Columns of the INRIA splat .ply: which there must be, and how they map to Gaussians ---------
-# Scales are logs, opacities logits, quaternions of any length; f_rest is channel-major (all of
-# red's coefficients, then green's, then blue's). Values here are as in the file: `_activate` and
-# `rows_of_gaussians` change them on reading and writing.
+# ---- Columns of the splat .ply: which there must be, and how they map to Gaussians ---------------
+# Scales are logs, opacities logits, quaternions of any length. f_dc may hold more than one term a
+# channel, as Street Gaussians' actors have; f_dc and f_rest are channel-major (all of red's, then
+# green's, then blue's).
 
 SEMANTIC = "semantic_class"
-_F_REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)
 _GEOMETRY = ("x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)),
              *(f"rot_{i}" for i in range(4)))  # fmt: skip
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_RGB = ("red", "green", "blue")
+_RGB = {"f_dc_0": "red", "f_dc_1": "green", "f_dc_2": "blue"}
 # Beyond these the float32 sigmoid is 0 or 1; a finite logit keeps other readers' sums finite.
 _LOGIT_MIN, _LOGIT_MAX = -110.0, 40.0
 
 
-def has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
-    """Whether coordinates come with more digits than float32 holds."""
-    types = dict(table.columns)
-    return header.byte_order == "ascii" or any(types[axis] in ("f8", "i4", "u4") for axis in "xyz")
-
-
-def read_columns(header: PlyHeader, table: PlyElement) -> dict[str, np.ndarray]:
+def read_columns(
+    header: PlyHeader, table: PlyElement, *, has_terms: bool = False
+) -> dict[str, np.ndarray]:
     """The columns of Gaussians as they stand in the file, gathered into contiguous arrays. means
     [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3] (log),
-    opacities [N] (logit), sh [N, K, 3], and semantic_class [N] where the file has it.
+    opacities [N] (logit), sh [N, K, 3], semantic_class [N] where the file has it, and where
+    has_terms says that f_dc may hold them, terms [N, F - 1, 3] beyond the first.
     """
-    sh_count = _check_columns(header, table)
-    mean_type = np.float64 if has_wide_means(header, table) else np.float32
+    terms, bands = _check_columns(header, table, has_terms=has_terms)
     pieces = iterate_rows(header, table.name)
     first = next(pieces, None)  # only now is the file known to be as long as its header says
-    target = _allocate(table, sh_count, mean_type)
-    done = 0
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (1 + bands, 3)}
+    types: dict[str, type] = {"means": np.float64 if _has_wide_means(header, table) else np.float32}
+    if has_terms:
+        shapes["terms"] = (terms - 1, 3)
+    if SEMANTIC in table.columns:
+        shapes[SEMANTIC], types[SEMANTIC] = (), np.int16
+    arrays = {n: np.empty((table.count, *s), types.get(n, np.float32)) for n, s in shapes.items()}
+    places, done = _columns_of(arrays), 0
     for rows in () if first is None else itertools.chain([first], pieces):
-        _scatter_columns(rows, target, slice(done, done + len(rows)))
+        with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 are infinite
+            for name, place in places.items():
+                if name in table.columns:
+                    values = rows[name]
+                else:
+                    values = (rows[_RGB[name]] / 255.0 - 0.5) / SH_C0
+                place[done : done + len(rows)] = values
         done += len(rows)
-    return target
+    return arrays
 
 
-def column_types(gaussians: Gaussians) -> list[tuple[str, str]]:
-    """Names and types of the columns written for these Gaussians, in INRIA's order."""
-    rest = 3 * (gaussians.sh.shape[1] - 1)
-    names = ["x", "y", "z", "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest))]
-    columns = [(name, "<f4") for name in (*names, *_GEOMETRY[3:])]
-    return columns if gaussians.semantic is None else [*columns, (SEMANTIC, "<i2")]
+def _columns_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Views of the arrays of `read_columns`, by the file's columns in INRIA's order."""
+    sh, terms = arrays["sh"], arrays.get("terms", np.empty((len(arrays["sh"]), 0, 3)))
+    columns = {axis: arrays["means"][:, i] for i, axis in enumerate("xyz")}
+    dc, bands = 1 + terms.shape[1], sh.shape[1] - 1
+    for number in range(3 * dc):
+        channel, term = divmod(number, dc)
+        columns[f"f_dc_{number}"] = terms[:, term - 1, channel] if term else sh[:, 0, channel]
+    for number in range(3 * bands):
+        columns[f"f_rest_{number}"] = sh[:, 1 + number % bands, number // bands]
+    columns["opacity"] = arrays["opacities"]
+    columns |= {f"scale_{i}": arrays["scales"][:, i] for i in range(3)}
+    columns |= {f"rot_{i}": arrays["quats"][:, i] for i in range(4)}
+    return columns | ({SEMANTIC: arrays[SEMANTIC]} if SEMANTIC in arrays else {})
 
 
-def rows_of_gaussians(part: Gaussians, dtype: np.dtype) -> np.ndarray:
-    """Structured rows [N] of the Gaussians, activations inverted. Normals are written as 0."""
-    rows = np.zeros(len(part), dtype=dtype)
-    opacities = part.opacities.double()
-    logits = (opacities.log() - torch.log1p(-opacities)).clamp(_LOGIT_MIN, _LOGIT_MAX)
-    log_scales = part.scales.double().log()
-    rest = part.sh[:, 1:].transpose(1, 2).reshape(len(part), -1)  # channel-major
-    columns = {axis: part.means[:, i] for i, axis in enumerate("xyz")}
-    columns["opacity"] = logits
-    columns |= {f"scale_{i}": log_scales[:, i] for i in range(3)}
-    columns |= {f"rot_{i}": part.quats[:, i] for i in range(4)}
-    columns |= {name: part.sh[:, 0, channel] for channel, name in enumerate(_DC)}
-    columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
-    if part.semantic is not None:
-        columns[SEMANTIC] = part.semantic
-    for name, values in columns.items():
-        rows[name] = values.detach().cpu().numpy()
-    return rows
-
-
-def _check_columns(header: PlyHeader, table: PlyElement) -> int:
-    """Number of SH coefficients K, once the columns are known to be those of Gaussians."""
-    names = set(table.names)
+def _check_columns(header: PlyHeader, table: PlyElement, *, has_terms: bool) -> tuple[int, int]:
+    """Colour terms and SH bands a channel, once the columns are known to be those of Gaussians."""
+    where, names = f"{header.path}, {table.name}", set(table.columns)
     missing = [name for name in _GEOMETRY if name not in names]
-    if not names.issuperset(_RGB):
-        missing += [name for name in _DC if name not in names]
+    if has_terms or not names.issuperset(_RGB.values()):
+        missing += [name for name in _DC[: 1 if has_terms else 3] if name not in names]
     if missing:
         raise SceneError(
             f"{header.path}: not a Gaussian splat .ply: its element {table.name!r} misses "
-            f"{', '.join(missing)}; it has {', '.join(table.names) or 'no properties'}. "
+            f"{', '.join(missing)}; it has {', '.join(table.columns) or 'no properties'}. "
             + _guess_content(header, names)
         )
-    rest = [name for name in table.names if name.startswith("f_rest_")]
-    if len(rest) not in _F_REST_COUNTS or set(rest) != {f"f_rest_{i}" for i in range(len(rest))}:
+    counts = {}
+    for prefix in ("f_dc_", "f_rest_"):
+        found = [name for name in table.columns if name.startswith(prefix)]
+        counts[prefix] = len(found) // 3
+        is_read = has_terms or prefix == "f_rest_"
+        are_all = set(found) == {f"{prefix}{i}" for i in range(len(found))}
+        if is_read and (len(found) % 3 or not are_all):
+            raise SceneError(
+                f"{where}: {prefix}0, {prefix}1, … must be a multiple of 3 in number (a channel's "
+                f"values after the other's) and numbered without gaps; got {len(found)}"
+            )
+    if 1 + counts["f_rest_"] not in SH_COUNTS:
         raise SceneError(
-            f"{header.path}: f_rest_0, f_rest_1, … must be {_F_REST_COUNTS} in number (SH degrees "
-            f"0 to 3) and numbered without gaps; got {len(rest)}"
+            f"{where}: f_rest_0, f_rest_1, … must be {tuple(3 * (k - 1) for k in SH_COUNTS)} in "
+            f"number (SH degrees 0 to 3); got {3 * counts['f_rest_']}"
         )
-    return 1 + len(rest) // 3
+    return counts["f_dc_"], counts["f_rest_"]
+
+
+def _has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
+    """Whether coordinates come with more digits than float32 holds."""
+    wide = ("f8", "i4", "u4")
+    return header.byte_order == "ascii" or any(table.columns[axis] in wide for axis in "xyz")
 
 
 def _guess_content(header: PlyHeader, names: set[str]) -> str:
@@ -341,45 +332,12 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
     return "This is a point cloud; a trained 3D Gaussian splat is needed."
 
 
-def _allocate(table: PlyElement, sh_count: int, mean_type: type) -> dict[str, np.ndarray]:
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (sh_count, 3)}
-    types = {"means": mean_type}
-    if SEMANTIC in table.names:
-        shapes[SEMANTIC], types[SEMANTIC] = (), np.int16
-    return {n: np.empty((table.count, *s), types.get(n, np.float32)) for n, s in shapes.items()}
-
-
-def _scatter_columns(rows: np.ndarray, target: dict[str, np.ndarray], where: slice) -> None:
-    """Copy the columns of some rows to their places; no activation yet."""
-    names = rows.dtype.names or ()
-    sh = target["sh"][where]
-    with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinite
-        for axis, name in enumerate("xyz"):
-            target["means"][where, axis] = rows[name]
-        for axis in range(3):
-            target["scales"][where, axis] = rows[f"scale_{axis}"]
-        for part in range(4):
-            target["quats"][where, part] = rows[f"rot_{part}"]
-        target["opacities"][where] = rows["opacity"]
-        for channel in range(3):
-            if _DC[channel] in names:
-                sh[:, 0, channel] = rows[_DC[channel]]
-            else:
-                sh[:, 0, channel] = (rows[_RGB[channel]] / 255.0 - 0.5) / SH_C0
-            bands = sh.shape[1] - 1
-            for band in range(bands):
-                sh[:, 1 + band, channel] = rows[f"f_rest_{channel * bands + band}"]
-        if SEMANTIC in target:
-            target[SEMANTIC][where] = rows[SEMANTIC]
-
-
-# ---- Gaussians in plain files: INRIA .ply (SH degree 0 to 3) and .splat (32-byte records) --------
+# ---- Files ---------------------------------------------------------------------------------------
 
 RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
 _SPLAT_RECORD = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
 )
-_PLY_NAMES = {"<f4": "float", "<i2": "short"}
 
 _log = logging.getLogger(__name__)
 
@@ -427,19 +385,24 @@ def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
     columns = read_columns(header, table)
     if table.count == 0:
         raise SceneError(f"{header.path}: its {element!r} element has 0 rows; nothing to render")
-    gaussians, origin = _activate(columns, wide=has_wide_means(header, table))
-    surplus = count_surplus_bytes(header)
-    gaussians, problems = check_gaussians(gaussians, where=str(header.path))
-    if surplus:
-        problems += (
-            f"{header.path}: {surplus} bytes follow the rows its header announces and were ignored",
-        )
-    notes = dict(
-        (key.strip(), value.strip())
-        for key, colon, value in (comment.partition(":") for comment in header.comments)
-        if colon
+    means, origin = columns["means"], np.zeros(3)
+    if means.dtype == np.float64:
+        origin = recentring_origin(means)
+        with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
+            means = (means - origin).astype(np.float32)
+    semantic = columns.get(SEMANTIC)
+    gaussians = Gaussians(
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(columns["quats"]),
+        scales=torch.from_numpy(columns["scales"]).exp_(),
+        opacities=torch.from_numpy(columns["opacities"]).sigmoid_(),
+        sh=torch.from_numpy(columns["sh"]),
+        semantic=None if semantic is None else torch.from_numpy(semantic),
     )
-    return SplatFile(gaussians, origin, notes, problems)
+    gaussians, problems = check_gaussians(gaussians, where=str(header.path))
+    pairs = (comment.partition(":") for comment in header.comments)
+    notes = {key.strip(): value.strip() for key, colon, value in pairs if colon}
+    return SplatFile(gaussians, origin, notes, (*problems, *header.surplus_problems()))
 
 
 def read_splat(path: str | Path) -> SplatFile:
@@ -473,24 +436,39 @@ def read_splat(path: str | Path) -> SplatFile:
 def write_ply(
     path: str | Path, gaussians: Gaussians, *, notes: Mapping[str, str] | None = None
 ) -> None:
-    """Write an INRIA .ply (binary little endian), atomically. notes: written as `comment key:
-    value` lines and given back by `read_ply`. A `semantic_class` column is added where the
-    Gaussians have classes; other readers ignore it.
+    """Write an INRIA .ply (binary little endian), atomically; normals are 0. notes: written as
+    `comment key: value` lines and given back by `read_ply`. A `semantic_class` column is added
+    where the Gaussians have classes; other readers ignore it.
     """
-    columns = column_types(gaussians)
     lines = ["ply", "format binary_little_endian 1.0"]
     for key, value in (notes or {}).items():
         if not f"{key}{value}".isprintable() or ":" in key:
             raise ValueError(f"a note must be one printable line, no ':' in its key; got {key!r}")
         lines.append(f"comment {key}: {value}")
+    names = list(_file_columns(gaussians.select(torch.arange(0))))
+    names[3:3] = ["nx", "ny", "nz"]
+    dtype = np.dtype([(name, "<i2" if name == SEMANTIC else "<f4") for name in names])
     lines.append(f"element vertex {len(gaussians)}")
-    lines += [f"property {_PLY_NAMES[code]} {name}" for name, code in columns]
+    lines += [f"property {'short' if name == SEMANTIC else 'float'} {name}" for name in names]
     with replaced_file(Path(path)) as file:
         file.write(("\n".join([*lines, "end_header"]) + "\n").encode())
         for start in range(0, len(gaussians), ROWS_PER_CHUNK):
             stop = min(start + ROWS_PER_CHUNK, len(gaussians))
-            part = gaussians.select(torch.arange(start, stop))
-            file.write(rows_of_gaussians(part, np.dtype(columns)).tobytes())
+            rows = np.zeros(stop - start, dtype)
+            for name, values in _file_columns(gaussians.select(torch.arange(start, stop))).items():
+                rows[name] = values
+            file.write(rows.tobytes())
+
+
+def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
+    """Columns of Gaussians by the names of a .ply, activations inverted."""
+    opacities = part.opacities.double()
+    logits = (opacities.log() - torch.log1p(-opacities)).clamp(_LOGIT_MIN, _LOGIT_MAX)
+    tensors = {"means": part.means, "quats": part.quats, "sh": part.sh, "opacities": logits}
+    tensors["scales"] = part.scales.double().log()
+    if part.semantic is not None:
+        tensors[SEMANTIC] = part.semantic
+    return _columns_of({name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
@@ -520,22 +498,3 @@ def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
         return np.zeros(3)
     median = np.median(finite, axis=0).astype(np.float64)
     return np.round(median) if np.linalg.norm(median) > RECENTRE_BEYOND_M else np.zeros(3)
-
-
-def _activate(columns: dict[str, np.ndarray], *, wide: bool) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians of a file's columns, in place, and the origin subtracted from their means."""
-    means = columns["means"]
-    origin = recentring_origin(means) if wide else np.zeros(3)
-    if wide:
-        with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
-            means = (means - origin).astype(np.float32)
-    semantic = columns.get(SEMANTIC)
-    gaussians = Gaussians(
-        means=torch.from_numpy(means),
-        quats=torch.from_numpy(columns["quats"]),
-        scales=torch.from_numpy(columns["scales"]).exp_(),
-        opacities=torch.from_numpy(columns["opacities"]).sigmoid_(),
-        sh=torch.from_numpy(columns["sh"]),
-        semantic=None if semantic is None else torch.from_numpy(semantic),
-    )
-    return gaussians, origin

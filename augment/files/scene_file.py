@@ -15,18 +15,26 @@ no copy; every number is looked at once, since the files may come from anywhere.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal, NamedTuple
+from typing import Annotated, Any, BinaryIO, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 from safetensors import safe_open
 from torch import Tensor
 
@@ -64,7 +72,11 @@ MAX_WAVES = 1000  # terms; what is summed for every image must not take for ever
 _SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _HALVED = ("quats", "opacities", "sh", "waves")
-_ROWS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+# Of each row; None for what only an upper limit is known of.
+_ROWS = {
+    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3),
+    "waves": (None, 3),
+}  # fmt: skip
 _FLOAT16_END = 65520  # rounds to infinity
 
 
@@ -202,7 +214,7 @@ def _take_part(
 
 
 def _check_array(tensor: Tensor, name: str, count: int, *, is_halved: bool, where: str) -> None:
-    shape = tuple(tensor.shape)
+    shape, rows = tuple(tensor.shape), _ROWS[name]
     expected = torch.float16 if is_halved else torch.float32
     if tensor.dtype != expected:
         raise SceneError(f"{where} must be {str(expected)[6:]}; got {tensor.dtype}")
@@ -211,15 +223,14 @@ def _check_array(tensor: Tensor, name: str, count: int, *, is_halved: bool, wher
             f"{where} must have {count} rows, as the document says; got {list(shape)}: they "
             f"do not belong together"
         )
-    if name in _ROWS and shape[1:] != _ROWS[name]:
-        raise SceneError(f"{where} must be {[count, *_ROWS[name]]}; got {list(shape)}")
-    is_colour = len(shape) == 3 and shape[2] == 3
-    if name == "sh" and not (is_colour and shape[1] in SH_COUNTS):
-        raise SceneError(f"{where} must be [N, K, 3] with K in {SH_COUNTS}; got {list(shape)}")
-    if name == "waves" and not (is_colour and shape[1] <= MAX_WAVES):
-        raise SceneError(
-            f"{where} must be [N, terms, 3], at most {MAX_WAVES} terms; got {list(shape)}"
-        )
+    is_shape = len(shape) == 1 + len(rows) and all(
+        want in (None, have) for have, want in zip(shape[1:], rows, strict=True)
+    )
+    limits = {"sh": SH_COUNTS, "waves": range(MAX_WAVES + 1)}
+    if not is_shape or (name in limits and shape[1] not in limits[name]):
+        sides = ", ".join("K" if want is None else str(want) for want in (count, *rows))
+        of_k = {"sh": f" with K in {SH_COUNTS}", "waves": f", at most {MAX_WAVES} terms"}
+        raise SceneError(f"{where} must be [{sides}]{of_k.get(name, '')}; got {list(shape)}")
 
 
 def _check_semantic(semantic: Tensor, count: int, where: str) -> None:
@@ -262,10 +273,11 @@ def _range(values: Tensor) -> tuple[float, float]:
 # ---- scene.json ----------------------------------------------------------------------------------
 
 FORMAT = "climategs-scene"
-VERSION = 2  # of what is written
-READABLE = (1, 2)
+VERSION = 2
 MAX_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
 _MAX_PROBLEMS_SHOWN = 5
+_ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
+Entry = TypeVar("Entry", bound=BaseModel)
 
 
 def _plain_text(text: str) -> str:
@@ -279,20 +291,51 @@ def _plain_text(text: str) -> str:
     return text
 
 
+def _as_list(value: object) -> object:
+    return value.tolist() if isinstance(value, Tensor | np.ndarray) else value
+
+
+def _pose_as_list(value: object) -> object:
+    if isinstance(value, Tensor) and value.dtype != torch.float64:
+        raise ValueError(f"poses must be float64; got {value.dtype}")
+    return _as_list(value)
+
+
+def _is_rigid(rows: list) -> list:
+    """Of poses [4, 4] or [N, 4, 4]."""
+    poses = np.array(rows, np.float64).reshape(-1, 4, 4)
+    rotation = poses[:, :3, :3]
+    with np.errstate(all="ignore"):  # of numbers so large that their products overflow
+        error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
+        determinant = np.linalg.det(rotation)
+    is_rotation = (error < _ROTATION_TOLERANCE).all() and (determinant > 0).all()
+    if not (is_rotation and (poses[:, 3, :] == np.eye(4)[3]).all()):
+        raise ValueError("a pose must be a rotation and a translation, 0 0 0 1 in its last row")
+    return rows
+
+
 Precision = Literal["float32", "float16"]
 Text = Annotated[str, AfterValidator(_plain_text)]
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Times = Annotated[list[Int64], BeforeValidator(_as_list)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Phase = Annotated[float, Field(ge=-1e9, le=1e9)]  # of which sine and cosine are known
 Pixels = Annotated[int, Field(ge=1, le=100_000)]
-Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Row3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_as_list)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
-Matrix3x4 = Annotated[list[Row4], Field(min_length=3, max_length=3)]
-Matrix4x4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
+Matrix3x4 = Annotated[list[Row4], Field(min_length=3, max_length=3), BeforeValidator(_as_list)]
+_Matrix4x4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
+_POSE = BeforeValidator(_pose_as_list), AfterValidator(_is_rigid)
+Pose = Annotated[_Matrix4x4, *_POSE]
+Poses = Annotated[list[_Matrix4x4], *_POSE]
 
 
 class _Closed(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    """Made of JSON, or of the record that it stands for."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, from_attributes=True
+    )
 
 
 class CameraEntry(_Closed):
@@ -305,8 +348,13 @@ class CameraEntry(_Closed):
     cx: float
     cy: float
     timestamp_ns: Int64
-    camera_from_world: Matrix4x4
+    camera_from_world: Pose
     is_orthographic: bool = False
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_usual(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+        entry = serialize(self)
+        return entry if self.is_orthographic else {k: entry[k] for k in list(entry)[:-1]}
 
 
 class FrameEntry(_Closed):
@@ -314,23 +362,23 @@ class FrameEntry(_Closed):
 
     index: Int64
     timestamp_ns: Int64
-    world_from_ego: Matrix4x4
+    world_from_ego: Pose
     cameras: dict[Text, CameraEntry]
     image_paths: dict[Text, Text]
 
 
 class TrackEntry(_Closed):
     hold_ns: Int64
-    timestamps_ns: list[Int64]
-    world_from_actor: list[Matrix4x4]
-    max_gap_ns: Int64 | None = None
+    max_gap_ns: Int64 | None
+    timestamps_ns: Times
+    world_from_actor: Poses
 
 
 class WavesEntry(_Closed):
     """The times of an actor's colour waves; their coefficients are its array `waves`."""
 
-    timestamps_ns: list[Int64]
-    phases: list[Phase]
+    timestamps_ns: Times
+    phases: Annotated[list[Phase], BeforeValidator(_as_list)]
 
     @model_validator(mode="after")
     def _belong_together(self) -> WavesEntry:
@@ -344,11 +392,13 @@ class ActorEntry(_Closed):
 
     track_id: Text
     label: Text
-    size_m: Row3
-    gaussians: Count
+    size_m: Annotated[Row3, BeforeValidator(lambda v: list(v) if type(v) is tuple else v)]
+    gaussians: Annotated[
+        Count, BeforeValidator(lambda v: len(v) if isinstance(v, Gaussians) else v)
+    ]
     track: TrackEntry
-    color_waves: WavesEntry | None = None
-    colors_in_world: bool = False
+    color_waves: WavesEntry | None
+    colors_in_world: bool
 
 
 class ImageColorMapEntry(_Closed):
@@ -372,25 +422,24 @@ class GroundEntry(_Closed):
 
 class SceneDocument(_Closed):
     """The whole file. working_folder: what relative paths in recorded_source start from. precision:
-    what quaternions, opacities and colours are stored as. The keys with a default are not in older
-    files.
+    what quaternions, opacities and colours are stored as.
     """
 
     format: Literal["climategs-scene"]
-    version: Literal[1, 2]
-    precision: Precision = "float32"
+    version: Literal[2]
+    precision: Precision
     name: Text
     recorded_source: Text
     working_folder: Text
     world_origin_m: Row3
     ground_z_m: float | None
     has_metric_scale: bool
-    ground: GroundEntry | None = None
-    has_known_gravity: bool = True
+    ground: GroundEntry | None
+    has_known_gravity: bool
     sky: Literal["constant", "latlong", "cubemap"]
     background_gaussians: Count
     color_maps: dict[Text, Matrix3x4]
-    image_color_maps: list[ImageColorMapEntry] = []
+    image_color_maps: list[ImageColorMapEntry]
     made_by: dict[str, Any]
     problems: list[Text]
     actors: list[ActorEntry]
@@ -402,11 +451,11 @@ def read_document(path: Path) -> SceneDocument:
     try:
         with open_file(path) as file:
             text = file.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise SceneError(f"{path}: a scene.json has at most {MAX_BYTES} bytes")
-        return parsed_document(text, str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
+    if len(text) > MAX_BYTES:
+        raise SceneError(f"{path}: a scene.json has at most {MAX_BYTES} bytes")
+    return parsed_document(text, str(path))
 
 
 def parsed_document(text: bytes | str, where: str) -> SceneDocument:
@@ -419,7 +468,7 @@ def parsed_document(text: bytes | str, where: str) -> SceneDocument:
     if not isinstance(raw, dict):
         raise SceneError(f"{where} describes no scene: expected an object; got {raw!r:.80}")
     check_format(raw.get("format"), raw.get("version"), where)
-    return checked_document(raw, where)
+    return checked(SceneDocument, raw, where)
 
 
 def check_format(found: object, version: object, where: str) -> None:
@@ -428,21 +477,20 @@ def check_format(found: object, version: object, where: str) -> None:
         raise SceneError(
             f'{where} describes no scene: its "format" must be {FORMAT!r}; got {found!r:.80}'
         )
-    if version not in READABLE:
-        known = " and ".join(map(str, READABLE))
+    if version != VERSION:
         raise SceneError(
-            f"{where}: this ClimateGS reads scenes of versions {known}; got {version!r:.80}. "
-            f"A newer one is read by a newer ClimateGS"
+            f"{where}: this ClimateGS reads scenes of version {VERSION}; got {version!r:.80}. A "
+            f"newer one is read by a newer ClimateGS"
         )
 
 
-def checked_document(raw: dict[str, Any], where: str) -> SceneDocument:
-    """The document as a record."""
+def checked(model: type[Entry], content: object, where: str) -> Entry:
+    """JSON, or a record, as the model."""
     try:
-        return SceneDocument.model_validate(raw)
-    except (ValidationError, RecursionError, OverflowError) as error:
-        if not isinstance(error, ValidationError):
-            raise SceneError(f"{where}: nested too deeply or numbers too large") from None
+        return model.model_validate(content)
+    except (RecursionError, OverflowError):
+        raise SceneError(f"{where}: nested too deeply or numbers too large") from None
+    except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False)
     shown = [
         f"{'.'.join(map(str, p['loc']))}: {p['msg']}; got {p['input']!r:.60}"
@@ -459,7 +507,6 @@ def _no_constant(name: str) -> float:
 # ---- scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
 
 _LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item
-_ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
 
 
 def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
@@ -470,33 +517,44 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
             f"scene {scene.name!r}: a sky of class {type(scene.sky).__name__} cannot be saved; "
             f"only {', '.join(t.__name__ for t in SKY_KINDS)} can"
         )
-    document = {
+    for frame in scene.frames:
+        if wrong := [name for name, camera in frame.cameras.items() if camera.name != name]:
+            raise SceneError(
+                f"frame {frame.index}: cameras must stand under their own names; {wrong} do not"
+            )
+    made_by = _json_facts(scene) | ({} if precision == "float32" else {"precision": precision})
+    content = {
         "format": FORMAT,
         "version": VERSION,
         "precision": precision,
         "name": scene.name,
         "recorded_source": scene.recorded_source or scene.source,
         "working_folder": os.getcwd(),
-        "world_origin_m": np.asarray(scene.world_origin_m, np.float64).tolist(),
+        "world_origin_m": np.asarray(scene.world_origin_m, np.float64),
         "ground_z_m": None if scene.ground_z_m is None else float(scene.ground_z_m),
         "has_metric_scale": bool(scene.has_metric_scale),
-        "ground": None if scene.ground is None else dataclasses.asdict(scene.ground),
+        "ground": scene.ground,
         "has_known_gravity": bool(scene.has_known_gravity),
         "sky": kind,
         "background_gaussians": len(scene.background),
-        "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
+        "color_maps": dict(scene.color_maps),
         "image_color_maps": [
-            {"camera": name, "timestamp_ns": int(timestamp_ns), "rows": matrix.tolist()}
+            {"camera": name, "timestamp_ns": int(timestamp_ns), "rows": matrix}
             for (name, timestamp_ns), matrix in scene.image_color_maps.items()
         ],
-        "made_by": _json_facts(scene)
-        | ({} if precision == "float32" else {"precision": precision}),
+        "made_by": made_by,
         "problems": list(scene.problems),
-        "actors": [_actor_entry(actor) for actor in scene.actors],
-        "frames": [_frame_entry(frame) for frame in scene.frames],
+        "actors": list(scene.actors),
+        "frames": [
+            replace(
+                frame,
+                cameras=dict(frame.cameras),
+                image_paths={n: os.path.abspath(path) for n, path in frame.image_paths.items()},
+            )
+            for frame in scene.frames
+        ],
     }
-    checked_document(document, f"scene {scene.name!r}")
-    return document
+    return checked(SceneDocument, content, f"scene {scene.name!r}").model_dump()
 
 
 def document_text(document: dict[str, Any]) -> str:
@@ -561,112 +619,41 @@ def scene_of(
 
 def track_entry(track: Track, where: str) -> dict[str, Any]:
     """A track as JSON holds it."""
-    return {
-        "hold_ns": int(track.hold_ns),
-        "max_gap_ns": None if track.max_gap_ns is None else int(track.max_gap_ns),
-        "timestamps_ns": track.timestamps_ns.tolist(),
-        "world_from_actor": _rigid_rows(track.world_from_actor, where),
-    }
-
-
-def _actor_entry(actor: Actor) -> dict[str, Any]:
-    waves = actor.color_waves
-    return {
-        "track_id": actor.track_id,
-        "label": actor.label,
-        "size_m": [float(v) for v in actor.size_m],
-        "gaussians": len(actor.gaussians),
-        "track": track_entry(actor.track, f"actor {actor.track_id!r}"),
-        "color_waves": None
-        if waves is None
-        else {"timestamps_ns": waves.timestamps_ns.tolist(), "phases": waves.phases.tolist()},
-        "colors_in_world": bool(actor.colors_in_world),
-    }
+    return checked(TrackEntry, track, where).model_dump()
 
 
 def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
-    where = f"actor {entry.track_id!r}"
+    def times(entry: TrackEntry | WavesEntry) -> Tensor:
+        return torch.tensor(entry.timestamps_ns, dtype=torch.int64)
+
     poses = torch.tensor(entry.track.world_from_actor, dtype=torch.float64).reshape(-1, 4, 4)
-    _check_rigid(poses, where)
     length, width, height = entry.size_m
     try:
-        times = torch.tensor(entry.track.timestamps_ns, dtype=torch.int64)
-        track = Track(times, poses, entry.track.hold_ns, entry.track.max_gap_ns)
+        track = Track(times(entry.track), poses, entry.track.hold_ns, entry.track.max_gap_ns)
         waves = None
         if entry.color_waves is not None:
             assert part.waves is not None
-            times = torch.tensor(entry.color_waves.timestamps_ns, dtype=torch.int64)
             phases = torch.tensor(entry.color_waves.phases, dtype=torch.float64)
-            waves = ColorWaves(part.waves, times, phases)
+            waves = ColorWaves(part.waves, times(entry.color_waves), phases)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise ValueError(f"actor {entry.track_id!r}: {error}") from error
     size_m = (length, width, height)
     return Actor(
         entry.track_id, entry.label, part.gaussians, track, size_m, waves, entry.colors_in_world
     )
 
 
-def _frame_entry(frame: Frame) -> dict[str, Any]:
-    where = f"frame {frame.index}"
-    wrong = [name for name, camera in frame.cameras.items() if camera.name != name]
-    if wrong:
-        raise SceneError(f"{where}: cameras must stand under their own names; {wrong} do not")
-    return {
-        "index": int(frame.index),
-        "timestamp_ns": int(frame.timestamp_ns),
-        "world_from_ego": _rigid_rows(frame.world_from_ego, where),
-        "cameras": {name: _camera_entry(camera) for name, camera in frame.cameras.items()},
-        "image_paths": {name: os.path.abspath(path) for name, path in frame.image_paths.items()},
-    }
-
-
-def _camera_entry(camera: Camera) -> dict[str, Any]:
-    return {
-        "width": int(camera.width),
-        "height": int(camera.height),
-        **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
-        "timestamp_ns": int(camera.timestamp_ns),
-        "camera_from_world": _rigid_rows(camera.camera_from_world, f"camera {camera.name!r}"),
-        **({"is_orthographic": True} if camera.is_orthographic else {}),
-    }
-
-
 def _frame(entry: FrameEntry) -> Frame:
-    where = f"frame {entry.index}"
-    world_from_ego = torch.tensor(entry.world_from_ego, dtype=torch.float64)
-    _check_rigid(world_from_ego, where)
+    def pose(rows: list) -> Tensor:
+        return torch.tensor(rows, dtype=torch.float64)
+
     cameras = {}
     for name, camera in entry.cameras.items():
-        pose = torch.tensor(camera.camera_from_world, dtype=torch.float64)
-        _check_rigid(pose, f"{where}, camera {name!r}")
-        numbers = camera.model_dump(exclude={"camera_from_world"})
-        cameras[name] = Camera(name=name, camera_from_world=pose, **numbers)
+        numbers = {field: getattr(camera, field) for field in CameraEntry.model_fields}
+        numbers["camera_from_world"] = pose(camera.camera_from_world)
+        cameras[name] = Camera(name=name, **numbers)
+    world_from_ego = pose(entry.world_from_ego)
     return Frame(entry.index, entry.timestamp_ns, world_from_ego, cameras, entry.image_paths)
-
-
-def _rigid_rows(transforms: Tensor, where: str) -> list:
-    if transforms.dtype != torch.float64:
-        raise SceneError(f"{where}: poses must be float64; got {transforms.dtype}")
-    try:
-        _check_rigid(transforms, where)
-    except ValueError as error:
-        raise SceneError(str(error)) from error
-    return transforms.tolist()
-
-
-def _check_rigid(transforms: Tensor, where: str) -> None:
-    """ValueError unless [.., 4, 4] are rotations and translations."""
-    poses = transforms.detach().numpy()  # torch would wake its threads for a few numbers
-    rotation = poses[..., :3, :3]
-    with np.errstate(all="ignore"):  # of numbers so large that their products overflow
-        error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
-        determinant = np.linalg.det(rotation)
-    is_rotation = (error < _ROTATION_TOLERANCE).all() and (determinant > 0).all()
-    has_last_row = (poses[..., 3, :] == np.eye(4)[3]).all()
-    if not (np.isfinite(poses).all() and is_rotation and has_last_row):
-        raise ValueError(
-            f"{where}: a pose must be a rotation and a translation with 0 0 0 1 in its last row"
-        )
 
 
 def _json_facts(scene: Scene) -> dict[str, Any]:
@@ -847,9 +834,9 @@ def _open_folder(folder: Path) -> _Opened:
 
 def _open_file(path: Path) -> _Opened:
     tensors, metadata = read_tensors(path)
-    known = {str(number): number for number in READABLE}
     version = metadata.get("version", "none")
-    check_format(metadata.get("format"), known.get(version, version), str(path))
+    known = VERSION if version == str(VERSION) else version
+    check_format(metadata.get("format"), known, str(path))
     if "document" not in metadata:
         raise SceneError(f"{path} is damaged: its metadata has no 'document'")
     document = parsed_document(metadata["document"], f"{path}, document")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +24,6 @@ from adapters.camera_files.paths import (
     ground_grid,
     make_default_path,
     solid_points,
-    split_names,
     with_camera_path,
 )
 from adapters.world import WorldChange
@@ -101,15 +101,10 @@ def test_nerfstudio_axes_and_intrinsics(tmp_path: Path) -> None:
     assert (first.fx, first.cx, first.cy, first.width) == (500, 320.5, 240.5, 640)
     assert first.image_path == str(tmp_path / "images" / "frame_00007.png")
     assert (second.fx, second.fy, second.width, second.image_path) == (400, 510, 320, None)
-
-
-def test_nerfstudio_angle_and_three_rows(tmp_path: Path) -> None:
-    content = nerfstudio_file(camera_angle_x=math.pi / 2)
-    del content["fl_x"], content["fl_y"], content["cx"], content["cy"]
-    content["frames"][0]["transform_matrix"].pop()
+    content = nerfstudio_file(camera_angle_x=math.pi / 2, fl_x=None, fl_y=None, cx=None, cy=None)
+    content["frames"][0]["transform_matrix"].pop()  # of three rows
     (view,) = read_views(save(tmp_path / "transforms.json", content)).views
-    assert view.fx == view.fy == pytest.approx(320)
-    assert (view.cx, view.cy) == (320, 240)
+    assert view.fx == view.fy == pytest.approx(320) and (view.cx, view.cy) == (320, 240)
 
 
 def test_distortion_is_left_out_and_said(tmp_path: Path) -> None:
@@ -143,6 +138,13 @@ def test_colmap_text_and_binary(tmp_path: Path) -> None:
     front, left = read_views(text).views
     assert front.image_path == str(tmp_path / "images" / "front" / "1.jpg")
     assert left.image_path is None
+
+
+def test_colmap_models_without_pycolmap_name_the_extra(tmp_path: Path, monkeypatch) -> None:
+    model = write_colmap(tmp_path / "a", "1 PINHOLE 640 480 500 510 321 242\n", ["1.jpg"])
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(AdapterError, match=r"pip install 'climategs\[colmap\]'"):
+        read_views(model)
 
 
 def test_damaged_colmap_models(tmp_path: Path) -> None:
@@ -212,38 +214,33 @@ def view(name: str, *, position=(0.0, 0.0, 2.0), target=(9.0, 0.0, 2.0), **chang
     )
 
 
-def grouped(names: list[str]) -> list[tuple[int, list[str]]]:
-    frames, problems = frames_from_views([view(name) for name in names], WorldChange())
-    assert problems == ()
-    return [(frame.index, list(frame.cameras)) for frame in frames]
-
-
-def test_folder_per_camera() -> None:
-    names = ["images/left/0010.jpg", "images/front/0010.jpg", "images/front/0009.jpg"]
-    assert grouped(names) == [(9, ["front"]), (10, ["front", "left"])]
-
-
-def test_folder_per_frame() -> None:
-    names = ["0003/cam_l.png", "0003/cam_f.png", "0002/cam_f.png", "0002/cam_l.png"]
-    assert grouped(names) == [(2, ["cam_f", "cam_l"]), (3, ["cam_f", "cam_l"])]
-
-
 @pytest.mark.parametrize(
-    "names",
+    ("names", "frames"),
     [
-        ["000012_0.png", "000012_1.png", "000013_0.png", "000013_1.png"],
-        ["000012_0", "000013_1", "000012_1", "000013_0"],
+        (
+            "images/left/0010.jpg images/front/0010.jpg images/front/0009.jpg",
+            [(9, ["front"]), (10, ["front", "left"])],
+        ),
+        (
+            "0003/cam_l.png 0003/cam_f.png 0002/cam_f.png 0002/cam_l.png",
+            [(2, ["cam_f", "cam_l"]), (3, ["cam_f", "cam_l"])],
+        ),
+        ("000012_0.png 000012_1.png 000013_0.png 000013_1.png",
+         [(12, ["0", "1"]), (13, ["0", "1"])]),
+        ("000012_0 000013_1 000012_1 000013_0", [(12, ["0", "1"]), (13, ["0", "1"])]),
+        ("12_front 12_front_left 13_front 13_front_left",
+         [(12, ["front", "front_left"]), (13, ["front", "front_left"])]),
+        ("left_0001.jpg right_0001.jpg left_0002.jpg right_0002.jpg",
+         [(1, ["left", "right"]), (2, ["left", "right"])]),
+        # Dates of a phone are no rig.
+        (" ".join(f"20240131_1200{n:02d}.jpg" for n in range(3)),
+         [(120000 + n, ["camera"]) for n in range(3)]),
     ],
-)
-def test_frame_then_camera(names: list[str]) -> None:
-    assert grouped(names) == [(12, ["0", "1"]), (13, ["0", "1"])]
-    words = [name.replace("_0", "_front").replace("_1", "_front_left") for name in names]
-    assert grouped(words)[0] == (12, ["front", "front_left"])
-
-
-def test_camera_then_frame() -> None:
-    names = ["left_0001.jpg", "right_0001.jpg", "left_0002.jpg", "right_0002.jpg"]
-    assert grouped(names) == [(1, ["left", "right"]), (2, ["left", "right"])]
+)  # fmt: skip
+def test_cameras_and_frames_are_told_by_names(names, frames) -> None:
+    found, problems = frames_from_views([view(name) for name in names.split()], WorldChange())
+    assert problems == ()
+    assert [(frame.index, list(frame.cameras)) for frame in found] == frames
 
 
 @pytest.mark.parametrize(
@@ -262,12 +259,6 @@ def test_one_camera_in_natural_order(names: list[str]) -> None:
     assert [list(frame.cameras) for frame in frames] == [["camera"]] * 3
     assert [f.index for f in frames] == sorted(f.index for f in frames)
     assert [f.timestamp_ns for f in frames] == [0, 100_000_000, 200_000_000]
-
-
-def test_phone_dates_are_no_rig() -> None:
-    names = [f"20240131_1200{n:02d}.jpg" for n in range(20)]
-    assert split_names(names) is None
-    assert all(cameras == ["camera"] for _, cameras in grouped(names))
 
 
 def test_repeated_names_are_said() -> None:
@@ -431,16 +422,9 @@ def test_paths_follow_the_recentring_and_the_clock(tmp_path: Path, scene: Scene)
 
 
 def test_labels_do_not_follow(tmp_path: Path) -> None:
-    class Labels:
-        def boxes(self, frame_index: int):
-            raise AssertionError("not asked for")
-
-        def lidar(self, frame_index: int):
-            raise AssertionError("not asked for")
-
     scene = Scene(
         name="s", source="procedural:street", background=street(), actors=(),
-        sky=ConstantSky(torch.zeros(3)), frames=(), labels=Labels(),
+        sky=ConstantSky(torch.zeros(3)), frames=(), labels=object(),
     )  # fmt: skip
     changed = with_camera_path(scene, save_path(tmp_path / "a.json", [LEVEL]))
     assert changed.labels is None
@@ -488,7 +472,7 @@ def test_drive_follows_the_road(heading_deg: float, slope: float) -> None:
 
 
 def test_a_scene_of_any_extent_gets_a_drive_of_a_kilometre_at_most(ends_soon) -> None:
-    for size in (500.0, 4e3, 1e7):
+    for size in (500.0, 1e7):
         ground = torch.rand(5000, 3, generator=torch.Generator().manual_seed(1))
         ground = gaussians_at(ground * torch.tensor([size, 0.5 * size, 0.4]))
         path = make_default_path(replace(ground, scales=ground.scales + size / 500), is_metric=True)
@@ -518,14 +502,6 @@ def test_a_road_above_its_foundations_is_driven_on() -> None:
     eyes = np.stack([view.world_from_camera[:3, 3] for view in path.views])
     np.testing.assert_allclose(eyes[:, 2], CAMERA_HEIGHT_M, atol=0.05)
     assert path.ground_z_m == pytest.approx(0, abs=0.05)
-
-
-def test_drive_ends_with_scene_ahead() -> None:
-    gaussians = street(heading_deg=0)
-    path = make_default_path(gaussians, is_metric=True)
-    last = [v for v in path.views if v.camera == "front"][-1].world_from_camera
-    ahead = (gaussians.means[:, :2].numpy() - last[:2, 3]) @ last[:2, 2]
-    assert ahead.max() > 15
 
 
 def test_what_blocks_the_road_is_avoided() -> None:
@@ -561,14 +537,14 @@ def test_kinds_can_be_insisted_on() -> None:
     assert "drive" in make_default_path(street(), is_metric=False, kind="drive").note
 
 
-@pytest.mark.parametrize("kind", ["auto", "drive", "orbit"])
-@pytest.mark.parametrize("count", [1, 2, 40])
-def test_degenerate_scenes_get_a_path(kind, count: int) -> None:
+def test_degenerate_scenes_get_a_path() -> None:
     """One Gaussian, or many in one place: no division by their extent."""
-    made = make_default_path(gaussians_at(torch.ones(count, 3)), is_metric=True, kind=kind)
-    assert frames_from_views(made.views, WorldChange())[0] and made.note.startswith(NO_CAMERAS)
+    for kind, count in (("auto", 1), ("drive", 1), ("drive", 40), ("orbit", 1), ("orbit", 40)):
+        made = make_default_path(gaussians_at(torch.ones(count, 3)), is_metric=True, kind=kind)
+        assert frames_from_views(made.views, WorldChange())[0] and made.note.startswith(NO_CAMERAS)
 
 
+@pytest.mark.long
 def test_real_tiles_are_driven(shared_dir: Path) -> None:
     """30 m tiles of a street, so blurred that nothing is free: a drive nonetheless, inside them."""
     for tile in sorted((shared_dir / "data" / "splats").glob("*.splat")):

@@ -132,16 +132,9 @@ def own_image(numbers: files.Numbers, at: int, position: int) -> tuple[np.ndarra
     width, height = files.SIZES[numbers.dataset][position]
     columns, rows = int(width / files.DOWNSCALE), int(height / files.DOWNSCALE)
     sx, sy = columns / width, rows / height
-    seen = Camera(
-        "own",
-        columns,
-        rows,
-        files.FOCAL_PX * sx,
-        files.FOCAL_PX * 1.02 * sy,
-        0.49 * width * sx,
-        0.52 * height * sy,
-        torch.from_numpy(np.linalg.inv(world_from_camera)),
-    )
+    lens = (files.FOCAL_PX * sx, files.FOCAL_PX * 1.02 * sy, 0.49 * width * sx, 0.52 * height * sy)
+    camera_from_world = torch.from_numpy(np.linalg.inv(world_from_camera))
+    seen = Camera("own", columns, rows, *lens, camera_from_world)
     background = models["Background"]
     every = np.arange(len(background["_means"]))
     parts = [PosedGaussians(world_gaussians(background, every, np.eye(4)))]
@@ -163,7 +156,7 @@ def own_image(numbers: files.Numbers, at: int, position: int) -> tuple[np.ndarra
 
 
 # Frame 2 is trained on, frame 3 lacks an object, frame 4 is held out.
-@pytest.mark.parametrize(("at", "position"), [(1, 0), (2, 1), (STRIDE, 0), (4, 2)])
+@pytest.mark.parametrize(("at", "position"), [(2, 1), (STRIDE, 0), (4, 2)])
 def test_images_are_those_composed_from_the_checkpoint(run, at, position):
     numbers, scene = run
     camera = list(scene.frame(START + at).cameras.values())[position]
@@ -176,19 +169,6 @@ def test_images_are_those_composed_from_the_checkpoint(run, at, position):
     assert np.quantile(error, 0.99) < 2e-5
     assert error.max() < 0.01
     assert own.std() > 0.1
-
-
-def test_objects_matter_to_the_images_that_are_compared(run):
-    _, scene = run
-    camera = next(iter(scene.frame(START + 1).cameras.values()))
-    whole, *less = (
-        rasterize(parts, camera, backend="reference").rgb
-        for parts in (
-            scene.parts_for(camera),
-            *(tuple(p for p in scene.parts_for(camera) if p.instance_id != i) for i in (1, 2)),
-        )
-    )
-    assert all(float((whole - without).abs().max()) > 0.1 for without in less)
 
 
 def test_colours_without_spherical_harmonics_are_sigmoids(tmp_path):
@@ -682,13 +662,6 @@ def test_what_is_gone_on_without_is_said(numbers):
         assert part in said
     assert "front_camera" not in scene.frame(2).image_paths
     assert len(scene.background) == 77
-
-
-def test_a_sky_of_another_kind_is_black_and_said(numbers):
-    change_checkpoint(numbers, lambda c: c["models"].update(Sky={"grid": torch.zeros(2)}))
-    scene = opened(numbers)
-    assert isinstance(scene.sky, ConstantSky)
-    assert any("not known here (grid); the sky is black" in p for p in scene.problems)
 
 
 def test_a_run_without_objects_or_corrections_is_a_scene(numbers):

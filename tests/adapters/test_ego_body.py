@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar_scene.depth import lidar_depth
+from adapters.lidar_scene.depth import read_returns
 from adapters.training_views.starting_scene import ego_body
 from augment.cameras import Camera, Frame
 from augment.geometry import transform_points
@@ -154,7 +154,7 @@ def test_it_captures_no_lidar_returns(scene):
     camera = camera_in(0)
     later = dataclasses.replace(camera, timestamp_ns=FRAME_NS)  # by then the car has moved on
     for view in (camera, later):
-        plain, other = (lidar_depth(s, 0, view) for s in (seen, with_body))
+        plain, other = (read_returns(s, 0).seen_by(view) for s in (seen, with_body))
         np.testing.assert_array_equal(plain.depth_m, other.depth_m)
         assert len(plain) == 1
 

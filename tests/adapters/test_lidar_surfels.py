@@ -17,7 +17,7 @@ from drivestudio_files import write_run
 
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
-from adapters.lidar_scene.depth import lidar_depth, read_returns
+from adapters.lidar_scene.depth import DepthPixels, read_returns
 from adapters.lidar_scene.split import PointSet
 from adapters.lidar_scene.surfels import (
     CLOSE_M,
@@ -161,9 +161,9 @@ def test_gaussians_are_flat_along_the_normal():
     np.testing.assert_allclose(g.sh[:, 0] * 0.28209479 + 0.5, colours, atol=1e-6)
     assert g.means.dtype == torch.float32 and g.semantic.dtype == torch.int16
     shape = SplatShape(opacity=0.5, sigma_per_spacing=1.0)
-    wide = gaussians_from_surfels(surfels, colours, None, shape)
+    wide = gaussians_from_surfels(surfels, colours, g.semantic.numpy(), shape)
     torch.testing.assert_close(wide.scales[:, :2], 2 * g.scales[:, :2])
-    assert (wide.opacities == 0.5).all() and wide.semantic is None
+    assert (wide.opacities == 0.5).all()
 
 
 def test_unseen_points_borrow_the_nearest_colour_within_reach():
@@ -279,6 +279,9 @@ class OneSweep:
     def lidar(self, frame_index: int) -> LidarSweep | None:
         return None if self.columns is None else LidarSweep(self.columns)
 
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        return sweep.columns.get("semantic")
+
 
 def camera(time_s: float = 10.0) -> Camera:
     pose = np.eye(4)
@@ -318,64 +321,45 @@ def driving_actor(speed_mps: float) -> Actor:
     return Actor("a", "Car", g, Track(times, poses), (4.0, 2.0, 1.5))
 
 
-def test_points_land_on_their_pixel_with_depth_and_time():
-    depth = lidar_depth(scene([[10, 0, 0], [4, 1, 0.5]], [9.95, 10.02]), 0, camera())
+def seen(one: Scene, time_s: float = 10.0) -> DepthPixels:
+    return read_returns(one, 0).seen_by(camera(time_s))
+
+
+def test_the_nearest_return_of_a_pixel_gives_its_depth():
+    depth = seen(scene([[10, 0, 0], [4, 1, 0.5], [7, 0, 0], [9, 0, 0]], [9.95, 10.02, 10, 10]))
     # u = 20 - 20 y / x, v = 15 - 20 z / x
-    assert depth.uv.tolist() == [[15, 12], [20, 15]] and depth.uv.dtype == np.int32
-    np.testing.assert_allclose(depth.depth_m, [4, 10])
-    assert depth.depth_m.dtype == np.float32
-    assert np.abs(depth.timestamp_ns - [10_020_000_000, 9_950_000_000]).max() < 1000
-
-
-def test_the_nearest_of_a_pixel_wins():
-    depth = lidar_depth(scene([[10, 0, 0], [7, 0, 0], [9, 0, 0]], [1, 2, 3]), 0, camera())
-    assert len(depth) == 1 and depth.depth_m[0] == 7 and depth.timestamp_ns[0] == 2 * SECOND
+    assert depth.pixels.tolist() == [12 * 40 + 15, 15 * 40 + 20] and depth.pixels.dtype == np.int32
+    assert depth.depth_m.tolist() == [4, 7] and depth.depth_m.dtype == np.float32
 
 
 def test_a_moving_objects_returns_are_carried_to_the_cameras_time():
-    # Its rear face, 2 m behind its centre, seen a tenth of a second early and late.
-    actor = driving_actor(20.0)
-    points = [[10 - 2 - 2, 0.0, 0.2], [10 - 2 + 2, 0.5, 0.2], [6.0, 3.0, 0.2]]
-    sparse = lidar_depth(scene(points, [9.9, 10.1, 9.9], actors=(actor,)), 0, camera())
-    np.testing.assert_allclose(np.sort(sparse.depth_m), [6, 8, 8], atol=1e-6)
-    later = lidar_depth(scene(points, [9.9, 10.1, 9.9], actors=(actor,)), 0, camera(10.05))
-    np.testing.assert_allclose(np.sort(later.depth_m), [6, 9, 9], atol=1e-6)
+    # Its rear face, 2 m behind its centre, seen a tenth of a second early and late; and the floor
+    # of its box, which is ground.
+    points = [[10 - 2 - 2, 0.0, 0.2], [10 - 2 + 2, 0.5, 0.2], [6.0, 3.0, 0.2], [5.0, 0.0, -0.7]]
+    one = scene(points, [9.9, 10.1, 9.9, 9.85], actors=(driving_actor(20.0),))
+    for time_s, depths in ((10.0, [5, 6, 8, 8]), (10.05, [5, 6, 9, 9]), (20.0, [5, 6])):
+        np.testing.assert_allclose(np.sort(seen(one, time_s).depth_m), depths, atol=1e-6)
 
 
-def test_returns_of_an_object_that_is_gone_are_left_out():
-    actor = driving_actor(20.0)
-    points = [[8.0, 0.0, 0.2], [6.0, 3.0, 0.2]]
-    sparse = lidar_depth(scene(points, [10, 10], actors=(actor,)), 0, camera(20.0))
-    np.testing.assert_allclose(sparse.depth_m, [6])
+def test_returns_of_no_surface_are_told_by_the_labels():
+    one = scene([[10, 0, 0], [5, 0, 1]], [10, 10], semantic=np.array([7, -1]))
+    assert len(read_returns(one, 0).points) == 2
+    np.testing.assert_allclose(read_returns(one, 0, of_surfaces=True).points, [[10, 0, 0]])
 
 
-def test_the_floor_of_a_box_is_ground():
-    actor = driving_actor(20.0)
-    sparse = lidar_depth(scene([[6.0, 0.0, -0.7]], [9.9], actors=(actor,)), 0, camera())
-    np.testing.assert_allclose(sparse.depth_m, [6])
-
-
-def test_classes_can_be_left_out():
-    points, semantic = [[10, 0, 0], [5, 0, 1]], np.array([7, 4])
-    one = scene(points, [10, 10], semantic=semantic)
-    assert len(lidar_depth(one, 0, camera())) == 2
-    kept = read_returns(one, 0, without_semantic=(4,))
-    np.testing.assert_allclose(kept.points, [[10, 0, 0]])
-
-
-def test_integer_times_and_missing_ones():
-    columns = {
-        c: np.full(1, v) for c, v in zip("xyz", WORLD_ORIGIN + np.array([8, 0, 0]), strict=True)
-    }
-    timed = made(columns | {"timestamp_ns": np.array([7])})
-    assert lidar_depth(timed, 0, camera()).timestamp_ns.tolist() == [7]
-    assert lidar_depth(made(columns), 0, camera()).timestamp_ns.tolist() == [10 * SECOND]
+def test_times_of_returns_may_be_whole_numbers_or_missing():
+    x, y, z = WORLD_ORIGIN[:, None] + np.array([[8], [0], [0]])
+    columns = {"x": x, "y": y, "z": z}
+    for more, time_ns in (
+        ({}, 10 * SECOND),
+        ({"timestamp_ns": np.array([7])}, 7),
+        ({"t": np.array([9.5])}, 9_500_000_000),
+        ({"t": np.array([1e6])}, 10 * SECOND),  # of some other start
+    ):
+        assert read_returns(made(columns | more), 0).timestamps_ns.tolist() == [time_ns]
     with pytest.raises(AdapterError, match=r"frame 0: its sweep's column timestamp_ns must hold"):
-        lidar_depth(made(columns | {"timestamp_ns": np.array([7.5])}), 0, camera())
-
-
-def test_no_sweep_gives_no_depth():
-    assert len(lidar_depth(made(None), 0, camera())) == 0
+        read_returns(made(columns | {"timestamp_ns": np.array([7.5])}), 0)
+    assert read_returns(made(None), 0) is None
 
 
 PANDASET = Path(__file__).resolve().parents[3] / "shared" / "data" / "pandaset_mini" / "002"

@@ -9,10 +9,9 @@ import drives
 import numpy as np
 import pytest
 
-from adapters.lidar_scene.depth import SparseDepth, depth_seen, read_returns
+from adapters.lidar_scene.depth import DepthPixels, read_returns
 from adapters.training_views.depth_priors import (
     DepthPriors,
-    PriorPixels,
     align,
     find_maps,
     find_sparse,
@@ -51,9 +50,9 @@ def test_returns_that_a_nearer_object_hides_from_the_camera_are_dropped(tmp_path
     points = sweep(np.array([0, 0, 2.6]))
     cam = drives.camera(size=(240, 160), focal_px=200.0)
     scene = drives.drive(tmp_path, 1, cameras=lambda f: {"front": cam}, sweeps={0: points})
-    seen = depth_seen(read_returns(scene, 0), cam)
+    seen = read_returns(scene, 0).seen_by(cam)
     kept = visible(seen, cam)
-    rays = cam.ray_directions().double().numpy()[seen.uv[:, 1], seen.uv[:, 0]]
+    rays = cam.ray_directions().double().numpy().reshape(-1, 3)[seen.pixels]
     hidden = entry(cam.centre.numpy(), rays) < seen.depth_m - 2.5  # behind the box, not its roof
     assert hidden.sum() > 300 and (~hidden).sum() > 5000
     # Hidden returns in the last row below the box's edge have nearer ones on one side only.
@@ -70,24 +69,22 @@ def test_slopes_poles_and_edges_hide_nothing():
     wall[:, 90:] = 12.0  # the corner of a house
     depth = np.concatenate([wall, np.minimum(floor, wall[:1])]).astype(np.float32)
     rows, columns = np.mgrid[10:90:2, 0:240:2]
-    uv = np.stack([np.concatenate([columns, u]), np.concatenate([rows, v])], -1).reshape(-1, 2)
-    seen = SparseDepth(uv.astype(np.int32), depth.ravel(), np.zeros(depth.size, int))
+    pixels = np.concatenate([rows, v]) * 240 + np.concatenate([columns, u])
+    seen = DepthPixels.of(pixels.ravel(), depth.ravel())
     kept = visible(seen, cam).reshape(depth.shape)
     # Only far floor beside the pole or the house may go: it has nearer floor below it too.
     assert set(np.nonzero(~kept)[1]) <= {58, 59, 61, 62, 88, 89} and kept.mean() > 0.99
     assert kept[:39].all()
-    empty = SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
-    assert len(visible(empty, cam)) == 0
+    assert len(visible(DepthPixels.of(np.zeros(0, int), np.zeros(0)), cam)) == 0
 
 
 def test_the_first_prior_of_a_pixel_is_believed_and_the_nearest_of_one_prior():
-    a = PriorPixels.of(np.array([7, 3, 7]), np.array([5.0, 2.0, 4.0]))
+    a = DepthPixels.of(np.array([7, 3, 7]), np.array([5.0, 2.0, 4.0]))
     assert a.pixels.tolist() == [3, 7] and a.depth_m.tolist() == [2, 4]
-    b = PriorPixels.of(np.array([1, 7]), np.array([9.0, 9.0])).weighing(0.5)
+    b = DepthPixels.of(np.array([1, 7]), np.array([9.0, 9.0]), 0.5)
     both = join_priors([a, b])
     assert both.pixels.tolist() == [1, 3, 7] and both.depth_m.tolist() == [9, 2, 4]
     assert both.weight.tolist() == [0.5, 1, 1] and both.pixels.dtype == np.int32
-    assert len(join_priors([])) == 0
 
 
 def test_alignment_survives_outliers():

@@ -9,8 +9,8 @@ import drives
 import pytest
 import torch
 
-from adapters.pandaset.adapter import _frame
-from adapters.pandaset.files import PandaSetLabels, read_sequence
+from adapters.pandaset import PandaSetLabels, read_frames
+from adapters.raw_drive import DriveOptions
 from adapters.training_views.checks import check_views
 from adapters.training_views.views import RecordedViews
 from augment.scene import Scene
@@ -20,11 +20,10 @@ from augment.sky import ConstantSky
 @pytest.fixture(scope="module")
 def scene(shared_dir) -> Scene:
     root = shared_dir / "data/pandaset_mini/002"
-    sequence = read_sequence(root)
-    frames = tuple(_frame(sequence, number) for number in range(0, len(sequence), 2))
+    frames, _, origin, _ = read_frames(root, DriveOptions())
     return Scene(
-        "002", "pandaset:002", drives.one_splat(), (), ConstantSky(torch.ones(3)), frames,
-        PandaSetLabels(root), sequence.world_origin_m,
+        "002", "pandaset:002", drives.one_splat(), (), ConstantSky(torch.ones(3)), frames[::2],
+        PandaSetLabels(root), origin,
     )  # fmt: skip
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from adapters.plain_files import ImageFault
-from adapters.training_views.byte_cache import ByteCache
 from adapters.training_views.views import RecordedViews, holdout_step, read_scaled
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
@@ -161,18 +160,3 @@ def test_a_jpeg_that_is_cut_short_is_no_image(tmp_path):
     full = drives.camera(size=(128, 96))
     with pytest.raises(ImageFault, match="is cut short"):
         read_scaled(path, full, full)
-
-
-def test_the_cache_keeps_what_was_used_last_and_never_more_than_its_limit():
-    cache = ByteCache[str](10)
-    cache.put("a", "A", 4)
-    cache.put("b", "B", 4)
-    assert cache.get("a") == "A"
-    cache.put("c", "C", 4)
-    assert cache.get("b") is None and cache.get("a") == "A"
-    cache.put("d", "D", 11)
-    assert cache.get("d") is None and cache.get("a") == "A"
-    cache.put("a", "A2", 1)
-    assert cache.get("a") == "A2"
-    with pytest.raises(ValueError, match="limit_bytes"):
-        ByteCache(-1)

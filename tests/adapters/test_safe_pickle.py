@@ -6,7 +6,6 @@ import builtins
 import copyreg
 import encodings.cp437  # noqa: F401  (zipfile decodes the names of a damaged archive by it)
 import gzip
-import operator
 import os
 import pickle
 import struct
@@ -63,12 +62,6 @@ def test_tables_come_back_as_they_were(tmp_path, protocol):
     pd.testing.assert_frame_equal(read, expected)
 
 
-def test_a_file_that_is_not_gzipped_is_read_too(tmp_path):
-    path = tmp_path / "t.pkl"
-    path.write_bytes(pickle.dumps(table()))
-    pd.testing.assert_frame_equal(read_frame(path), table())
-
-
 def test_a_table_indexed_and_named_as_the_dataset_does(tmp_path):
     write_table(tmp_path / "t.pkl.gz", {"uuid": ["a", "b"], "yaw": np.array([0.1, 0.2])})
     read = read_frame(tmp_path / "t.pkl.gz")
@@ -118,68 +111,52 @@ def test_a_table_of_an_old_pandas_and_numpy_is_read(tmp_path):
     ("function", "arguments", "name"),
     [
         (os.system, ("echo run > {marker}",), r"\.system"),
-        (builtins.eval, ("open('{marker}', 'w')",), "builtins.eval"),
-        (builtins.exec, ("open('{marker}', 'w')",), "builtins.exec"),
-        (builtins.getattr, (np.ndarray, "tofile"), "builtins.getattr"),
-        (operator.attrgetter, ("__class__",), "operator.attrgetter"),
+        (builtins.eval, ("open('{marker}', 'w')",), "eval"),
+        (builtins.getattr, (np.ndarray, "tofile"), "getattr"),
         (np.load, ("{marker}",), "numpy.load"),
         (pd.read_pickle, ("{marker}",), "read_pickle"),
-        (pd.eval, ("1 + 1",), "eval"),
     ],
 )
-def test_what_a_hostile_file_asks_for_is_refused_by_name(tmp_path, function, arguments, name):
+@pytest.mark.parametrize("is_hidden", [False, True])
+def test_what_a_hostile_file_asks_for_is_refused_by_name(
+    tmp_path, function, arguments, name, is_hidden
+):
     marker = tmp_path / "marker"
     arguments = tuple(a.format(marker=marker) if isinstance(a, str) else a for a in arguments)
-    path = write(tmp_path / "bad.pkl.gz", Calls(function, *arguments))
+    value = Calls(function, *arguments)
+    if is_hidden:  # among the texts of a table
+        column = np.empty(3, dtype=object)
+        column[:] = [value] * 3
+        value = table().assign(label=pd.Series(column, dtype=object))
+    path = write(tmp_path / "bad.pkl.gz", value, protocol=2 + 2 * is_hidden)
     with pytest.raises(AdapterError, match=rf"bad\.pkl\.gz was not read: it asks for .*{name}"):
         read_frame(path)
     assert not marker.exists()
 
 
-@pytest.mark.parametrize("protocol", [2, 4])
-def test_a_call_hidden_in_an_object_column_is_refused(tmp_path, protocol):
-    frame = table()
-    column = np.empty(3, dtype=object)
-    column[:] = [Calls(os.system, f"touch {tmp_path / 'marker'}")] * 3
-    frame["label"] = pd.Series(column, dtype=object)
-    with pytest.raises(AdapterError, match="system"):
-        read_frame(write(tmp_path / "bad.pkl.gz", frame, protocol))
-    assert not (tmp_path / "marker").exists()
-
-
-@pytest.mark.parametrize("value", [[1, 2], {"x": 1}, np.zeros(3), "text"])
-def test_something_else_than_a_table_is_refused(tmp_path, value):
-    with pytest.raises(AdapterError, match=f"must hold a pandas table; .* {type(value).__name__}"):
-        read_frame(write(tmp_path / "t.pkl.gz", value))
-
-
-def test_a_missing_file_is_named(tmp_path):
+def test_what_is_no_whole_table_is_named(tmp_path):
+    path = tmp_path / "t.pkl"
+    for value in ([1, 2], {"x": 1}, np.zeros(3), "text"):
+        with pytest.raises(AdapterError, match=f"a pandas table; .* {type(value).__name__}"):
+            read_frame(write(path, value))
+    data = pickle.dumps(table())
+    zipped = gzip.compress(
+        pickle.dumps(pd.DataFrame(np.random.default_rng(0).normal(size=(2000, 4))))
+    )
+    for broken, message in (
+        (data[:-40], "cut short"),
+        (data[: len(data) // 2], "cut short"),
+        (b"", "cut short"),
+        (b"hello", "was not read"),
+        (b"\x80\x04\x95" + b"\xff" * 9, "cut short"),
+        (zipped[: len(zipped) // 10], "is not a whole gzip file.*download"),
+        (zipped[:-500], "is not a whole gzip file.*download"),
+    ):
+        path.write_bytes(broken)
+        with pytest.raises(AdapterError, match=rf"t\.pkl.*{message}"):
+            read_frame(path)
     with pytest.raises(AdapterError, match=r"none\.pkl\.gz does not exist"):
         read_frame(tmp_path / "none.pkl.gz")
-
-
-@pytest.mark.parametrize("kept", [0.1, 0.5, 0.95])
-def test_a_truncated_gzip_file_is_named(tmp_path, kept):
-    frame = pd.DataFrame(np.random.default_rng(0).normal(size=(2000, 4)))
-    path = write(tmp_path / "t.pkl.gz", frame)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * kept)])
-    with pytest.raises(AdapterError, match=r"t\.pkl\.gz is not a whole gzip file.*download"):
-        read_frame(path)
-
-
-def test_a_truncated_or_garbled_pickle_is_named(tmp_path):
-    data = pickle.dumps(table())
-    for broken in (
-        data[:-40],
-        data[: len(data) // 2],
-        b"",
-        b"hello",
-        b"\x80\x04\x95" + b"\xff" * 9,
-    ):
-        (tmp_path / "t.pkl").write_bytes(broken)
-        with pytest.raises(AdapterError, match=r"t\.pkl"):
-            read_frame(tmp_path / "t.pkl")
 
 
 def test_a_zip_bomb_stops_at_the_bound(tmp_path):
@@ -202,17 +179,8 @@ def test_the_real_files_are_what_pandas_reads(shared_dir):
 
 
 WATCHED = (
-    "import",
-    "exec",
-    "compile",
-    "open",
-    "ctypes.",
-    "os.",
-    "subprocess.",
-    "socket.",
-    "marshal.",
-)
-MUTATIONS = 60  # of each file
+    "import", "exec", "compile", "open", "ctypes.", "os.", "subprocess.", "socket.", "marshal.",
+)  # fmt: skip
 
 
 class _Watch:
@@ -282,17 +250,8 @@ CORE = "numpy.core.multiarray"
 def dtype(
     code="f8", order="<", sub=NONE, names=NONE, fields=NONE, size=-1, align=-1, flags=0, more=()
 ):
-    state = tuple_of(
-        number(3),
-        text(order),
-        sub,
-        names,
-        fields,
-        number(size),
-        number(align),
-        number(flags),
-        *more,
-    )
+    numbers = (number(size), number(align), number(flags))
+    state = tuple_of(number(3), text(order), sub, names, fields, *numbers, *more)
     return called(DTYPE, text(code), FALSE, TRUE) + state + b"b"
 
 
@@ -365,6 +324,10 @@ HOSTILE = {
     "a buffer out of band": b"\x97",
     "a buffer made read-only": content(b"x") + b"\x98",
     "what the memo lacks": b"h\x07",
+    "one array twice": array() + b"q\x01s" + text("b") + b"h\x01",
+    "a memo of gigabytes": number(1) + b"r\xff\xff\xff\x7f" + b"j\xff\xff\xff\x7e",
+    "endless bytes": b"\x8e" + HUGE[2:],
+    "an endless bytearray": b"\x96" + HUGE[2:],
     "the array itself in its state": array()[:-1] + b"q\x01h\x01b",
     "a dotted name": b"\x8c\x05numpy\x8c\x10ndarray.__init__\x93",
     "a name by a number": number(1) + number(2) + b"\x93",
@@ -377,20 +340,14 @@ HOSTILE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", HOSTILE)
-def test_what_a_pickle_says_of_arrays_is_believed_in_plain_cases_only(tmp_path, what):
+def test_what_a_pickle_says_of_arrays_is_believed_in_plain_cases_only(tmp_path):
     path = tmp_path / "a.npy"
     path.write_bytes(dictionary(array()))
     assert read_array_dict(path)["a"].tolist() == [0, 0]  # the frame of all the cases is sound
-    path.write_bytes(dictionary(HOSTILE[what]))
-    with nothing_runs(path), pytest.raises(AdapterError, match=r"a\.npy"):
-        read_array_dict(path)
-
-
-def test_a_dictionary_cannot_hold_one_array_twice(tmp_path):
-    (tmp_path / "a.npy").write_bytes(dictionary(array() + b"q\x01s" + text("b") + b"h\x01"))
-    with pytest.raises(AdapterError, match="one array twice"):
-        read_array_dict(tmp_path / "a.npy")
+    for what, data in HOSTILE.items():
+        path.write_bytes(dictionary(data))
+        with nothing_runs(path), pytest.raises(AdapterError, match=r"a\.npy"):
+            pytest.fail(f"{what}: {read_array_dict(path)}")
 
 
 def test_the_known_attack_by_numpys_own_constructors_is_refused(tmp_path, shared_dir):
@@ -407,17 +364,6 @@ def test_the_known_attack_by_numpys_own_constructors_is_refused(tmp_path, shared
 # ---- real files, changed at random -----------------------------------------------------------
 
 
-def pickled_table() -> pd.DataFrame:
-    frame = pd.DataFrame({
-        "x": pd.Series([1.5, -2.0, np.nan]),
-        "d": pd.Series([0, 1, 0]),
-        "label": pd.Series(["Car", None, np.nan], dtype=object),
-        "stationary": pd.Series([True, False, True]),
-    })  # fmt: skip
-    frame.columns = pd.Index(list(frame.columns), dtype=object)
-    return frame
-
-
 def _stream(path: Path) -> None:
     with open(path, "rb") as file:
         for _ in stream_arrays(file):
@@ -426,26 +372,17 @@ def _stream(path: Path) -> None:
 
 def _files(folder: Path) -> list[tuple[Path, Callable[[Path], object]]]:
     for protocol in (2, 3, 4, 5):
-        (folder / f"{protocol}.pkl").write_bytes(pickle.dumps(pickled_table(), protocol))
-    (folder / "table.pkl.gz").write_bytes(gzip.compress(pickle.dumps(pickled_table(), 4), 1))
+        (folder / f"{protocol}.pkl").write_bytes(pickle.dumps(table(), protocol))
+    (folder / "table.pkl.gz").write_bytes(gzip.compress(pickle.dumps(table(), 4), 1))
     np.save(folder / "a.npy", {"mask": np.eye(3), "value": np.arange(4)})
     arrays = {n: np.arange(6.0).reshape(2, 3) for n in range(3)}
     (folder / "stream.pkl").write_bytes(pickle.dumps(arrays, 4))
-    weights = {
-        "w": torch.nn.Parameter(torch.arange(6.0).reshape(2, 3)),
-        "step": 4,
-        "half": torch.ones(2).half(),
-    }
+    weights = {"w": torch.nn.Parameter(torch.eye(3)), "step": 4, "half": torch.ones(2).half()}
     torch.save(weights, folder / "new.pth")
     torch.save(weights, folder / "old.pth", _use_new_zipfile_serialization=False)
-    readers = {
-        ".pkl": read_frame,
-        ".gz": read_frame,
-        ".npy": read_array_dict,
-        ".pth": load_checkpoint,
-    }
+    readers: dict[str, Callable] = {".npy": read_array_dict, ".pth": load_checkpoint}
     return [
-        (path, _stream if path.name == "stream.pkl" else readers[path.suffix])
+        (path, _stream if path.name == "stream.pkl" else readers.get(path.suffix, read_frame))
         for path in sorted(folder.iterdir())
     ]
 
@@ -471,14 +408,15 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(changed)
 
 
-def test_files_changed_at_random_run_nothing_and_give_our_errors(tmp_path):
-    rng = np.random.default_rng(11)
+@pytest.mark.parametrize("mutations", [15, pytest.param(300, marks=pytest.mark.long)])
+def test_files_changed_at_random_run_nothing_and_give_our_errors(tmp_path, mutations):
+    rng = np.random.default_rng(mutations)
     (tmp_path / "whole").mkdir()
     for whole, read in _files(tmp_path / "whole"):
         read(whole)  # whatever is imported at first use
         data = whole.read_bytes()
         path = tmp_path / whole.name
-        for _ in range(MUTATIONS):
+        for _ in range(mutations):
             path.write_bytes(mutated(data, rng))
             with nothing_runs(path), suppress(AdapterError, PickleError):
                 read(path)

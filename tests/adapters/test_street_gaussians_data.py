@@ -6,7 +6,6 @@ import json
 import pickle
 import shutil
 import struct
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -95,20 +94,13 @@ def test_the_images_number_counts_all_of_the_selection(street):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("split_test", "split_train", "held_out"),
-    [
-        (-1, -1, []),
-        (4, -1, [4]),
-        (1, -1, [1, 2, 3, 4, 5, 6]),
-        (-1, 1, []),
-        (-1, 3, [1, 2, 4, 5]),
-        (2, 3, [2, 4, 6]),
-    ],
-)
-def test_held_out_images_follow_the_split(split_test, split_train, held_out):
-    config = ModelConfig(split_test=split_test, split_train=split_train)
-    assert sorted(held_out_steps(7, config)) == held_out
+def test_held_out_images_follow_the_split():
+    for split_test, split_train, held_out in (
+        (-1, -1, []), (4, -1, [4]), (1, -1, [1, 2, 3, 4, 5, 6]), (-1, 1, []),
+        (-1, 3, [1, 2, 4, 5]), (2, 3, [2, 4, 6]),
+    ):  # fmt: skip
+        config = ModelConfig(split_test=split_test, split_train=split_train)
+        assert sorted(held_out_steps(7, config)) == held_out
 
 
 def test_the_split_counts_selected_frames_not_their_numbers(street):
@@ -153,16 +145,13 @@ def test_images_that_are_missing_damaged_or_of_another_size(own_street):
     assert frames_of(data)[0].cameras["FRONT_LEFT"].width == 96
 
 
-def test_a_principal_point_outside_the_images_is_an_error(own_street):
+def test_images_that_cannot_be_the_cameras_are_an_error(own_street):
     for number in own_street.numbers:
         path = own_street.image_path(number, 0)
         head = path.read_bytes()
         path.write_bytes(head[:16] + struct.pack(">II", 40, 30) + head[24:])
     with pytest.raises(AdapterError, match=r"intrinsics/0\.txt: cx, cy .* 40x30 .* got 48\.75"):
         read_data(own_street.root, FRONT)
-
-
-def test_two_files_of_one_image_are_an_error(own_street):
     shutil.copy(own_street.image_path(0, 0), own_street.root / "images" / "000000_0.jpg")
     with pytest.raises(AdapterError, match=r"000000_0\.jpg and .*000000_0\.png are one image"):
         read_data(own_street.root, FRONT)
@@ -199,18 +188,15 @@ def test_damaged_or_missing_calibration_is_named(own_street, name, text, message
             read_data(own_street.root, FRONT)
 
 
-def edit_times(root: Path, change) -> None:
-    path = root / "timestamps.json"
-    times = json.loads(path.read_text())
-    change(times)
-    path.write_text(json.dumps(times))
-
-
 def test_times_must_increase_and_be_there_for_every_image(own_street):
-    edit_times(own_street.root, lambda times: times["FRONT_LEFT"].pop("000002"))
+    path = own_street.root / "timestamps.json"
+    times = json.loads(path.read_text())
+    del times["FRONT_LEFT"]["000002"]
+    path.write_text(json.dumps(times))
     with pytest.raises(AdapterError, match="FRONT_LEFT lacks frame 000002"):
         read_data(own_street.root, FRONT)
-    edit_times(own_street.root, lambda times: times["FRAME"].update({"000002": 1.5e9}))
+    times["FRAME"]["000002"] = 1.5e9
+    path.write_text(json.dumps(times))
     with pytest.raises(AdapterError, match="must increase"):
         read_data(own_street.root, FRONT)
 
@@ -362,11 +348,11 @@ def test_a_scene_of_some_frames(street):
 
 def test_a_scene_needs_lidar_and_images(own_street):
     shutil.rmtree(own_street.root / "images")
-    with pytest.raises(AdapterError, match=r"images holds no usable image"):
+    with pytest.raises(AdapterError, match=r"there is no usable image in 4 frames"):
         open_raw(own_street.root, QUERY)
     write_dataset(own_street.root)
     (own_street.root / "pointcloud.npz").unlink()
-    with pytest.raises(AdapterError, match=r"pointcloud\.npz holds no returns of frames 0 to 3"):
+    with pytest.raises(AdapterError, match=r"no LiDAR returns in 4 frames.*npz lacks 4 frames"):
         open_raw(own_street.root, QUERY)
     shutil.rmtree(own_street.root / "extrinsics")
     with pytest.raises(AdapterError, match=r"extrinsics holds no calibration"):

@@ -295,7 +295,7 @@ def test_wrong_point_clouds(tmp_path: Path) -> None:
     for old, new, message in (
         (b"element vertex_background ", b"element vertex ", "opens as gaussians:"),
         (b"element vertex_background ", b"element vertex_sky ", "expected an element vertex_b"),
-        (b"property float scale_1\n", b"property float scale_9\n", "scale_1 missing"),
+        (b"property float scale_1\n", b"property float scale_9\n", "misses scale_1"),
         (b"property float f_dc_2\n", b"property float f_dc_3\n", "f_dc_0, f_dc_1"),
         (b"property float f_rest_8\n", b"property float f_rest_9\n", "f_rest_0, f_rest_1"),
         (b"ply\n", b"plo\n", "not a .ply file"),

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from augment.effects.snow.snow import PlacedSnow
 from augment.effects.snow.support import support_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
+from augment.jobs.render_job import RenderJob, run_job
 from augment.labels import Boxes, LidarSweep
 from augment.render.fog import Fog
 from augment.scene import Gaussians, Scene
@@ -156,6 +158,11 @@ def make_recipe(
     settings = {"semantic": True, "instance": True, **output}
     numbers = {"name": name, "variant": variant, "seed": 7}
     return Recipe(**numbers, weather=weather, style=style, output=Output(**settings))
+
+
+CLEAR = make_recipe("clear", lidar=True)
+FOGGY = make_recipe(image="jpg", lidar=True)
+FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
 
 
 def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
@@ -306,3 +313,30 @@ def tree_digest(folder: Path) -> dict[str, str]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+def write_scene(out: Path, recipes: list, name: str = "street", frames: int = 4) -> None:
+    """A scene of two cameras under some recipes."""
+    job = RenderJob(f"fake:{name}?frames={frames}", recipes, out)
+    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
+
+
+def assert_same_sample(a: Any, b: Any, *, but: tuple[str, ...] = ()) -> None:
+    """Equal in types, dtypes and values; NaN equals NaN. but: keys that are not compared."""
+    assert type(a) is type(b)
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a.keys() - set(but):
+            assert_same_sample(a[key], b[key])
+    elif isinstance(a, list):
+        for one, other in zip(a, b, strict=True):
+            assert_same_sample(one, other)
+    elif isinstance(a, torch.Tensor):
+        same = np.array_equal(a.numpy(), b.numpy(), equal_nan=a.is_floating_point())
+        assert a.dtype == b.dtype and same
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype and [repr(v) for v in a.ravel()] == [repr(v) for v in b.ravel()]
+    elif isinstance(a, float):
+        assert a == b or (a != a and b != b)
+    else:
+        assert a == b

@@ -96,15 +96,7 @@ def noting_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str)
 
 
 def slow_noting_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
-    time.sleep(0.02)
-    return noting_render(scene, camera, recipe, backend=backend)
-
-
-def very_slow_noting_render(
-    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str
-) -> FakeView:
-    """So slow that a job is still at it when a busy machine comes to stop it."""
-    time.sleep(0.1)
+    time.sleep(0.05)
     return noting_render(scene, camera, recipe, backend=backend)
 
 

@@ -126,24 +126,18 @@ def colour_maps(seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(maps).float()
 
 
+def in_weather(gaussians: Gaussians, weather: str, seed: int = 0, pose=None) -> PosedGaussians:
+    """A part that is snow lit per pixel ("light"), has a style's maps ("maps"), or is plain."""
+    part = PosedGaussians(gaussians, pose, is_overlay=weather == "light" or bool(seed % 2))
+    if weather == "light":
+        return dataclasses.replace(part, shading=snow_light(len(gaussians), seed))
+    return dataclasses.replace(part, color_maps=colour_maps(seed)) if weather == "maps" else part
+
+
 def snow_light(count: int, seed: int = 0) -> SplatShading:
     """Light per pixel on `count` splats, from a low sun."""
     slopes = torch.from_numpy(np.random.default_rng(seed).uniform(0, 1, (count, 3))).float()
     return SplatShading(slopes, (0.6, 0.0, 0.8), 0.4)
-
-
-def in_float64(parts: list[PosedGaussians]) -> list[PosedGaussians]:
-    """The same numbers in the precision in which the definition is taken for exact."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return [
-        dataclasses.replace(
-            part,
-            gaussians=dataclasses.replace(
-                part.gaussians, **{n: getattr(part.gaussians, n).double() for n in names}
-            ),
-        )
-        for part in parts
-    ]
 
 
 VARIABLE = "CLIMATEGS_EXAMPLES"

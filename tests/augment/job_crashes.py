@@ -252,16 +252,12 @@ def notes_of(kind: str) -> set[str]:
     return {line[2:] for line in lines if line[0] == kind}
 
 
-def wait_for_notes(more: int, child: int | None = None) -> int | None:
-    """Until so many more images are finished, or the child has ended: then its exit code."""
+def wait_for_notes(more: int) -> None:
+    """Until so many more images are finished."""
     wanted, deadline = len(notes_of("A")) + more, time.monotonic() + 150
     while len(notes_of("A")) < wanted:
-        pid, status = (0, 0) if child is None else os.waitpid(child, os.WNOHANG)
-        if pid:
-            return os.waitstatus_to_exitcode(status)
         require(time.monotonic() < deadline, "nothing is rendered")
         time.sleep(0.005)
-    return None
 
 
 def workers_of_server() -> list[int]:
@@ -290,42 +286,41 @@ def wait_for_workers(limit_s: float = 20) -> None:
 # ---- Scenarios ----------------------------------------------------------------------------------
 
 
-def kill_until_through(folder: Path, job: Callable[..., Work], kills: int, changes: int) -> dict:
-    """Kill one process after the other, around changes of the disk, until the job gets through."""
-    rng, met, rounds, whole = random.Random(3), 0, 0, whole_of(folder, job)
-    while met < kills:
-        out, when = folder / f"killed-{rounds}", f"round {rounds}"
+def kill_until_through(folder: Path, job: Callable[..., Work], rounds: int, changes: int) -> dict:
+    """Kill a job around four changes of the disk, one after the other, and let it get through."""
+    rng, kills, whole = random.Random(3), 0, whole_of(folder, job)
+    for number in range(rounds):
+        out = folder / f"killed-{number}"
         forget_notes()
-        while True:
-            number = rng.randrange(1, changes)
-            code = end_of(fork(job(out), at_change(number)))
-            require(code in (0, KILLED), f"killed at {number}: exit code {code}")
-            check_whole_files(out, whole, f"killed at {number}")
-            if code == 0:
-                break
-            met += 1
-        check_ended(out, whole, when)
-        rounds += 1
-    return {"kills": met, "rounds": rounds}
+        for _ in range(4):
+            at = rng.randrange(1, changes)
+            code = end_of(fork(job(out), at_change(at)))
+            require(code in (0, KILLED), f"killed at {at}: exit code {code}")
+            check_whole_files(out, whole, f"killed at {at}")
+            kills += code == KILLED
+        finish(job(out), f"round {number}")
+        check_ended(out, whole, f"round {number}")
+    return {"kills": kills}
 
 
 def kill_a_few_times(folder: Path) -> dict:
     """The quick case, which the others hold too: of few images."""
-    (folder / "render").mkdir(), (folder / "generate").mkdir()
+    for name in ("render", "generate"):
+        (folder / name).mkdir()
     small = {"scenes": ("fake:a?frames=2",)}
-    rendered = kill_until_through(folder / "render", rendering, 4, 400)
-    generated = kill_until_through(
-        folder / "generate", lambda out: generating(out, **small), 4, 120
+    found = (
+        kill_until_through(folder / "render", rendering, 1, 150),
+        kill_until_through(folder / "generate", lambda out: generating(out, **small), 1, 120),
     )
-    return {"kills": rendered["kills"] + generated["kills"]}
+    return {"kills": sum(each["kills"] for each in found)}
 
 
 def kill_render_jobs(folder: Path) -> dict:
-    return kill_until_through(folder, rendering, 12, 500)
+    return kill_until_through(folder, rendering, 6, 250)
 
 
 def kill_generate_jobs(folder: Path) -> dict:
-    return kill_until_through(folder, generating, 12, 500)
+    return kill_until_through(folder, generating, 6, 500)
 
 
 def kill_while_overwriting(folder: Path) -> dict:
@@ -414,35 +409,6 @@ def run_several_drivers(folder: Path) -> dict:
     return {"rendered_twice": again}
 
 
-def kill_workers(folder: Path, kills: int = 2) -> dict:
-    """Kill workers and drivers of a job with processes, at random times, until it gets through."""
-    rng, killed, runs, rounds = random.Random(1), 0, 0, 0
-    scenes = ("fake:a?frames=5", "fake:b?frames=4")
-    whole = whole_of(folder, lambda out: generating(out, scenes=scenes))
-    while killed < kills:
-        out, rounds = folder / f"killed-{rounds}", rounds + 1
-        work = generating(out, slow_noting_render, scenes=scenes, workers=2)
-        forget_notes()
-        while True:
-            child, code, runs = fork(work), None, runs + 1
-            while code is None:
-                code = wait_for_notes(rng.randrange(1, 8), child)
-                if code is None and rng.random() < 0.5:
-                    os.kill(child, signal.SIGKILL)
-                    code, killed = end_of(child), killed + 1
-                    wait_for_workers()
-                elif code is None and (found := workers_of_server()):
-                    os.kill(rng.choice(found), signal.SIGKILL)
-                    killed += 1
-            require(code in (0, KILLED), f"processes: exit code {code}")
-            check_reader(out, whole, may_fail=True)  # killed, and killed again alone
-            if code == 0 and "failed" not in read_finished(open_store(out))["status"].to_pylist():
-                break
-        check_ended(out, whole, f"processes, round {rounds}")
-        wait_for_workers()
-    return {"kills": killed, "runs": runs}
-
-
 def die_at_one_image(folder: Path) -> dict:
     """A worker dies at one image each time; a later run renders that image alone."""
     whole, out, results = whole_of(folder, generating), folder / "dying", folder / "results"
@@ -501,7 +467,6 @@ SCENARIOS = (
     stop_jobs_with_workers,
     fill_the_disk,
     run_several_drivers,
-    kill_workers,
     die_at_one_image,
     die_while_opening,
 )

@@ -11,7 +11,6 @@ import gc
 import os
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -39,7 +38,6 @@ from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
 from tests import snow_scenes
-from tests.augment import compiled_kernels as kernels
 from tests.augment.kernel_compiling import Launch, compile_launches, complaints, recorded_launches
 from tests.augment.kernel_frames import views
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
@@ -262,6 +260,9 @@ def test_two_views_under_way_do_not_mix(scene, away):
     assert not np.array_equal(alone[0].rgb, alone[1].rgb)
 
 
+# ---- snow ----------------------------------------------------------------------------------------
+
+
 @pytest.mark.long
 def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     small = sheet((0.0, 1.4), (-0.7, 0.7))  # few splats, for an interpreted blend
@@ -300,6 +301,9 @@ def assert_alike(found, expected) -> None:
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
         else:
             assert torch.equal(a, b), field.name
+
+
+# ---- copies, and the pretended GPU ---------------------------------------------------------------
 
 
 def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch):
@@ -343,21 +347,11 @@ def test_without_a_gpu_kernels_are_interpreted_and_auto_does_not_take_them():
     assert available_backends()[CUDA] is None and not gpu.has_gpu()
 
 
+# ---- compiling for a Hopper GPU ------------------------------------------------------------------
+
 interpreted = pytest.mark.skipif(
     not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"
 )
-
-
-def record_small_kernels() -> Counter[Launch]:
-    source, target = torch.ones(40), torch.zeros(40)
-    with recorded_launches() as counts:
-        for count in (1, 16, 39):
-            gpu.launch(kernels.scale, (3,), source, target, count, 2.5, BLOCK=16, num_warps=1)
-        assert target[:39].eq(1.25).all() and target[39] == 0  # they run all the same
-        gpu.launch(kernels.scale, (1,), source[1:], target, 3, 1.0, BLOCK=16, num_warps=2)
-        gpu.launch(kernels.add_wide, (1,), source, target, BLOCK=16, num_warps=1)
-        gpu.launch(kernels.scale, (0,), source, target, 0, 1.0, BLOCK=64)
-    return counts
 
 
 def record_views(*names: str) -> list[Launch]:
@@ -366,23 +360,6 @@ def record_views(*names: str) -> list[Launch]:
         for name in names or every:
             every[name]()
     return [*counts]
-
-
-@pytest.mark.long
-@interpreted
-def test_what_is_wrong_with_a_kernel_is_seen():
-    with recorded_launches() as broken, pytest.raises(Exception, match="arange"):
-        gpu.launch(kernels.broken, (1,), torch.ones(40), BLOCK=16)
-    with recorded_launches() as crowded:
-        many = torch.ones(2048)
-        gpu.launch(kernels.crowd, (1,), many, many, BLOCK=2048, num_warps=1, maxnreg=32)
-    compiled = compile_launches([*(record_small_kernels() | broken | crowded)])
-    good = [each for each in compiled if each.kernel.endswith(":scale")]
-    assert len(good) == 2 and not complaints(good) and all(each.registers for each in good)
-    found = {each.kernel.partition(":")[2]: complaints([each]) for each in compiled}
-    assert "does not compile" in found["broken"][0] and "power of 2" in found["broken"][0]
-    assert "spills" in found["crowd"][0]
-    assert "float64" in found["add_wide"][0] and "atomics" in found["add_wide"][1]
 
 
 @interpreted

@@ -15,22 +15,12 @@ pytest.importorskip("triton")
 
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
-from augment.render import layout
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
-from augment.render.cuda.backward import color_gradients
-from augment.render.cuda.splats import HIDDEN, CudaSplats, CudaTiles
 from augment.render.fog import Fog
 from augment.render.gsplat_backend import draw_with_gsplat
 from augment.render.rasterize import rasterize
-from augment.render.reference import (
-    LOG2_E,
-    bin_to_tiles,
-    order_by_depth,
-    project_parts,
-    rasterize_reference,
-)
 from augment.scene import Gaussians, PosedGaussians
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
@@ -105,84 +95,7 @@ def test_a_colour_held_by_its_clamp_has_no_gradient():
     assert found[0, 0, 0] == 0 and found[0, 0, 1:].all()
 
 
-@pytest.mark.long
-def test_parallel_rays_see_every_splat_from_one_side():
-    camera = dataclasses.replace(camera_ahead(9, 7, 2.0), is_orthographic=True)
-    parts = [PosedGaussians(random_gaussians(40, seed=2))]
-    expected = sh_gradients(parts, camera, "reference")
-    assert_close(sh_gradients(parts, camera, "cuda"), expected, 2e-5)
-
-
 # ---- the transposed blend alone ----------------------------------------------------------------
-
-
-def reference_splats(parts, camera, settings=DEFAULT) -> tuple[CudaSplats, CudaTiles]:
-    """What the projection and the lists of the backend would hand over, by the definition."""
-    with torch.no_grad():
-        splats = order_by_depth(project_parts(parts, camera, settings))
-        lists = bin_to_tiles(splats, camera)
-    count = sum(len(part.gaussians) for part in parts)
-    (xx, xy, yy), dets, opacities = splats.covs2d.T, splats.dets, splats.opacities
-    del xx
-    half = 0.5 * LOG2_E
-    records = torch.full((count, layout.RECORD), math.nan)  # of what is not drawn: anything
-    fields = {
-        layout.MEAN_X: splats.means2d[:, 0],
-        layout.MEAN_Y: splats.means2d[:, 1],
-        layout.LEAN_X: xy / yy,
-        layout.SHARP_X: torch.sqrt(half * yy / dets),
-        layout.FALL_Y: half / yy,
-        layout.LOG_OPACITY: torch.log2(opacities),
-    }
-    for field, value in fields.items():
-        records[splats.ids, field] = value
-    assert splats.colors is not None
-    records[splats.ids, layout.RED : layout.RED + 3] = splats.colors
-    keys = torch.full((count,), HIDDEN, dtype=torch.int32)
-    keys[splats.ids] = splats.depths.view(torch.int32)
-    none = torch.zeros(count, 2, dtype=torch.int32)
-    device = gpu.gpu_device()
-    return (
-        CudaSplats(records.to(device), keys.to(device), none.to(device), none[:, 0].to(device),
-                   None, None),
-        CudaTiles(
-            splats.ids[lists.tile_splat_ids].int().to(device),
-            lists.tile_offsets.int().to(device),
-            lists.columns,
-            lists.rows,
-        ),
-    )  # fmt: skip
-
-
-def expected_color_gradients(parts, camera, d_rgb) -> torch.Tensor:
-    """Of parts of one SH function, whose slope is that of the colour."""
-    leaves = [tracked(part, "sh") for part in parts]
-    out = rasterize_reference(leaves, camera, frozenset({RGB}), DEFAULT, None)
-    assert out.rgb is not None
-    (out.rgb * d_rgb).sum().backward()
-    grads = [part.gaussians.sh.grad for part in leaves]
-    return torch.cat([grad[:, 0] for grad in grads if grad is not None]) * math.sqrt(4 * math.pi)
-
-
-def crowded() -> list[PosedGaussians]:
-    """Lists of several batches, which light does not come through, and a splat in every tile."""
-    wall = random_gaussians(80, seed=9, sh_degree=0, size=0.5)
-    wall = dataclasses.replace(wall, opacities=torch.full((80,), 0.95))
-    broad = one_gaussian((9.0, 0.0, 0.0), 4.0, 0.4)
-    hidden = one_gaussian((-3.0, 0.0, 0.0))
-    return [PosedGaussians(stack(broad, hidden)), PosedGaussians(wall)]
-
-
-@pytest.mark.long
-def test_every_tile_adds_its_share():
-    parts, camera = crowded(), camera_ahead(37, 21, 28.0)
-    d_rgb = weights_of(camera)
-    splats, tiles = reference_splats(parts, camera)
-    found = color_gradients(splats, tiles, camera, DEFAULT, d_rgb.to(gpu.gpu_device())).cpu()
-    assert_close([found], [expected_color_gradients(parts, camera, d_rgb)], 1e-5)
-    assert not found[1].any() and found[0].all()
-    again = color_gradients(splats, tiles, camera, DEFAULT, d_rgb.to(gpu.gpu_device())).cpu()
-    assert torch.equal(found, again)
 
 
 @pytest.mark.gpu

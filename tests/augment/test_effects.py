@@ -16,8 +16,8 @@ from augment.jobs.render_job import RenderJob, run_job
 from augment.plan import make_plan
 from augment.views import render_view
 from recipes.errors import RecipeError
-from recipes.json_schema import recipe_json_schema
 from recipes.load import load_recipe
+from recipes.recipe_file import recipe_json_schema
 from recipes.schema import KNOBS, Recipe
 from tests.augment.dust import TINT, DustEffect
 from tests.streets import LABELLED_STREET, open_street
@@ -84,12 +84,16 @@ def test_a_recipe_without_it_has_the_hash_it_had():
         effects.add_effect(DustEffect())
 
 
-def test_plans_and_explain_name_its_passes(recipe_file):
+def test_plans_name_its_passes(recipe_file):
     scene = open_street(URI)
     plan = make_plan(load_recipe(str(recipe_file)).resolve(0), scene)
     assert "expected_depth" in plan.buffers
     assert [s.runs for s in plan.steps if s.name == TINT] == [True]
     assert [s.runs for s in make_plan(Recipe(), scene).steps if s.name == TINT] == [False]
+
+
+@pytest.mark.long
+def test_explanations_name_its_passes(recipe_file):
     page = explanation_text(explain_recipe(str(recipe_file), URI, times=False))
     assert f"dust.half_m = {HALF_M}" in page and f"runs   {TINT}" in page
 

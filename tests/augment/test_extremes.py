@@ -20,7 +20,7 @@ from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import support_of
 from augment.plan import make_plan
 from augment.rng import rng_for
-from augment.scene import Actor, Track
+from augment.scene import Actor, Gaussians, Track
 from augment.semantics import SemanticClass
 from augment.views import WeatheredView, render_buffers, render_view
 from recipes.errors import RecipeError

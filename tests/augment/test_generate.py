@@ -1,8 +1,7 @@
-"""`climategs generate`: what is rendered, what is left alone, what becomes of failures and kills."""
+"""`climategs generate`: what is rendered, what left alone, what becomes of failures and kills."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -26,13 +25,12 @@ from generate_jobs import (
     raising_render,
 )
 
-from augment.errors import ClimateGSError, GpuLost, OutputError
+from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.block_worker import VARIANTS, enter_variant
 from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
 from augment.jobs.layout import folder_name
-from augment.jobs.manifest import Identity, list_parts, read_finished, read_manifest
+from augment.jobs.manifest import list_parts, read_finished, read_manifest
 from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
@@ -163,25 +161,19 @@ def test_an_image_that_fails_costs_itself_and_is_tried_again(tmp_path: Path, who
 
 
 def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, whole: dict) -> None:
+    """Unusable where it was never opened; else all its images are failed rows, and tried again."""
     result = run(make_job(tmp_path, opener=open_without_memory))
     assert (result.written, result.failed) == (16, 0)
-    assert list(result.unusable) == ["fake:b?frames=3"]
     assert "memory ran out (bad allocation)" in result.unusable["fake:b?frames=3"]
     assert read_status(open_store(tmp_path))[0].unusable == result.unusable
-    assert run(make_job(tmp_path)).written == 12
-    assert outputs(tmp_path) == whole
-
-
-def test_a_scene_that_could_be_opened_once(tmp_path: Path, whole: dict) -> None:
-    """All its images are failed rows, and are tried again."""
-    run(make_job(tmp_path, shard=(1, 28)))
-    result = run(make_job(tmp_path, opener=open_without_memory))
+    out = tmp_path / "once"
+    run(make_job(out, shard=(1, 28)))
+    result = run(make_job(out, opener=open_without_memory))
     assert (result.written + result.skipped, result.failed) == (16, 12)
-    assert {row["scene"] for row in rows_of(tmp_path, status="failed")} == {"b"}
-    assert len(rows_of(tmp_path)) == 28
-    assert all("memory ran out" in r["message"] for r in rows_of(tmp_path, status="failed"))
-    assert run(make_job(tmp_path)).failed == 0
-    assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
+    assert {row["scene"] for row in rows_of(out, status="failed")} == {"b"}
+    assert len(rows_of(out)) == 28
+    assert run(make_job(out)).failed == 0
+    assert outputs(out) == whole and leftovers(out) == []
 
 
 def test_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -318,16 +310,6 @@ def test_a_gpu_has_one_process_and_a_name_and_mixes_with_no_cpu(tmp_path, monkey
         assert outputs(out) == before
 
 
-def test_a_lost_gpu_fails_no_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_of(tmp_path, "cuda", renderer=raising_render)
-    with monkeypatch.context() as patch:
-        patch.setattr("augment.jobs.worker.gpu_is_lost", lambda backend: True)
-        with pytest.raises(GpuLost, match="since frame 1, camera front"):
-            run(job)
-    result = run(job_of(tmp_path, "cuda"))
-    assert result.failed == 0 and result.written + result.skipped == 4
-
-
 def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
     result = run(job_of(tmp_path, "auto"))
     timings = result.timings
@@ -337,20 +319,6 @@ def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
     assert shares is not None
     assert shares.rendering + shares.held + shares.beside == pytest.approx(1)
     assert shares_of(run(job_of(tmp_path, "auto")).timings) is None
-
-
-FOG = Identity("fake:street", "0123456789abcdef", "recorded", "0.1.0", "auto")
-
-
-def test_the_same_may_come_again_and_another_may_not(tmp_path):
-    store = open_store(tmp_path)
-    enter_variant(store, "street/north", "fog-000", FOG)
-    enter_variant(store, "street/north", "fog-000", FOG)
-    enter_variant(store, "street/north", "fog-001", dataclasses.replace(FOG, recipe_hash="other"))
-    with pytest.raises(OutputError, match=r"fog-000 already holds .* recipe hash there '0123"):
-        changed = dataclasses.replace(FOG, recipe_hash="fedcba9876543210")
-        enter_variant(store, "street/north", "fog-000", changed)
-    assert len(store.list(VARIANTS)) == 2
 
 
 # ---- Names, damage, kills -----------------------------------------------------------------------
@@ -394,14 +362,14 @@ def found_by(folder: Path, *scenarios: str) -> dict[str, dict]:
 
 
 def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
-    assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] >= 8
+    assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] == 8
 
 
 @pytest.mark.long
 def test_jobs_that_are_killed_stopped_or_starved_of_disk_go_on(quick_folder: Path) -> None:
     found = found_by(quick_folder)
-    assert found["kill_render_jobs"]["kills"] + found["kill_generate_jobs"]["kills"] >= 24
+    assert found["kill_render_jobs"]["kills"] + found["kill_generate_jobs"]["kills"] >= 30
     assert found["kill_while_overwriting"]["kills"] >= 4
-    assert found["fill_the_disk"]["failures"] >= 2 and found["kill_workers"]["kills"] >= 2
+    assert found["fill_the_disk"]["failures"] >= 2
     assert len(found["stop_jobs_with_workers"]["finished"]) == 6
     assert {"run_several_drivers", "die_at_one_image", "die_while_opening"} <= found.keys()

@@ -1,4 +1,4 @@
-"""What pictures do not depend on, and how far float32 is from the definition in float64."""
+"""What pictures do not depend on, how far float32 is from float64, gradients at the extremes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from augment.cameras import Camera, Frame
+from augment.geometry import rigid
+from augment.reconstruct import kernels as adam
+from augment.reconstruct.config import LearningRates
+from augment.reconstruct.splats import CORRECTIONS, Splats, splat_rates
+from augment.reconstruct.trainer import Knots, part_forces, splat_inputs
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -22,9 +27,13 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
+from augment.render.constants import RasterSettings
+from augment.render.cpu import backward as cpu_backward
+from augment.render.cpu.driver import Scratch
 from augment.render.layout import HeightClip
+from augment.render.part_views import part_poses
 from augment.render.rasterize import rasterize
-from augment.render.threads import limit_threads
+from augment.render.threads import kernel_threads, limit_threads
 from augment.scene import Gaussians, Ground, PosedGaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
@@ -33,31 +42,19 @@ from tests.augment.extremes import street
 from tests.augment.hard_scenes import (
     KINDS,
     SMOGS,
-    colour_maps,
     drawing,
     hard_gaussians,
-    in_float64,
-    snow_light,
+    in_weather,
     untied,
     wide_camera,
 )
-from tests.scenes import slight_pose
+from tests.scenes import in_float64, parts_in_float64, slight_pose
 
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
 ALL, SNOWY = frozenset(BUFFERS), frozenset({RGB, ALPHA, OVERLAY})
 WEATHERS = ("clear", "uniform", "layered", "clip", "light", "maps")
 weathers = st.sampled_from(WEATHERS)
 seeds = st.integers(0, 2**31)
-
-
-def part_of(gaussians: Gaussians, weather: str, seed: int = 0, pose=None) -> PosedGaussians:
-    part = PosedGaussians(gaussians, pose)
-    if weather == "light":
-        light = snow_light(len(gaussians), seed)
-        return dataclasses.replace(part, is_overlay=True, shading=light)
-    if weather == "maps":
-        return dataclasses.replace(part, color_maps=colour_maps(seed))
-    return part
 
 
 def render(parts: list[PosedGaussians], camera: Camera, weather: str) -> RenderOutput:
@@ -86,8 +83,8 @@ def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_d
     camera = wide_camera(fov_deg)
     gaussians = untied(hard_gaussians(kind, camera, count, seed=seed), camera)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(len(gaussians)))
-    first = images(render([part_of(gaussians, weather, seed)], camera, weather))
-    part = part_of(gaussians, weather, seed)
+    first = images(render([in_weather(gaussians, weather, seed)], camera, weather))
+    part = in_weather(gaussians, weather, seed)
     shuffled = dataclasses.replace(part, gaussians=gaussians.select(order))
     if part.shading is not None:
         light = dataclasses.replace(part.shading, slopes=part.shading.slopes[order])
@@ -106,7 +103,7 @@ def test_a_part_split_in_two_has_the_same_bits(kind, weather, seed, is_posed, cu
     """Ids too, for they count through the parts. Blocks of 2048 begin anew with each part."""
     camera, count = wide_camera(60.0), 2600
     gaussians = hard_gaussians(kind, camera, count, seed=seed)
-    whole = part_of(gaussians, weather, seed, slight_pose() if is_posed else None)
+    whole = in_weather(gaussians, weather, seed, slight_pose() if is_posed else None)
     at = [slice(0, min(cut, count)), slice(min(cut, count), count)]
     halves = [dataclasses.replace(whole, gaussians=_sliced(gaussians, s)) for s in at]
     if whole.shading is not None:
@@ -169,7 +166,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
     moved = dataclasses.replace(camera, cx=camera.cx + dx, cy=camera.cy + dy)
     margins = max(-dx, 0), max(-dy, 0), max(dx, 0), max(dy, 0)
     gaussians = _centred(hard_gaussians(kind, camera, 120, seed=seed), camera, *margins)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     first = images(render(parts, camera, weather))
     second = images(render(parts, moved, weather))
     height, width = camera.height, camera.width
@@ -185,7 +182,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
 def test_a_larger_image_holds_the_smaller_one_to_the_bit(kind, weather, seed, wider, higher):
     camera = wide_camera(60.0, (45, 37))
     gaussians = _centred(hard_gaussians(kind, camera, 300, seed=seed), camera)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     larger = dataclasses.replace(camera, width=45 + wider, height=37 + higher)
     whole = images(render(parts, larger, weather))
     for name, image in images(render(parts, camera, weather)).items():
@@ -200,11 +197,14 @@ def test_a_window_shows_its_part_of_the_picture(kind, weather, seed, left, top):
     width, height = 90 - left - 17, 64 - top - 11
     gaussians = hard_gaussians(kind, camera, 200, seed=seed)
     gaussians = _centred(gaussians, camera, left, top, 17, 11)
-    parts = [part_of(gaussians, weather, seed)]
+    parts = [in_weather(gaussians, weather, seed)]
     window = camera.cropped(left, top, width, height)
     whole = images(render(parts, camera, weather))
     cut = {n: image[top : top + height, left : left + width] for n, image in whole.items()}
     assert_same_picture(render(parts, window, weather), cut, 40)
+
+
+# ---- whole frames --------------------------------------------------------------------------------
 
 
 def _valley(gaussians: Gaussians, camera: Camera) -> Scene:
@@ -260,6 +260,8 @@ def test_frames_in_all_weathers_do_not_depend_on_threads(shading):
     np.testing.assert_equal(dict(first.masks), dict(second.masks))
 
 
+# ---- float32 against float64 ---------------------------------------------------------------------
+
 # Kernels are compiled for each set of buffers: these are sets that pictures ask for.
 CLIPPED_WEATHERS = ("clear", "uniform", "layered", "above", "below", "light", "maps")
 FOVS_DEG = (1, 10, 60, 120, 170)
@@ -276,15 +278,6 @@ def render_on(parts, camera: Camera, weather: str, backend: str) -> dict[str, to
         parts, camera, buffers=buffers, fog=SMOGS.get(weather), clip=clip, backend=backend
     )
     return {name: getattr(output, name) for name in buffers}
-
-
-def overlay_of(gaussians, weather: str, seed: int) -> PosedGaussians:
-    part = PosedGaussians(gaussians, is_overlay=bool(seed % 2))
-    if weather == "light":
-        return dataclasses.replace(part, shading=snow_light(len(gaussians), seed))
-    if weather == "maps":
-        return dataclasses.replace(part, color_maps=colour_maps(seed))
-    return part
 
 
 def errors(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> dict:
@@ -334,10 +327,10 @@ def assert_within(found: dict, bounds: dict[str, float], weather: str) -> None:
 
 
 def compare(gaussians, camera: Camera, weather: str, seed: int) -> dict:
-    part = overlay_of(gaussians, weather, seed)
+    part = in_weather(gaussians, weather, seed)
     return errors(
         render_on([part], camera, weather, "cpu"),
-        render_on(in_float64([part]), camera, weather, "reference"),
+        render_on(parts_in_float64([part]), camera, weather, "reference"),
     )
 
 
@@ -407,3 +400,110 @@ def test_float32_coordinates_lose_centimetres_far_from_the_origin(distance_m, lo
         render_on([part], camera, "clear", "cpu"), render_on([exact], camera, "clear", "reference")
     )
     assert off / 3 < float(found[RGB].quantile(0.9)) < 3 * off
+
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+# ---- gradients -----------------------------------------------------------------------------------
+
+kinds = st.sampled_from(KINDS)
+fovs = st.sampled_from((1, 10, 60, 120, 170))
+sizes = st.sampled_from(((33, 21), (1, 1), (17, 1), (16, 16)))
+
+
+def learnt(gaussians: Gaussians) -> Gaussians:
+    tensors = {n: getattr(gaussians, n).clone().requires_grad_() for n in FIELDS}
+    return dataclasses.replace(gaussians, **tensors)
+
+
+def gradients(gaussians: Gaussians, camera, *, backend: str, seed: int, **options) -> dict:
+    """Of a loss in which every pixel of colour, alpha and depth has a weight of its own."""
+    own = learnt(gaussians)
+    output = rasterize(
+        [PosedGaussians(own)],
+        camera,
+        buffers=(RGB, ALPHA, EXPECTED_DEPTH),
+        backend=backend,
+        **options,
+    )
+    generator = torch.Generator().manual_seed(seed % 2**31)
+    loss = output.alpha.new_zeros(())
+    for image in (output.rgb, output.alpha, output.expected_depth):
+        assert torch.isfinite(image).all()
+        loss = loss + (image * torch.rand(image.shape, generator=generator).to(image)).sum()
+    loss.backward()
+    return {name: getattr(own, name).grad for name in FIELDS}
+
+
+def assert_finite(found: dict) -> None:
+    for name, value in found.items():
+        assert value is not None and bool(torch.isfinite(torch.as_tensor(value)).all()), name
+
+
+@pytest.mark.long
+@drawing(8)
+@given(kinds, seeds, fovs, sizes, st.booleans())
+def test_gradients_of_the_cpu_rasteriser_are_finite(kind, seed, fov_deg, size, antialiased):
+    camera = wide_camera(fov_deg, size)
+    gaussians = hard_gaussians(kind, camera, 60, seed=seed)
+    settings = RasterSettings(antialiased=antialiased)
+    assert_finite(gradients(gaussians, camera, backend="cpu", seed=seed, settings=settings))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("smog", SMOGS)
+@drawing(2)
+@given(kinds, seeds, fovs, st.booleans(), st.booleans())
+def test_gradients_of_the_definition_are_finite(smog, kind, seed, fov_deg, antialiased, is_double):
+    camera = wide_camera(fov_deg, (16, 9))
+    gaussians = hard_gaussians(kind, camera, 30, seed=seed)
+    if is_double:
+        gaussians = in_float64(gaussians)
+    settings = RasterSettings(antialiased=antialiased)
+    found = gradients(
+        gaussians, camera, backend="reference", seed=seed, settings=settings, fog=SMOGS[smog]
+    )
+    assert_finite(found)
+
+
+# ---- reconstruction ------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@drawing(5)
+@given(kinds, seeds, fovs, st.sampled_from((0.0, 1e-30, 1.0, 1e10)))
+def test_splats_and_poses_are_finite_after_a_step(kind, seed, fov_deg, steepness):
+    """Adam keeps logarithms of scales and logits of opacities within what can be drawn."""
+    camera = wide_camera(fov_deg)
+    start = hard_gaussians(kind, camera, 60, seed=seed, sh_degree=3)
+    pose = rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    splats = Splats.of([start, start.select(torch.arange(20))], 3)
+    poses = part_poses([None, pose])
+    rates = LearningRates()
+    inputs = splat_inputs(splats, [0, 1], poses, camera, RasterSettings())
+    knots = Knots([np.array([0, 10])], 6)
+    rng, scratch = np.random.default_rng(seed), Scratch()
+    for step in range(2):
+        tape = cpu_backward.record(inputs, camera, RasterSettings(), scratch, with_depth=True)
+        images = [
+            (steepness * rng.normal(size=image.shape)).astype(np.float32)
+            for image in (tape.rgb, tape.alpha, tape.expected_depth)
+        ]
+        found = tape.backward(*images)
+        forces = part_forces(inputs, found)
+        on_camera = forces.on_camera(camera.camera_from_world.numpy() @ poses)
+        knots.update(0, 5, on_camera, np.full(6, 0.1), 1e-3)
+        with kernel_threads():
+            adam.update_splats(
+                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
+                adam.GradientRows(found.rows.reshape(-1), found.ids, found.counts), 16,
+                splat_rates(rates, step / 10, camera, 50.0), CORRECTIONS.reshape(-1),
+                splats.adam_state(),
+            )  # fmt: skip
+    for name, array in splats.arrays().items():
+        assert np.isfinite(array).all(), name
+    assert np.isfinite(knots.values).all() and np.isfinite(on_camera).all()
+    assert splats.scales.min() > 0
+    assert splats.opacities.min() >= 0 and splats.opacities.max() <= 1
+    np.testing.assert_allclose(np.linalg.norm(splats.quats, axis=1), 1, atol=1e-5)

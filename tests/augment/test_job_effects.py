@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
 from batch_scenes import (
     LEVEL_Z_M,
     ORIGIN_M,
@@ -34,7 +32,7 @@ from batch_scenes import (
 
 from augment.boxes import PlacedBoxes
 from augment.cameras import Camera, Frame
-from augment.dataset import SceneDataset, WeatherDataset, collate_frames
+from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
 from augment.effects.snow import support as beds
@@ -184,20 +182,6 @@ def test_a_clear_day_has_the_same_labels_and_no_tables(whole: Path, tmp_path: Pa
         assert np.isnan(row["snow_depth_m"])
 
 
-def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Recipe) -> None:
-    recorded = make_frame(1)
-    path = [
-        Frame(number, time, recorded.world_from_ego, {"front": make_camera("front", time, 0.5)})
-        for number, time in ((1, recorded.timestamp_ns), (2, 5))
-    ]
-    job = RenderJob("fake:street", [recipe], tmp_path, camera_path=path)
-    assert run(job).written == 2
-    assert [row["box_water_path"] is None for row in rows_of(tmp_path)] == [False, True]
-    water = box_tables()["box_water"].read(tmp_path / LABELS / "water.parquet")
-    assert list(water) == [(1, "front")]
-    assert run(job, must_not_render).skipped == 2
-
-
 @pytest.mark.parametrize(
     ("uri", "output"), [("fake:street?unlabelled=1", {}), ("fake:street", {"labels": False})]
 )
@@ -285,100 +269,43 @@ def test_a_progress_log_carries_the_numbers(whole: Path, recipe, tmp_path: Path)
     assert tree_digest(tmp_path) == tree_digest(whole)
 
 
-def test_an_image_that_fails_later_loses_its_rows(whole: Path, recipe, copied: Path) -> None:
-    (copied / FOLDER / "images" / "front" / "000003.png").unlink()
-
-    def fails(scene, camera, recipe, *, backend):
-        raise RuntimeError("no such luck")
-
-    assert run(RenderJob("fake:street", [recipe], copied), fails).failed == 1
-    assert (3, "front") not in box_tables()["box_water"].read(copied / LABELS / "water.parquet")
-    assert run(RenderJob("fake:street", [recipe], copied)).written == 1
-    assert tree_digest(copied) == tree_digest(whole)
+def test_a_finished_folder_of_an_older_version_stays_as_it_is(whole, recipe, copied: Path) -> None:
+    """Rendering all of it again would be the only way to the numbers: nobody asked for that. What
+    is rendered anew has them.
+    """
+    (copied / LABELS / "smog.parquet").unlink()
+    manifest = copied / "manifest.parquet"
+    pq.write_table(pq.read_table(manifest).drop_columns(["box_smog_path"]), manifest)
+    before, job = tree_digest(copied), RenderJob("fake:street", [recipe], copied)
+    assert run(job, must_not_render).skipped == 8
+    assert tree_digest(copied) == before
+    sample = WeatherDataset(copied)[5]
+    assert sample["paths"]["box_smog"] is None and sample["boxes"]["transmittance"] is None
+    for lost in ("labels/boxes.parquet", "calibration.json"):  # comes back without rendering
+        (copied / FOLDER / lost).unlink()
+        assert run(job, must_not_render).skipped == 8
+        assert (copied / FOLDER / lost).read_bytes() == (whole / FOLDER / lost).read_bytes()
+    for frame in (0, 2):
+        (copied / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
+    assert run(job).written == 2
+    table = box_tables()["box_smog"].read(copied / LABELS / "smog.parquet")
+    has = {(r["frame"], r["camera"]) for r in rows_of(copied) if r["box_smog_path"]}
+    assert has == set(table) == {(0, "front"), (2, "front")}
+    assert run(job, must_not_render).skipped == 8
 
 
 def test_outputs_of_the_first_version_are_gone_on_with(tmp_path: Path) -> None:
     """Without the columns that came later: no style; no weather, so surfaces are alike."""
-    whole, old = tmp_path / "whole", tmp_path / "old"
-    run(RenderJob("fake:street", [CLEAR], whole))
-    run(RenderJob("fake:street", [CLEAR], old, frames=[0, 1]))
-    table = pq.read_table(old / "manifest.parquet")
+    run(RenderJob("fake:street", [CLEAR], tmp_path, frames=[0, 1]))
+    table = pq.read_table(tmp_path / "manifest.parquet")
     young = [n for n in table.column_names if n.startswith(("flood_", "snow_", "style_"))]
-    pq.write_table(table.drop_columns([*{*young, *later_columns()}]), old / "manifest.parquet")
-    assert read_manifest(old)["surface"].to_pylist() == ["solid"] * 4
-    sample = WeatherDataset(old)[0]
+    pq.write_table(table.drop_columns([*{*young, *later_columns()}]), tmp_path / "manifest.parquet")
+    assert read_manifest(tmp_path)["surface"].to_pylist() == ["solid"] * 4
+    sample = WeatherDataset(tmp_path)[0]
     assert sample["surface"] == "solid" and sample["water"] is sample["snow"] is None
-    assert sample["boxes"]["submerged_fraction"] is sample["boxes"]["transmittance"] is None
-    assert run(RenderJob("fake:street", [CLEAR], old)).skipped == 4
-    assert without_2d(old) == without_2d(whole)
-    measured = [row["box_2d_path"] is not None for row in rows_of(old)]
+    assert run(RenderJob("fake:street", [CLEAR], tmp_path)).skipped == 4
+    measured = [row["box_2d_path"] is not None for row in rows_of(tmp_path)]
     assert measured == [False] * 4 + [True] * 4  # only rendering tells
-
-
-def without_2d(out: Path) -> tuple[dict[str, str], list[str]]:
-    """Files and rows, without what only rendering tells."""
-    files = tree_digest(out / "street")
-    assert files.pop("clear-000/labels/boxes_2d.parquet")
-    unknown = dict.fromkeys(("box_2d_path", "lidar", "lidar_note"))
-    return files, [repr({**row, **unknown}) for row in rows_of(out)]
-
-
-@pytest.fixture
-def older(copied: Path) -> Path:
-    """The folder as a version without the table of smog left it."""
-    (copied / LABELS / "smog.parquet").unlink()
-    table = pq.read_table(copied / "manifest.parquet")
-    pq.write_table(table.drop_columns(["box_smog_path"]), copied / "manifest.parquet")
-    return copied
-
-
-def test_a_finished_folder_of_before_stays_as_it_is(whole, recipe, older: Path) -> None:
-    """Rendering all of it again would be the only way to the numbers: nobody asked for that."""
-    before = tree_digest(older)
-    result = run(RenderJob("fake:street", [recipe], older), must_not_render)
-    assert (result.written, result.skipped) == (0, 8)
-    assert tree_digest(older) == before
-    sample = WeatherDataset(older)[5]
-    assert sample["paths"]["box_smog"] is None and sample["boxes"]["transmittance"] is None
-    for lost in ("labels/boxes.parquet", "calibration.json"):  # comes back without rendering
-        (older / FOLDER / lost).unlink()
-        assert run(RenderJob("fake:street", [recipe], older), must_not_render).skipped == 8
-        assert (older / FOLDER / lost).read_bytes() == (whole / FOLDER / lost).read_bytes()
-    assert not (older / LABELS / "smog.parquet").exists()
-
-
-def test_new_images_of_an_older_folder_have_their_numbers(whole, recipe, older: Path) -> None:
-    """The others keep none, and the next run has nothing to do."""
-    for frame in (0, 2):
-        (older / FOLDER / "images" / "front" / f"{frame:06d}.png").unlink()
-    job, path = RenderJob("fake:street", [recipe], older), LABELS / "smog.parquet"
-    assert run(job).written == 2
-    table, expected = (box_tables()["box_smog"].read(out / path) for out in (older, whole))
-    assert set(table) == {(0, "front"), (2, "front")}
-    item = 2, "front"
-    np.testing.assert_array_equal(table[item]["transmittance"], expected[item]["transmittance"])
-    has = {(r["frame"], r["camera"]) for r in rows_of(older) if r["box_smog_path"]}
-    assert has == set(table)
-    assert len([s for s in WeatherDataset(older) if s["boxes"]["transmittance"] is not None]) == 2
-    assert run(job, must_not_render).skipped == 8
-
-
-def test_samples_hold_them_read_or_rendered(whole: Path, recipe: Recipe) -> None:
-    files = WeatherDataset(whole, cameras=["front"], frames=[2])
-    (row,) = files.table.to_pylist()
-    sample, view = files[0], camera_and_view(row, recipe)[1]
-    live = SceneDataset(open_fake("fake:street"), recipe, renderer=fake_render)[4]
-    assert (live["frame"], live["camera"]["name"]) == (2, "front")
-    np.testing.assert_array_equal(sample["snow"].numpy(), view.masks["snow"] > 0)
-    np.testing.assert_array_equal(live["snow"], sample["snow"])
-    for kind, name in (("snow", "snow_fraction"), ("smog", "transmittance")):
-        table = box_tables()[f"box_{kind}"].read(whole / LABELS / f"{kind}.parquet")
-        numbers = table[2, "front"][name]
-        np.testing.assert_array_equal(sample["boxes"][name], numbers)
-        np.testing.assert_array_equal(live["boxes"][name], numbers)
-    assert sample["paths"]["snow"].endswith("snow/front/000002.png")
-    assert sample["weather"]["snow_depth_m"] == 0.0
-    assert collate_frames([sample, live])["snow"].shape == (2, 16, 24)
 
 
 def test_all_comes_through_smog_without_density(tmp_path: Path) -> None:
@@ -411,24 +338,19 @@ def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
         assert ((left >= 0) & (left <= 1) & (left <= numbers["transmittance"])).all()
 
 
-FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
-
-
 # ---- Where snow can lie: found once a job, used again by later jobs ------------------------------
 
 
 class Placements(list):
-    """Stands in for finding a bed: lists (settings, cameras) of every call.
+    """Stands in for finding a bed: lists the cameras of every call. fails: what it raises."""
 
-    before: what to do at each call.
-    """
-
-    before: Callable[[], None] = staticmethod(lambda: None)
+    fails: Exception | None = None
 
     def __call__(self, scene, cameras, settings, *, backend="auto", progress=False):
-        self.before()
-        self.append((settings, list(cameras)))
-        return make_bed(len(self[-1][1]) + settings.cell_m)
+        if self.fails is not None:
+            raise self.fails
+        self.append(list(cameras))
+        return make_bed(len(self[-1]) + settings.cell_m)
 
 
 @pytest.fixture
@@ -442,30 +364,9 @@ def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
     return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
 
 
-def files_of(out: Path) -> list[Path]:
-    return [path for pattern in FILES for path in out.rglob(pattern)]
-
-
-def test_a_bed_is_found_for_all_cameras_before_any_file(placements, tmp_path: Path) -> None:
-    placements.before = lambda: placements.append(files_of(tmp_path))
-    job = RenderJob("fake:street", [snowy()], tmp_path, frames=[1], cameras=["front"])
-    result = run(job)
-    assert result.written == 1 and result.timings["prepare"] > 0
-    before, (settings, cameras) = placements
-    assert before == []
-    assert settings == PlacementSettings(cell_m=0.05, max_slope_deg=50.0)
-    expected = [camera for k in range(4) for camera in make_frame(k).cameras.values()]
-    assert [(c.name, c.timestamp_ns) for c in cameras] == [
-        (c.name, c.timestamp_ns) for c in expected
-    ]
-    # The other images need no second search.
-    assert run(dataclasses.replace(job, frames=None, cameras=None)).written == 7
-    assert len(placements) == 2
-
-
 def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> None:
     run(RenderJob("fake:street", [snowy(0.1)], tmp_path))
-    placements.before = pytest.fail
+    placements.fails = AssertionError("searched again")
     result = run(RenderJob("fake:street", [snowy(0.3, 1)], tmp_path), bed_render)
     assert (result.written, result.failures) == (8, ())
 
@@ -473,12 +374,9 @@ def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> 
 def test_where_there_can_be_no_snow_nothing_is_written_or_replaced(
     placements, tmp_path: Path
 ) -> None:
-    def fails() -> None:
-        raise SceneError("scene 'street' does not know its metres")
-
     run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
     before = tree_digest(tmp_path)
-    placements.before = fails
+    placements.fails = SceneError("scene 'street' does not know its metres")
     for overwrite, variant in ((False, 1), (True, 0)):
         job = RenderJob("fake:street", [snowy(0.1, variant)], tmp_path, overwrite=overwrite)
         with pytest.raises(SceneError, match="does not know its metres"):
@@ -501,25 +399,12 @@ def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
     load = {"scene_loader": lambda _uri: scene}
     run(RenderJob("fake:street", [snowy()], tmp_path / "path", camera_path=path), render, **load)
     run(RenderJob("fake:street", [snowy()], tmp_path / "own", frames=[0]), render, **load)
-    assert [len(cameras) for _, cameras in placements] == [1, 8]
+    assert [len(cameras) for cameras in placements] == [1, 8]
     assert [bed.ground.centers_m[0, 0].item() for bed in found] == pytest.approx([1.05, 8.05, 8.05])
     # A path's job after it neither takes the scene's bed nor leaves its own.
     run(RenderJob("fake:street", [snowy()], tmp_path / "path2", camera_path=path), render, **load)
     assert found[-1].ground.centers_m[0, 0].item() == pytest.approx(1.05)
     assert beds.support_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
-
-
-def test_live_samples_share_one_search(placements) -> None:
-    scene = open_fake("fake:street")
-    live = SceneDataset(scene, snowy(), renderer=bed_render, frames=[0])
-    assert len(placements) == 1 and len(placements[0][1]) == 8
-    images = [live[k]["image"] for k in range(2)]
-    assert len(placements) == 1
-    state = {name: value for name, value in vars(live).items() if name != "scene"}
-    again = SceneDataset.__new__(SceneDataset)
-    again.__setstate__({**state, "scene": open_fake("fake:street")})  # as a worker receives it
-    placements.before = pytest.fail
-    assert all(torch.equal(again[k]["image"], images[k]) for k in range(2))
 
 
 @pytest.mark.long
@@ -544,25 +429,18 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
 # ---- Maps of styles: found once a job, and what renders its images again -------------------------
 
 
-class Searches(list):
-    """Stands in for working out maps: lists (style, cameras) of every call.
-
-    before: what to do at each call. The maps say how strong the style is and how many cameras.
-    """
-
-    before: Callable[[], None] = staticmethod(lambda: None)
-
-    def __call__(self, scene, style, cameras):
-        self.before()
-        self.append((style, cameras))
-        return make_maps(style.strength + (0 if cameras is None else 0.01 * len(cameras)))
-
-
 @pytest.fixture
-def searches(monkeypatch: pytest.MonkeyPatch) -> Searches:
-    found = Searches()
-    monkeypatch.setattr(scene_maps, "_find_maps", found)
-    return found
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[Exception]:
+    """Working out maps costs nothing, or raises what is in the list."""
+    fails: list[Exception] = []
+
+    def find_maps(scene, style, cameras):
+        if fails:
+            raise fails[0]
+        return make_maps(style.strength)
+
+    monkeypatch.setattr(scene_maps, "_find_maps", find_maps)
+    return fails
 
 
 def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
@@ -572,18 +450,6 @@ def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
 
 def run_styled(job: RenderJob, renderer=style_render) -> JobResult:
     return run(job, renderer)
-
-
-def reds(out: Path) -> dict[str, set[int]]:
-    """The second pixel's red in the images of every variant."""
-
-    def red(path: Path) -> int:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        assert image is not None
-        return int(image[0, 1, 2])
-
-    folders = (out / "street").glob("*-*")
-    return {folder.name: set(map(red, folder.glob("images/*/*.png"))) for folder in folders}
 
 
 def image_at(path: Path, colour: int = 90) -> str:
@@ -596,29 +462,10 @@ def image_at(path: Path, colour: int = 90) -> str:
     return str(path)
 
 
-def test_maps_are_found_once_for_all_images_before_any_file(searches, tmp_path: Path) -> None:
-    searches.before = lambda: searches.append([p for p in tmp_path.rglob("*") if p.suffix])
-    recipes = [styled(0.5), styled(0.5, 1), styled(0.25, 2), make_recipe("clear")]
-    job = RenderJob("fake:street", recipes, tmp_path, frames=[1], cameras=["front"])
-    result = run_styled(job)
-    assert result.written == 4 and result.timings["prepare"] > 0
-    before, (first, cameras), _, (second, _) = searches
-    assert before == [] and (first, second) == (recipes[0].style, recipes[2].style)
-    assert cameras is None, "a selection does not count"
-    found = reds(tmp_path)
-    del found["clear-000"]
-    assert found == {"fog-000": {50}, "fog-001": {50}, "fog-002": {25}}
-    assert run_styled(dataclasses.replace(job, frames=None, cameras=None)).written == 28
-    assert reds(tmp_path)["fog-001"] == {50}
-
-
 def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Path) -> None:
-    def fails() -> None:
-        raise StyleError("sunset.jpg is cut short")
-
     run_styled(RenderJob("fake:street", [make_recipe()], tmp_path / "out", frames=[0]))
     before = tree_digest(tmp_path / "out")
-    searches.before = fails
+    searches.append(StyleError("sunset.jpg is cut short"))
     image = image_at(tmp_path / "sunset.png")
     changed = with_digest(styled(image=image))
     image_at(tmp_path / "sunset.png", 91)
@@ -634,21 +481,6 @@ def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Pa
             with pytest.raises((StyleError, RecipeError), match=message):
                 run_styled(job)
             assert tree_digest(tmp_path / "out") == before
-
-
-def test_the_manifest_says_the_style(searches, tmp_path: Path) -> None:
-    image = image_at(tmp_path / "sunset.png")
-    recipes = [make_recipe(), styled(0.5, 1), styled(2, 2, image=image, method="reinhard")]
-    run_styled(RenderJob("fake:street", recipes, tmp_path / "out", frames=[0], cameras=["front"]))
-    table = read_manifest(tmp_path / "out")
-    names = ("style", "style_method", "style_strength")
-    assert [tuple(row[name] for name in names) for row in table.to_pylist()] == [
-        (None, None, 0.0),
-        ("dusk", "mkl", 0.5),
-        ("sunset.png", "reinhard", 2.0),
-    ]
-    at = table.column_names.index("style")
-    assert table.column_names[at : at + 2] == ["style", "style_method"]
 
 
 def test_the_recipe_in_the_folder_renders_it_again(searches, tmp_path: Path) -> None:
@@ -732,6 +564,7 @@ def test_a_picture_under_another_name_is_the_same_style(searches, tmp_path: Path
         run_styled(RenderJob("fake:street", [other], out), must_not_render)
 
 
+@pytest.mark.long
 def test_the_librarys_own_style_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
     """Real maps and real pictures, whole and in parts that search anew."""
     image, uri = image_at(tmp_path / "sunset.png", 150), "fake:street?frames=2"

@@ -18,12 +18,12 @@ from scipy.integrate import quad
 
 from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium
-from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water, water_reflectance
+from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.effects.lidar.beam import LidarModel, origins_of
 from augment.effects.lidar.sweep import weathered_sweep
-from augment.effects.smog import scatter_before, soft_echo, soft_response, wavelength_factor
+from augment.effects.smog import soft_echo, soft_response, wavelength_factor
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.effect import snow_layers_of
 from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
@@ -34,7 +34,6 @@ from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
 from augment.memo import memo_of
-from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.scene import Scene
 from augment.views import WeatheredView, render_view
 from recipes.flood import Flood, Waves
@@ -300,26 +299,6 @@ def test_denser_smog_leaves_less() -> None:
         assert (dim[dense & thin] <= lit[dense & thin]).all()
 
 
-@pytest.mark.long
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(
-    st.floats(1e-9, 100.0),
-    st.one_of(st.none(), st.floats(0.1, 1e5)),
-    st.floats(-1e4, 1e4),
-    st.integers(0, 2**31),
-)
-def test_extremes_of_smog(sigma: float, height: float | None, base: float, seed: int) -> None:
-    medium = Fog(sigma, (1.0, 1.0, 1.0), height, base)
-    rng = np.random.default_rng(seed)
-    ends = np.array([0.0, 1e-3, 0.9, 0.91, 5.0, 200.0, 1e6])
-    eyes = np.full(7, 1.8)
-    tau = optical_depth_of_arrays(medium, ends, eyes, eyes - 0.01 * ends)
-    assert (tau >= 0).all()
-    found = scatter_before(medium, eyes, ends, MODEL, rng)
-    assert np.isfinite(found.signal).all() and (found.signal >= 0).all()
-    assert (found.ranges_m <= ends).all() and (found.signal[:3] == 0).all()
-
-
 SNOW = Snow(depth_m=0.1)
 FLAT = cells_on_grid(np.zeros((200, 60)), 0.1, corner_m=(0.0, -3.0))
 
@@ -484,17 +463,6 @@ def test_a_clear_flood_shows_its_bed_near_the_car_and_nothing_farther() -> None:
     assert rises[0] < 0 and slanted.any() and (rises[slanted] > 0).all()
 
 
-def test_mud_shows_its_surface_near_by() -> None:
-    sweep = sweep_of(ground_points(np.linspace(1, 90, 100)), intensity=0.2)
-    muddy = Flood(level_m=0.4, reference="absolute", turbidity_ntu=200)
-    out = weathered_sweep(street(), recipe(flood=muddy), 0, sweep)
-    code = out.columns["weather_code"]
-    assert code[0] == SCATTERED and code[-1] == LOST
-    np.testing.assert_allclose(out.points_m[code == SCATTERED][:, 2], 41.5 + 0.4, atol=1e-6)
-    assert water_reflectance(medium(extinction=0.34)) == 0
-    assert 0.05 < water_reflectance(medium(extinction=100.0)) < 0.33
-
-
 def test_a_drowned_sensor_sees_nothing() -> None:
     sweep = sweep_of(some_points(50), intensity=0.2)
     out = weathered_sweep(street(), recipe(flood=2.0), 0, sweep)
@@ -510,15 +478,3 @@ def test_more_water_never_leaves_more() -> None:
         unchanged = out.columns["weather_code"] == UNCHANGED
         assert not (unchanged & ~before).any()
         before = unchanged
-
-
-@pytest.mark.long
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.floats(-50, 1.79), st.floats(0, 1e6), st.floats(1, 3), st.floats(0.0, 1.0))
-def test_extremes_of_water(level: float, extinction: float, index: float, rho: float) -> None:
-    points = np.vstack([some_points(20), [[1e-9, 0, -100], [1e5, 0, 1.7999], [1, 0, 1.8]]])
-    found = meet_water(medium(level, extinction, index), *beams(points), np.full(23, rho))
-    for values in (found.surface_m, found.range_m, found.kept, found.reflectance):
-        assert np.isfinite(values).all() and (values >= 0).all()
-    assert (found.kept <= 1 + 1e-12).all() and (found.reflectance < 0.33).all()
-    assert (found.range_m >= found.surface_m).all()

@@ -299,22 +299,6 @@ def test_every_part_of_the_key_counts() -> None:
     assert len({first(**other) for other in others}) == len(others)
 
 
-def test_neighbouring_keys_are_independent() -> None:
-    frames = np.array([[first(seed=s, frame=f) for f in range(40)] for s in range(25)])
-    flat = np.sort(frames.ravel())
-    steps = np.arange(1, flat.size + 1) / flat.size
-    distance = max((steps - flat).max(), (flat - steps + 1 / flat.size).max())
-    assert distance < 1.95 / math.sqrt(flat.size)  # Kolmogorov: one fair sample in a thousand
-    pairs = np.corrcoef(frames[:, :-1].ravel(), frames[:, 1:].ravel())[0, 1]
-    assert abs(pairs) < 4 / math.sqrt(25 * 39)  # a correlation's four standard deviations
-
-
-def test_the_global_state_is_not_touched() -> None:
-    before = np.random.get_state(legacy=False)["state"]["key"].tobytes()  # noqa: NPY002
-    rng_for(**KEY).random(10)
-    assert np.random.get_state(legacy=False)["state"]["key"].tobytes() == before  # noqa: NPY002
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

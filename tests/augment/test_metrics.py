@@ -174,6 +174,8 @@ def test_bad_depths_are_refused():
         depth_errors(np.ones(3), np.array([0, 1, np.inf]))
 
 
+# ---- consistency of views ------------------------------------------------------------------------
+
 WALL_M = 8.0
 
 
@@ -288,30 +290,7 @@ def test_a_board_goes_along_with_its_box(apart):
     assert wrong.rmse == pytest.approx(0.2 * apart_m * np.sqrt(2 / 3), rel=0.05)
 
 
-def test_the_surroundings_of_a_moving_board_do_not_count():
-    """Half a metre around it, in both pictures: shadows and what reaches beyond the label."""
-    a, b = wall_view(driving_camera(0)), wall_view(driving_camera(1))
-    for view in (a, b):  # a floor under the board, painted as its shadow
-        gap = np.abs(view.depth_m - 6.2) < 1
-        below = np.zeros_like(gap)
-        below[1:] = gap[:-1] & ~gap[1:]
-        view.depth_m[below] = 6.2
-        view.picture[below] = 0.0
-    carried = carry(ActorPaths(board_boxes(FRAMES)), a, b)
-    shadow = (a.picture == 0).all(-1)
-    assert shadow.any() and np.isnan(carried.points_m[shadow]).all()
-    assert carried.unclear_b[(b.picture == 0).all(-1)].all()
-
-
-def test_what_moves_and_whose_pose_is_not_known_does_not_count():
-    """The second picture is taken half a frame after the last label."""
-    late = dataclasses.replace(driving_camera(2), timestamp_ns=2 * FRAME_NS + FRAME_NS // 2)
-    a, b = wall_view(driving_camera(1)), wall_view(late)
-    carried = carry(ActorPaths(board_boxes(3)), a, b)
-    on_board = a.depth_m < 7
-    assert not carried.moved.any() and np.isnan(carried.points_m[on_board]).all()
-    assert np.isfinite(carried.points_m[:, :5]).all()
-
+# ---- LPIPS ---------------------------------------------------------------------------------------
 
 SIZE = 40
 # torchvision's `features` as its own lists have them: channels, and M for a pooling.
@@ -485,11 +464,3 @@ def test_other_files_are_refused(tmp_path):
     torch.save([torch.zeros(1)], tmp_path / "list.pth")
     with pytest.raises(MetricError, match="holds a list and not a state dict"):
         load_lpips(tmp_path / "list.pth")
-
-
-def test_small_pictures_are_refused(alex):
-    network = Lpips(ALEX, alex)
-    small = torch.zeros(1, 3, 31, 31)
-    assert float(network(small, small)) == 0
-    with pytest.raises(ValueError, match="H, W >= 31 for alex"):
-        network(small[..., 1:], small[..., 1:])

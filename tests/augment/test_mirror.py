@@ -299,19 +299,6 @@ def test_links_within_the_dataset_stay_links(source, out):
     assert trees.mirror(source, out).changed == 0
 
 
-def test_images_that_are_named_through_a_link(source, tmp_path):
-    """As a dataset whose camera folder is a link: the image stands where it really is."""
-    (source / "camera/front").rename(source / "images")
-    (source / "camera/front").symlink_to("../images")
-    out = tmp_path / "out"
-    trees.render(source, out)
-    before = trees.snapshot(source)
-    done = trees.mirror(source, out)
-    assert (done.folder / "images/02.png").samefile(image_of(out, "front", 2))
-    assert trees.listing(done.folder) == trees.listing(source)
-    assert trees.snapshot(source) == before
-
-
 def test_own_entries_may_lie_elsewhere(source, tmp_path):
     """What people do whose disks are full; a link below them may lead to another of them."""
     (source / "camera").rename(tmp_path / "disk")
@@ -433,18 +420,6 @@ def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
     before = trees.snapshot(done.folder)
     assert trees.mirror(source, out).changed == 0
     assert trees.snapshot(done.folder) == before
-
-
-def test_resized_images_follow_what_they_were_made_from(source, tmp_path):
-    out = tmp_path / "out"
-    trees.render(source, out, scale=0.5)
-    done = trees.mirror(source, out)
-    image, recorded = image_of(out, "front", 0), source / "camera/front/01.png"
-    cv2.imwrite(str(image), np.full((8, 12, 3), 77, np.uint8))  # rendered anew
-    cv2.imwrite(str(recorded), np.zeros((10, 14, 3), np.uint8))  # of another size now
-    assert trees.mirror(source, out).changed == 2
-    assert (cv2.imread(str(done.folder / "camera/front/00.png")) == 77).all()
-    assert cv2.imread(str(done.folder / "camera/front/01.png")).shape == (10, 14, 3)
 
 
 def test_grey_images_stay_grey(source, tmp_path):

@@ -18,7 +18,7 @@ from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 from augment.sky import CubemapSky
-from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose, stack
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 DEFAULT = RasterSettings()
@@ -265,19 +265,6 @@ def test_tiles_that_close_long_before_their_list_ends():
     assert hidden.sum() > 300  # what closed tiles hide gets exactly nothing
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("count", [32, 33])
-def test_lists_about_as_long_as_a_batch(count):
-    """Faint splats that all cover both tiles: no pixel closes before the end of the list."""
-    gaussians = dataclasses.replace(
-        crowd(count, opacity=0.03),
-        means=torch.stack([torch.linspace(3, 6, count), torch.zeros(count), torch.zeros(count)], 1),
-        scales=torch.linspace(2.0, 3.0, 3 * count).reshape(count, 3).contiguous(),
-    )
-    found = assert_gradients_match(posed(gaussians), camera_ahead(24, 16))
-    assert np.abs(found[0]["opacities"]).all()
-
-
 def degenerate() -> dict[str, Gaussians]:
     """Gaussians at the edges of what can be drawn, by name; sixty of each."""
     base = random_gaussians(60, seed=7, sh_degree=2, size=0.4)
@@ -344,17 +331,6 @@ def test_alphas_that_are_clamped_do_not_move():
     assert_gradients_match(posed(random_gaussians(100, size=0.5)), camera, settings, max_flips=1)
 
 
-def test_gaussians_about_the_near_plane():
-    """Those nearer than near_m are culled and get nothing; z is x here, to the bit."""
-    x = torch.tensor([0.5, np.nextafter(np.float32(2), np.float32(0)).item(), 2.0, 2.5])
-    base = stack(*(one_gaussian(opacity=0.5, scale=0.2) for _ in range(4)))
-    means = torch.stack([x, torch.linspace(-0.1, 0.1, 4), torch.zeros(4)], 1)
-    parts = posed(dataclasses.replace(base, means=means))
-    settings = RasterSettings(near_m=2.0)
-    found = assert_gradients_match(parts, camera_ahead(17, 9), settings)
-    assert (np.abs(found[0]["opacities"]) > 0).tolist() == [False, False, True, True]
-
-
 def test_equal_depths_keep_the_order_of_their_index():
     """Forty splats at one z, alternately of two colours, in two parts."""
     rng = np.random.default_rng(3)
@@ -401,27 +377,6 @@ def test_same_bits_for_any_number_of_threads_and_every_time():
         for actual, expected in zip(run, runs[0], strict=True):
             for name in FIELDS:
                 assert np.array_equal(actual[name], expected[name]), name
-
-
-def test_two_renders_in_one_loss_keep_apart():
-    """Each keeps its own record of what it drew, whatever is rendered before its gradients."""
-    cameras = [camera_ahead(21, 15), camera_ahead(33, 9, yaw=0.2)]
-    parts = posed(random_gaussians(100))
-    separate = [gradients(parts, c, weighting(c, {RGB}))[0] for c in cameras]
-    tracked = leaves(parts)
-    images = [rasterize(tracked, c, backend="cpu").rgb for c in cameras]
-    rasterize(parts, camera_ahead(50, 50), backend="cpu")
-    pairs = zip(images, cameras, strict=True)
-    total = sum((image * weighting(c, {RGB})[RGB]).sum() for image, c in pairs)
-    total.backward(retain_graph=True)
-    for name in FIELDS:
-        together = getattr(tracked[0].gaussians, name).grad.double().numpy()
-        summed = separate[0][name] + separate[1][name]
-        # two float32 gradients added in float32 rather than in float64
-        np.testing.assert_allclose(together, summed, rtol=1e-6, atol=1e-6 * np.abs(summed).max())
-    first = tracked[0].gaussians.means.grad.clone()
-    total.backward()
-    assert torch.equal(tracked[0].gaussians.means.grad, 2 * first)  # the record can be used again
 
 
 LIGHT = SplatShading(torch.ones(60, 3), (0.0, 0.0, 1.0), 0.5)

@@ -31,7 +31,7 @@ import augment
 from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.layout import item_paths, resolve_inside
-from augment.jobs.manifest import read_manifest, write_manifest
+from augment.jobs.manifest import read_manifest
 from augment.jobs.processes import OutputLock, process_mark
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes, read_lidar
@@ -330,13 +330,6 @@ def test_paths_from_a_manifest_must_stay_inside(tmp_path: Path) -> None:
             resolve_inside(root, path)
 
 
-def test_unlabelled_scenes_have_no_label_files(tmp_path: Path) -> None:
-    run(RenderJob("fake:s?unlabelled=1", [make_recipe()], tmp_path, frames=[1]))
-    rows = read_manifest(tmp_path).to_pylist()
-    assert all(row["labels_path"] is None and row["lidar_path"] is None for row in rows)
-    assert not (tmp_path / "s" / "fog-000" / "labels").exists()
-
-
 def test_the_librarys_own_renderer(tmp_path: Path) -> None:
     """`auto` is written down as the backend that it stood for."""
     job = RenderJob(
@@ -349,17 +342,7 @@ def test_the_librarys_own_renderer(tmp_path: Path) -> None:
     assert image.std() > 1  # something of the scene is in it
 
 
-def test_rows_that_are_merged_while_a_job_runs_stay(tmp_path: Path) -> None:
-    """As `generate` does in the same output."""
-    run(RenderJob("fake:other", [make_recipe()], tmp_path / "other"))
-    others, out = read_manifest(tmp_path / "other"), tmp_path / "out"
-    street = RenderJob("fake:street", [make_recipe()], out)
-    run(street, on_outcome=lambda _: write_manifest(out, others))
-    scenes = read_manifest(out)["scene"].to_pylist()
-    assert scenes.count("other") == scenes.count("street") == others.num_rows
-
-
-IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
+# ---- Going on ------------------------------------------------------------------------------------
 
 
 def test_a_complete_job_renders_nothing_and_touches_nothing(copied: Path) -> None:

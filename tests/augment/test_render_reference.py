@@ -16,6 +16,8 @@ from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
 from tests.scenes import (
+    GOLDEN,
+    GOLDEN_MODES,
     camera_ahead,
     golden_view,
     one_gaussian,
@@ -146,34 +148,11 @@ def test_splats_that_cannot_be_seen(mean, opacity):
     assert bool((output.splat_ids == -1).all())
 
 
-@pytest.mark.parametrize("opacity", [1 / 255, 0.00392])
-def test_opacity_at_the_threshold(opacity):
-    gaussian = one_gaussian((4.0, 0, 0), 2.0, opacity, dtype=torch.float64)
-    camera = dataclasses.replace(camera_ahead(8, 8), cx=4.5, cy=4.5)
-    alpha = render(gaussian, camera).alpha
-    expected = opacity if opacity >= 1 / 255 else 0.0
-    assert float(alpha[4, 4]) == pytest.approx(expected, rel=1e-12)
-    assert int((alpha > 0).sum()) == (1 if expected else 0)  # only where the exponent is 0
-
-
 def test_a_splat_at_near_is_drawn_and_one_just_nearer_is_not():
     near = np.float32(0.01)
     for z, drawn in ((near, True), (np.nextafter(near, np.float32(0)), False)):
         output = render(one_gaussian((float(z), 0, 0), 0.001), camera_ahead())
         assert bool(output.alpha.max() > 0) == drawn
-
-
-def test_needles_in_float32():
-    """Long thin splats close to the eye have covariances whose determinant cancels all digits."""
-    camera = camera_ahead()
-    output = {}
-    for dtype in (torch.float32, torch.float64):
-        gaussians = random_gaussians(300, seed=3, dtype=dtype)
-        scales = gaussians.scales * torch.tensor([400.0, 1e-3, 1e-3], dtype=dtype)
-        output[dtype] = render(dataclasses.replace(gaussians, scales=scales), camera)
-    single, double = output.values()
-    # With xx yy - xy^2 the error is 7e-3.
-    assert_images_close(single.alpha, double.alpha, p999=1e-5)
 
 
 # ---- order and stop ---------------------------------------------------------------------------
@@ -293,20 +272,6 @@ def test_each_buffer_alone_equals_itself_among_all():
         assert all(getattr(alone, other) is None for other in BUFFERS if other != name)
 
 
-def test_a_scene_far_from_the_origin_keeps_its_detail_in_float32():
-    """Kilometres out, means have 0.1 mm left; the projection must not lose more."""
-    shift = torch.tensor([2048.0, -4096.0, 32.0])
-    gaussians = random_gaussians(500, sh_degree=1)
-    grid = 2.0**-10  # both places hold these numbers exactly
-    gaussians = dataclasses.replace(gaussians, means=(gaussians.means / grid).round() * grid)
-    moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
-    here = (0.1234567, -0.0765432, 0.0111111)
-    there = tuple(float(a) + float(b) for a, b in zip(here, shift, strict=True))
-    near = render(gaussians, camera_ahead(61, 43, 55.0, position=here))
-    far = render(moved, camera_ahead(61, 43, 55.0, position=there))
-    assert_images_close(far.rgb, near.rgb, p999=1e-4, max_flips=3)
-
-
 # ---- smog -------------------------------------------------------------------------------------
 
 
@@ -333,50 +298,28 @@ def test_smog_with_a_scale_height_uses_world_heights():
     assert float(ratio) == pytest.approx(1 - math.exp(-tau), rel=1e-6)  # midpoint rule
 
 
-GOLDEN = ("edge", "garden_small", "opaque")
-MODES = (
-    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
-    *(f"a99_classic_sh{degree}" for degree in range(4)),
-)
-STORED = {"rgb": RGB, "alpha": ALPHA, "ED": EXPECTED_DEPTH}
+# ---- stored renders ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", GOLDEN_MODES)
 @pytest.mark.parametrize("name", GOLDEN)
-def test_stored_renders(shared_dir, name, mode, dtype):
-    with_sh = mode[-3:-1] == "sh"
-    path = shared_dir / "golden" / f"{name}.npz"
-    parts, camera, arrays = golden_view(path, with_sh=with_sh, dtype=dtype)
-    settings = RasterSettings(
-        alpha_max=0.999 if mode.startswith("a999") else 0.99,
-        antialiased="_aa" in mode,
-        sh_degree=int(mode[-1]) if with_sh else None,
-    )
-    output = rasterize_reference(parts, camera, frozenset(STORED.values()), settings, None)
-    # The files hold float32, so float64 agrees to its rounding of depths up to 4 m, and no pixel
-    # flips. In float32 a handful of 17 010 pixels may land on the other side of a threshold.
-    exact = dtype == torch.float64
-    tolerance = {"p999": 5e-7, "flip": 1e-6} if exact else {"p999": 1e-4, "max_flips": 5}
-    compared = 0
-    for key, buffer in STORED.items():
-        if f"{mode}_{key}" in arrays:
-            expected = arrays[f"{mode}_{key}"]
-            assert_images_close(getattr(output, buffer), expected, **tolerance)
-            compared += 1
-    assert compared == (1 if with_sh else 3)
+def test_stored_renders(shared_dir, name, mode):
+    parts, camera, settings, arrays = golden_view(shared_dir, name, mode, torch.float64)
+    images = {"rgb": RGB, "alpha": ALPHA, "ED": EXPECTED_DEPTH}
+    output = rasterize_reference(parts, camera, frozenset(images.values()), settings, None)
+    for key in arrays.keys() & images.keys():
+        # The files hold float32: rounding of depths of up to 4 m, and no pixel flips.
+        assert_images_close(getattr(output, images[key]), arrays[key], p999=5e-7, flip=1e-6)
 
 
 @pytest.mark.parametrize("name", GOLDEN)
 def test_stored_projections(shared_dir, name):
-    path = shared_dir / "golden" / f"{name}.npz"
-    parts, camera, arrays = golden_view(path, with_sh=False, dtype=torch.float64)
+    parts, camera, _, arrays = golden_view(shared_dir, name, "a999_classic", torch.float64)
     splats = project_parts(parts, camera, RasterSettings())
     # The file's arrays are zero where its renderer culled; this one culls by the image later.
     seen = (arrays["radii"] > 0).all(1)
-    shared = torch.from_numpy(seen)[splats.ids]
     assert set(np.flatnonzero(seen)) <= set(splats.ids.tolist())
-    splats = splats.select(shared)
+    splats = splats.select(torch.from_numpy(seen)[splats.ids])
     ids = splats.ids.numpy()
     xx, xy, yy = splats.covs2d.unbind(1)
     conics = torch.stack([yy, -xy, xx], 1) / splats.dets[:, None]
@@ -386,6 +329,8 @@ def test_stored_projections(shared_dir, name):
     np.testing.assert_allclose(splats.depths, arrays["depths"][ids], rtol=1e-12, atol=1e-12)
 
 
+# ---- gradients -----------------------------------------------------------------------------------
+
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -394,7 +339,10 @@ def render_posed(gaussians, camera, settings=None, smog=None, pose=None):
     return rasterize_reference(parts, camera, frozenset(BUFFERS), settings, smog)
 
 
-@pytest.mark.parametrize("variant", ["classic", "antialiased", "smog"])
+@pytest.mark.parametrize(
+    "variant",
+    ["classic", *(pytest.param(v, marks=pytest.mark.long) for v in ("antialiased", "smog"))],
+)
 def test_gradients_of_every_tensor(variant):
     camera = camera_ahead(4, 3, 7.0)
     gaussians = smooth_gaussians(3, sh_degree=1 if variant == "classic" else 0)
@@ -411,34 +359,3 @@ def test_gradients_of_every_tensor(variant):
     assert bool((image(*tensors)[3] > 0).any())  # the median depth is exercised too
     # 6 decimal steps in float64: central differences are good to about 1e-8
     assert torch.autograd.gradcheck(image, tensors, eps=1e-6, atol=1e-6, fast_mode=False)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_stay_finite_at_every_cut_off(dtype):
-    gaussians = random_gaussians(400, seed=8, dtype=dtype)
-    opacities = gaussians.opacities.clone()
-    opacities[:40] = 1.0
-    opacities[40:80] = 0.0
-    opacities[80:120] = 1 / 255
-    scales = gaussians.scales.clone()
-    scales[120:160] = 1e-12  # the determinant of their covariance underflows in float32
-    scales[160:200] = scales[160:200] * torch.tensor([100.0, 1e-4, 1e-4]).to(dtype)
-    sh = gaussians.sh.clone()
-    sh[200:240, 0] = -5.0  # colours clamped to 0
-    fields = {
-        "means": gaussians.means,
-        "quats": gaussians.quats,
-        "scales": scales,
-        "opacities": opacities,
-        "sh": sh,
-    }
-    tensors = {name: value.clone().requires_grad_() for name, value in fields.items()}
-    smog = Fog(0.05, (0.5, 0.6, 0.7), 10.0)
-    settings = RasterSettings(antialiased=True)
-    output = render_posed(Gaussians(**tensors), camera_ahead(), settings, smog)
-    total = output.rgb.sum() + output.alpha.sum() + output.expected_depth.sum()
-    (total + output.median_depth.sum() + output.mode_depth.sum()).backward()
-    for name, tensor in tensors.items():
-        assert tensor.grad is not None
-        assert bool(torch.isfinite(tensor.grad).all()), name
-        assert float(tensor.grad.abs().max()) > 0, name

@@ -275,6 +275,9 @@ def test_datasets_names_for_objects_have_classes():
     assert {name: class_of_label(name) for name in names} == names
 
 
+# ---- what is worked out once for an owner --------------------------------------------------------
+
+
 class Owner:
     """Hashed by identity."""
 

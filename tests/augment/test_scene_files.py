@@ -33,7 +33,6 @@ from augment.files.scene_file import (
 )
 from augment.geometry import multiply_quats
 from augment.jobs import atomic as atomic_folder
-from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
 from augment.scene import Actor, ColorWaves, Gaussians, Track
 from augment.sky import ConstantSky, LatLongSky
@@ -73,11 +72,6 @@ def test_a_scene_comes_back_to_the_bit(tmp_path, sky):
     assert again.source == f"scene:{tmp_path / 'a' / 'fit'}"
     assert is_scene_folder(tmp_path / "a" / "fit")
     assert sorted(p.name for p in (tmp_path / "a" / "fit").iterdir()) == sorted(FILES)
-    ours, theirs = (
-        rasterize(s.parts_for(s.frames[0].cameras["ahead"]), camera_ahead()).rgb
-        for s in (scene, again)
-    )
-    assert torch.equal(ours, theirs)
 
 
 def test_equal_scenes_make_equal_files(tmp_path, saved):
@@ -98,45 +92,11 @@ def test_what_else_a_scene_may_be(tmp_path):
     assert load_scene_parts(tmp_path / "fit").actors == ()
 
 
-def test_scenes_of_version_1_still_open(saved):
-    """A document as version 1 wrote it: nothing of what came later is in it."""
-    scene = fitted_scene(image_color_maps={})
-    car, person = scene.actors
-    person = dataclasses.replace(person, track=dataclasses.replace(person.track, max_gap_ns=None))
-    car = dataclasses.replace(car, color_waves=None, colors_in_world=False)
-    scene = dataclasses.replace(scene, actors=(car, person))
-    save_scene(scene, saved)
-    new = json.loads((saved / "scene.json").read_text())
-    keys = ["format", "version", "name", "recorded_source", "working_folder", "world_origin_m",
-            "ground_z_m", "has_metric_scale", "ground", "has_known_gravity", "sky", "color_maps",
-            "background_gaussians", "made_by", "problems", "actors", "frames"]  # fmt: skip
-    old = {key: new[key] for key in keys} | {"version": 1}
-    old["actors"] = [
-        {key: actor[key] for key in ("track_id", "label", "size_m", "gaussians")}
-        | {
-            "track": {
-                k: actor["track"][k] for k in ("hold_ns", "timestamps_ns", "world_from_actor")
-            }
-        }
-        for actor in new["actors"]
-    ]
-    (saved / "scene.json").write_text(json.dumps(old))
-    assert_same(load_scene_parts(saved), scene, but=DIFFERENT)
-
-
 def test_cameras_from_above_stay_so(tmp_path):
     above = dataclasses.replace(camera_ahead(), is_orthographic=True)
     frame = dataclasses.replace(fitted_scene().frames[0], cameras={"ahead": above}, image_paths={})
     save_scene(fitted_scene(frames=(frame,)), tmp_path / "fit")
     assert load_scene_parts(tmp_path / "fit").frames[0].cameras["ahead"].is_orthographic
-
-
-def test_folders_from_before_grounds_were_kept_still_open(saved):
-    document = json.loads((saved / "scene.json").read_text())
-    del document["ground"], document["has_known_gravity"]
-    (saved / "scene.json").write_text(json.dumps(document))
-    scene = load_scene_parts(saved)
-    assert scene.ground is None and scene.has_known_gravity
 
 
 def test_arrays_are_mapped_and_writes_to_them_stay_in_memory(saved):
@@ -153,6 +113,7 @@ def test_image_paths_become_absolute(tmp_path, monkeypatch):
     assert paths == {"ahead": str(tmp_path / "data" / "4.jpg")}
 
 
+@pytest.mark.long
 def test_a_million_gaussians_open_at_once(tmp_path):
     scene = fitted_scene(background=random_gaussians(1_000_000, sh_degree=1))
     save_scene(scene, tmp_path / "fit")
@@ -177,7 +138,7 @@ def test_what_cannot_be_kept_is_refused(tmp_path):
         ({"background": wide}, "saved scenes hold float32; got torch.float64"),
         ({"made_by": {"loss": float("nan")}}, "made_by must hold JSON's own types"),
         ({"made_by": {"config": object()}}, "made_by must hold JSON's own types"),
-        ({"frames": (stretched,)}, "frame 4: a pose must be a rotation and a translation"),
+        ({"frames": (stretched,)}, "frames.0.world_from_ego: .*a pose must be a rotation"),
         ({"made_by": {"name": "\ud800"}}, "made_by must hold JSON's own types"),
         ({"name": "a\0b"}, "name: .*NUL"),
         ({"actors": (waving(1001),)}, "waves of 1001 terms; saved scenes hold 1000"),
@@ -208,10 +169,7 @@ def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path):
     assert not hidden(tmp_path)
 
 
-@pytest.mark.parametrize("exchanges", [True, False])
-def test_replacing_keeps_what_else_is_there(tmp_path, saved, monkeypatch, exchanges):
-    if not exchanges:
-        monkeypatch.setattr(atomic_folder, "_exchange", lambda one, other: False)
+def test_replacing_keeps_what_else_is_there(tmp_path, saved):
     (saved / "report").mkdir()
     (saved / "report" / "curves.png").write_bytes(b"png")
     (tmp_path / "link").symlink_to(saved)
@@ -221,35 +179,24 @@ def test_replacing_keeps_what_else_is_there(tmp_path, saved, monkeypatch, exchan
     assert (tmp_path / "link").is_symlink() and not hidden(tmp_path)
 
 
-@pytest.mark.parametrize("exchanges", [True, False])
-@pytest.mark.parametrize("stop_at", range(6))
-def test_an_error_at_any_moment_leaves_one_of_the_two(
-    tmp_path, saved, monkeypatch, exchanges, stop_at
-):
-    """The calls that change names or flush fail, one after the other."""
-    calls = iter(range(1000))
-    if not exchanges:
-        monkeypatch.setattr(atomic_folder, "_exchange", lambda one, other: False)
+@pytest.mark.parametrize("stop_at", range(4))
+def test_an_error_at_any_moment_leaves_one_of_the_two(tmp_path, saved, monkeypatch, stop_at):
+    """The calls that flush fail, one after the other."""
+    calls, flush = iter(range(1000)), os.fsync
 
-    def failing(do):
-        def call(*args):
-            if next(calls) == stop_at:
-                raise OSError(28, os.strerror(28))
-            return do(*args)
-
-        return call
+    def failing(descriptor):
+        if next(calls) == stop_at:
+            raise OSError(28, os.strerror(28))
+        flush(descriptor)
 
     (saved / "notes.txt").write_text("keep")
-    for name in ("flush_folder", "_exchange"):
-        monkeypatch.setattr(atomic_folder, name, failing(getattr(atomic_folder, name)))
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "rename", failing(os.rename))
-        try:
-            save_scene(fitted_scene(name="new"), saved)
-            failed = False
-        except OutputError as error:
-            assert "the disk is full" in str(error)
-            failed = True
+    monkeypatch.setattr(os, "fsync", failing)
+    try:
+        save_scene(fitted_scene(name="new"), saved)
+        failed = False
+    except OutputError as error:
+        assert "the disk is full" in str(error)
+        failed = True
     assert load_scene_parts(saved).name in (("drive 2", "new") if failed else ("new",))
     monkeypatch.undo()
     save_scene(fitted_scene(name="newest"), saved)
@@ -271,19 +218,6 @@ def test_a_killed_save_is_cleared_by_the_next(tmp_path, saved):
     assert load_scene_parts(saved).name == "drive 2"
     save_scene(fitted_scene(name="new"), saved)
     assert load_scene_parts(saved).name == "new" and not hidden(tmp_path)
-
-
-def test_a_full_disk_is_said(tmp_path, monkeypatch):
-    from augment.files import scene_file as scene_files
-
-    def full(*_):
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(scene_files, "write_tensors", full)
-    for save, name in ((save_scene, "fit"), (save_scene_file, "fit.climategs")):
-        with pytest.raises(OutputError, match="the disk is full"):
-            save(fitted_scene(), tmp_path / name)
-    assert not list(tmp_path.iterdir())
 
 
 # Damaged and hostile folders
@@ -308,6 +242,9 @@ def test_missing_and_damaged_files_are_named(saved, tmp_path):
                 load_scene_parts(hurt)
 
 
+GONE = {"camera": "gone", "timestamp_ns": 0, "rows": [[1.0] * 4] * 3}
+
+
 def change_document(folder: Path, change) -> None:
     raw = json.loads((folder / "scene.json").read_text())
     change(raw)
@@ -318,8 +255,8 @@ def change_document(folder: Path, change) -> None:
     ("path", "value", "message"),
     [
         (("format",), "other", r'"format" must be \'climategs-scene\'; got \'other\''),
-        (("version",), 3, "reads scenes of versions 1 and 2; got 3"),
-        (("version",), [], r"reads scenes of versions 1 and 2; got \[\]"),
+        (("version",), 3, "reads scenes of version 2; got 3"),
+        (("version",), [], r"reads scenes of version 2; got \[\]"),
         (("precision",), "float16", r"background\.quats must be float16; got torch\.float32"),
         (("precision",), "float64", "'float32' or 'float16'; got 'float64'"),
         (("colour_maps",), {}, "colour_maps: Extra inputs are not permitted"),
@@ -329,8 +266,16 @@ def change_document(folder: Path, change) -> None:
         (("actors", 0, "track", "timestamps_ns"), [1, 1, 2], "'car/1': track timestamps"),
         (("actors", 0, "track", "timestamps_ns"), [1, 2], "'car/1': a track needs"),
         (("actors", 0, "track", "timestamps_ns"), [2**63], "less than"),
-        (("actors", 0, "track", "world_from_actor", 1, 0, 0), 9.0, "'car/1': a pose must be"),
-        (("actors", 0, "track", "world_from_actor", 1, 0, 0), 1e300, "'car/1': a pose must be"),
+        (
+            ("actors", 0, "track", "world_from_actor", 1, 0, 0),
+            9.0,
+            "world_from_actor: .*a pose must",
+        ),
+        (
+            ("actors", 0, "track", "world_from_actor", 1, 0, 0),
+            1e300,
+            "world_from_actor: .*a pose must",
+        ),
         (("actors", 0, "track", "max_gap_ns"), 0.5, "max_gap_ns: .*valid integer"),
         (("actors", 0, "color_waves"), None, r"does not know: \['actors\.0\.waves'\]"),
         (("actors", 1, "color_waves"), {"timestamps_ns": [0], "phases": [0.0]}, "lacks actors.1"),
@@ -339,12 +284,12 @@ def change_document(folder: Path, change) -> None:
         (("actors", 0, "color_waves", "phases", 0), 1e300, "less than or equal to"),
         (("image_color_maps", 0, "rows"), [[1.0] * 4] * 2, "at least 3 items"),
         (("image_color_maps", 0, "rows", 0, 0), 1e300, "must be finite"),
+        (("image_color_maps", 0), GONE, "1 images' colour maps are given twice"),
         (
-            ("image_color_maps", 0),
-            {"camera": "gone", "timestamp_ns": 0, "rows": [[1.0] * 4] * 3},
-            "1 images' colour maps are given twice",
+            ("frames", 0, "world_from_ego", 0, 0),
+            -1e308,
+            "frames.0.world_from_ego: .*a pose must be",
         ),
-        (("frames", 0, "world_from_ego", 0, 0), -1e308, "frame 4: a pose must be"),
         (("frames", 0, "cameras", "left", "fx"), -1.0, "camera 'left': fx must be finite and > 0"),
         (("frames", 0, "cameras", "left", "fx"), 1e999, "no number of JSON"),
         (("frames", 0, "cameras", "left", "width"), 10**9, "less than or equal to 100000"),
@@ -387,15 +332,14 @@ def paths_of(value, path=()):
         )
 
 
-VALUES = st.recursive(
+LEAVES = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
-    | st.sampled_from([2**63, -(2**63) - 1, 10**400, 1e308, "\ud800", -0.0]),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner),
-    max_leaves=6,
+    | st.sampled_from([2**63, -(2**63) - 1, 10**400, 1e308, "\ud800", -0.0])
 )  # fmt: skip
+VALUES = LEAVES | st.lists(LEAVES, max_size=4) | st.dictionaries(st.text(max_size=3), LEAVES)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_any_document_is_a_scene_or_a_scene_error(tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "fuzzed"
@@ -485,20 +429,14 @@ def test_undrawable_gaussians_are_left_out_and_counted(saved):
     assert torch.allclose(lengths, torch.ones(47))
 
 
-@pytest.mark.parametrize(
-    "faces",
-    [
-        np.zeros((6, 4, 5, 3), "f4"),
-        np.zeros((5, 4, 4, 3), "f4"),
-        np.zeros((6, 0, 0, 3), "f4"),
-        np.zeros((6, 4, 4, 3), "f8"),
-        np.full((6, 4, 4, 3), np.inf, "f4"),
-    ],
-)
-def test_wrong_skies_are_refused(saved, faces):
-    save_file({"faces": faces}, saved / "sky.safetensors")
-    with pytest.raises(SceneError, match=r"sky\.safetensors: faces"):
-        load_scene_parts(saved)
+def test_wrong_skies_are_refused(saved):
+    for faces in (
+        np.zeros((6, 4, 5, 3), "f4"), np.zeros((5, 4, 4, 3), "f4"), np.zeros((6, 0, 0, 3), "f4"),
+        np.zeros((6, 4, 4, 3), "f8"), np.full((6, 4, 4, 3), np.inf, "f4"),
+    ):  # fmt: skip
+        save_file({"faces": faces}, saved / "sky.safetensors")
+        with pytest.raises(SceneError, match=r"sky\.safetensors: faces"):
+            load_scene_parts(saved)
 
 
 @pytest.fixture
@@ -642,17 +580,11 @@ def test_names_and_failures(tmp_path, file, monkeypatch):
 
 def test_damaged_files_are_named(file):
     data = file.read_bytes()
-    for damaged in (b"", data[:5], data[:100], data[: len(data) // 2], data[:-1], data + b"\0"):
+    cut = [b"", data[:5], data[:100], data[: len(data) // 2], data[:-1], data + b"\0"]
+    lengths = (0, 1, 100_000_001, 2**40, 2**64 - 1)  # which a header claims to have
+    for damaged in (*cut, *(struct.pack("<Q", length) + data[8:] for length in lengths)):
         file.write_bytes(damaged)
         with pytest.raises(SceneError, match=r"fit\.climategs is damaged or no safetensors file"):
-            load_scene_parts(file)
-
-
-def test_a_header_that_claims_too_much_is_refused(file):
-    data = file.read_bytes()
-    for length in (0, 1, 100_000_001, 2**40, 2**64 - 1):
-        file.write_bytes(struct.pack("<Q", length) + data[8:])
-        with pytest.raises(SceneError, match=r"fit\.climategs is damaged"):
             load_scene_parts(file)
 
 
@@ -661,9 +593,9 @@ def test_a_header_that_claims_too_much_is_refused(file):
     [
         (lambda m: m.clear(), r'"format" must be \'climategs-scene\'; got None'),
         (lambda m: m.update(format="pt"), r'"format" must be \'climategs-scene\'; got \'pt\''),
-        (lambda m: m.pop("version"), "scenes of versions 1 and 2; got 'none'"),
-        (lambda m: m.update(version="3"), "scenes of versions 1 and 2; got '3'. A newer one"),
-        (lambda m: m.update(version="2.0"), r"scenes of versions 1 and 2; got '2\.0'"),
+        (lambda m: m.pop("version"), "scenes of version 2; got 'none'"),
+        (lambda m: m.update(version="3"), "scenes of version 2; got '3'. A newer one"),
+        (lambda m: m.update(version="2.0"), r"scenes of version 2; got '2\.0'"),
         (lambda m: m.pop("document"), "its metadata has no 'document'"),
         (lambda m: m.update(document=""), "document is no JSON"),
         (lambda m: m.update(document="[" * 500_000), "document is no JSON"),

@@ -1,4 +1,4 @@
-"""Snow laid on beds made by hand: how deep, where, how closed, what it buries, in which light."""
+"""Snow laid on beds made by hand: how deep, where, how closed, in which light, near the camera."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ import torch
 
 from augment.cameras import Camera, Frame
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.kernels import BARE_M
+from augment.effects.snow.kernels import BARE_M, FARTHEST_M, MAX_SPLITS, REACH, SPREAD, CloseView
 from augment.effects.snow.layer import (
-    OPACITY,
     PRESSED,
     build_snow_layer,
-    field_of,
     find_depths,
     gradient_noise,
     heights_of,
     mottle_of,
-    octaves_of,
     profile_of,
     share_covered,
-    threshold_of,
 )
 from augment.effects.snow.light import (
     Illumination,
@@ -34,16 +30,30 @@ from augment.effects.snow.light import (
     light_of,
     linear_from_display,
 )
-from augment.effects.snow.near_camera import SnowLayers
+from augment.effects.snow.near_camera import (
+    MOTTLE,
+    RELIEF,
+    Crystals,
+    Grain,
+    Layer,
+    SnowLayers,
+    finest_split,
+    shift_m,
+    split_discs,
+    split_near,
+    sun_step,
+    view_limits,
+)
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, LatLongSky, Sky
 from recipes.snow import Snow, SnowLight
+from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
 
 CELL_M = 0.05
@@ -83,15 +93,6 @@ def test_median_depth_on_open_ground_is_the_recipes(depth_m, drift):
     heights = _depths(bed.ground, depth_m=depth_m, wind={"drift": drift}, tracks="never")
     assert abs(np.median(heights) / depth_m - 1) < (0.03 if drift < 1 else 0.06)
     assert heights.min() >= depth_m / 4.1 and heights.max() <= depth_m * 4.1
-
-
-def test_wind_piles_snow_up_before_obstacles_and_takes_it_from_their_lee():
-    options = {"depth_m": 0.1, "wind": {"drift": 0.5, "direction_deg": 90}}
-    before, beside, behind = (
-        np.median(_depths(level_bed(10.0, 0.1, banks=banks).ground, **options))
-        for banks in ((0.0, 0.8), (0.8, 0.0), (0.0, -0.8))
-    )
-    assert before > 1.2 * beside and behind < 0.95 * beside
 
 
 def test_layer_is_rounded_at_open_edges_and_nowhere_else():
@@ -175,38 +176,6 @@ def test_level_layer_lets_no_light_through(depth_m, grain):
         assert _alpha(cover, camera)[inside].min() > 0.98
 
 
-def test_edge_is_as_sharp_as_a_cell():
-    cover = _lay(level_bed(4.0, border=OPEN_EDGE), depth_m=0.02, grain=0.5, tracks="never", seed=1)
-    camera = looking((2, 4, 3), (2, 4, 0), 120, 400, 2000.0)
-    alpha = _alpha(cover, camera).numpy()  # rows run towards -y
-    pixel_m = 2.98 / 2000
-    widths, middles = [], []
-    for column in alpha.T:
-        if column[-1] < 0.9:
-            continue  # a bare patch
-        low, middle, high = ((column > share).argmax() for share in (0.1, 0.5, 0.9))
-        widths.append((high - low) * pixel_m)
-        middles.append((200 - middle) * pixel_m)
-    assert len(widths) > 60
-    assert np.median(widths) < 1.2 * CELL_M and max(widths) < 1.6 * CELL_M
-    assert abs(np.median(middles)) < 0.4 * CELL_M  # from the bed's border
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("depth_m", [0.2, 2.0])
-def test_sides_of_a_deep_layer_are_closed(depth_m):
-    cover = _lay(level_bed(3.0, border=OPEN_EDGE), depth_m=depth_m)
-    height = 0.3 * depth_m
-    camera = looking((1.5, -4 - 3 * depth_m, height), (1.5, 1.5, height), 300, 200, 300.0)
-    rays = camera.ray_directions(torch.float64)
-    hit = camera.centre - camera.centre[1] / rays[..., 1:2] * rays
-    margin = 0.3 + 0.3 * min(depth_m, 1.0)
-    inside = (hit[..., 0] > margin) & (hit[..., 0] < 3 - margin)
-    inside &= (hit[..., 2] > 0.03) & (hit[..., 2] < 0.45 * depth_m)
-    assert inside.sum() > 50
-    assert _alpha(cover, camera)[inside].min() > 0.97
-
-
 def test_discs_lie_in_the_surface_of_a_slope():
     """A plane of 30 degrees: discs' middles above it by the depth, their thin axes along it."""
     slope = math.tan(math.radians(30))
@@ -241,17 +210,6 @@ def test_colours_follow_the_sun_and_stay_between_shade_and_light():
     assert away[2] - away[0] > facing[2] - facing[0] + 0.03  # bluish where the sun is low
 
 
-def test_shadows_of_the_recording_are_bluish_snow_not_dirt():
-    light = np.ones((40, 40))
-    light[:20] = 0.3
-    bed = bed_of_cells(cells_on_grid(np.zeros((40, 40)), CELL_M, light=light))
-    gaussians = _lay(bed, depth_m=0.1).ground.gaussians
-    shaded = _colors(gaussians)[gaussians.means[:, 0] < 0.7].mean(0)
-    lit = _colors(gaussians)[gaussians.means[:, 0] > 1.3].mean(0)
-    assert (shaded - torch.tensor(LIGHT.shadow_rgb)).abs().max() < 0.03
-    assert lit[0] - shaded[0] > lit[2] - shaded[2] + 0.05
-
-
 def test_two_shadings_agree_where_normals_do():
     bed = level_bed(4.0)
     baked = _lay(bed, depth_m=0.1).ground
@@ -266,34 +224,6 @@ def test_two_shadings_agree_where_normals_do():
         FAR_AWAY, looking((2, 2, 3), (2, 2, 0))
     )[-1]
     assert part.is_overlay and part.shading is not None and part.shading.sun == SUN
-
-
-# --- what it buries -------------------------------------------------------------------------------
-
-
-def test_gaussians_are_buried_where_all_their_cells_carry_snow():
-    scene = scene_of(grid_surface(np.zeros((10, 10)), 0.5))
-    before = scene.background.opacities.clone()
-    cells = level_bed(10.0, 0.1).ground
-    rng = np.random.default_rng(0)
-    buried_by = torch.from_numpy(rng.integers(0, len(cells), (60, 5), np.int32))
-    buried_by[:40, 1:] = buried_by[:40, :1]
-    buried_by[::7, 4] = -1
-    cells = dataclasses.replace(
-        cells, buried=torch.arange(20, 80, dtype=torch.int32), buried_by=buried_by
-    )
-    cover = _lay(bed_of_cells(cells), scene, depth_m=0.1, coverage=0.5)
-    snowy = set()
-    for x, y in cover.ground.gaussians.means[:, :2].tolist():  # no disc leaves its cell
-        snowy.add((math.floor(x / 0.1), math.floor(y / 0.1)))
-    places = [tuple(np.floor(c / 0.1).astype(int)) for c in cells.centers_m[:, :2].numpy()]
-    expected = before.clone()
-    for number, row in enumerate(buried_by.tolist()):
-        if all(c >= 0 and places[c] in snowy for c in row):
-            expected[20 + number] = 0
-    assert 5 < (expected == 0).sum() < 55
-    assert torch.equal(cover.ground.opacities, expected)
-    assert torch.equal(scene.background.opacities, before)
 
 
 # --- actors ---------------------------------------------------------------------------------------
@@ -354,40 +284,6 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
 # --- extremes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"depth_m": 1e-12},
-        {"depth_m": 10.0, "wind": {"drift": 1.0}, "sparkle": 1.0},
-        {"depth_m": 0.1, "coverage": 0.001, "shading": "per_pixel"},
-    ],
-)
-def test_extremes_stay_finite(options):
-    for bed in (
-        level_bed(8.0, 0.1, border=OPEN_EDGE),
-        level_bed(CELL_M),
-        level_bed(60.0, 10.0),
-        level_bed(0.01, 0.001),
-        level_bed(2.0, corner_m=(1e6, -1e6)),
-        bed_of_cells(cells_on_grid(np.full((3, 3), np.nan))),
-    ):
-        cover = _lay(bed, **options)
-        snow = cover.ground.gaussians
-        for values in (snow.means, snow.quats, snow.scales, snow.opacities, snow.sh):
-            assert torch.isfinite(values).all()
-        assert (snow.scales > 0).all() and (snow.opacities == OPACITY).all()
-        assert snow.semantic is not None and (snow.semantic == int(SemanticClass.SNOW)).all()
-        if options["depth_m"] == 10.0:
-            assert (len(snow) > 0) == (len(bed.ground) > 0)
-
-
-@pytest.mark.parametrize("options", [{"depth_m": 0.0}, {"depth_m": 0.1, "coverage": 0.0}])
-def test_no_snow_leaves_the_parts_own_tensors(options):
-    cover = _lay(level_bed(2.0), **options)
-    assert not len(cover.ground.gaussians)
-    assert cover.ground.opacities is FAR_AWAY.background.opacities
-
-
 def test_same_bits_for_any_number_of_threads_and_another_seed_is_another_snow():
     bed = level_bed(8.0, 0.1, border=OPEN_EDGE)
     layers = []
@@ -413,15 +309,6 @@ def test_noise_has_unit_deviation_and_median_zero():
     noise = gradient_noise(*_points(400_000), SEED)
     assert abs(noise.std() - 1) < 0.005
     assert abs(np.median(noise)) < 0.01
-
-
-def test_threshold_leaves_the_share_it_was_asked_for():
-    octaves = octaves_of(((2.6, 1.0), (1.1, 0.5), (0.45, 0.3)), np.random.default_rng(5))
-    field = field_of(octaves, *_points(200_000, seed=3))
-    for share in (0.01, 0.5, 0.9):
-        got = (field > threshold_of(octaves, share)).mean()
-        assert abs(got - share) < 0.005  # standard errors 0.0011 here and 0.0014 of the threshold
-    assert threshold_of(octaves, 0.0) == math.inf and threshold_of(octaves, 1.0) == -math.inf
 
 
 def _rugged_cells(corner_m=(0.0, 0.0)):
@@ -462,6 +349,8 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     )
 
 
+# ---- light ---------------------------------------------------------------------------------------
+
 HEIGHT = 180  # a row a degree
 GREY = (0.35, 0.35, 0.35)
 BLUE_SKY = (0.30, 0.45, 0.75)
@@ -497,11 +386,6 @@ def discs(rgb: object, semantic: SemanticClass | None, *, count: int = 30, z: fl
         sh=sh.contiguous(),
         semantic=None if semantic is None else torch.full((count,), int(semantic)).short(),
     )
-
-
-def joined(*parts: Gaussians) -> Gaussians:
-    names = ("means", "quats", "scales", "opacities", "sh", "semantic")
-    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def scene(sky: Sky, ground: Gaussians, frames: tuple[Frame, ...] = ()) -> Scene:
@@ -605,43 +489,6 @@ def test_what_the_recipe_says_holds() -> None:
     check(illumination_of(place, snow(brightness=1.0, albedo=1.0)))
 
 
-def test_the_road_is_asked_first_and_by_area() -> None:
-    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
-    road = discs((0.3, 0.3, 0.3), SemanticClass.ROAD)
-    walls = discs((0.9, 0.1, 0.1), SemanticClass.BUILDING, count=300)
-    pavement = discs((0.6, 0.6, 0.6), SemanticClass.SIDEWALK, count=300)
-    alone = light_of(scene(sky, road))
-    assert alone.ground_albedo == 0.10
-    assert alone.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
-    assert light_of(scene(sky, joined(walls, pavement, road))) == alone
-    few = discs((0.3, 0.3, 0.3), SemanticClass.ROAD, count=5)
-    assert light_of(scene(sky, joined(few, pavement))).ground_albedo == 0.22
-    # a layer of many small dark splats beneath, which nothing sees
-    beneath = discs((0.0, 0.0, 0.0), SemanticClass.ROAD, count=100)
-    small = dataclasses.replace(beneath, scales=0.3 * beneath.scales)
-    faint = dataclasses.replace(beneath, opacities=0.1 * beneath.opacities)
-    for layer in (small, faint):
-        assert light_of(scene(sky, joined(road, layer))) == alone
-
-
-def test_without_classes_level_splats_below_the_cameras_are_ground() -> None:
-    sky = ConstantSky(torch.tensor([0.5, 0.5, 0.5]))
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
-    pose[1, 3] = 1.5  # the eye stands at z = 1.5 m
-    camera = Camera("front", 8, 6, 5.0, 5.0, 4.0, 3.0, pose)
-    frames = (Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": camera}),)
-    below, above = discs((0.3, 0.3, 0.3), None), discs((0.9, 0.9, 0.9), None, count=90, z=4.0)
-    turned = math.sqrt(0.5) * torch.tensor([1.0, 1.0, 0, 0]).repeat(90, 1)
-    upright = dataclasses.replace(discs((0.9, 0.1, 0.1), None, count=90), quats=turned)
-    parts = [below, above, upright]
-    names = ("means", "quats", "scales", "opacities", "sh")
-    everything = Gaussians(*(torch.cat([getattr(p, name) for p in parts]) for name in names))
-    found = light_of(scene(sky, everything, frames))
-    assert found.ground_rgb_linear == pytest.approx((luminance((0.3, 0.3, 0.3)),) * 3, rel=1e-5)
-    assert not found.ground_is_grey
-
-
 def test_any_scene_gives_colours() -> None:
     numbers = ((0.0, 0.0), (0.0, math.nan), (1e-4, 40.0), (7.0, 1.0), (math.nan, 0.5))
     for (sky, road), semantic in itertools.product(numbers, (SemanticClass.ROAD, None)):
@@ -649,3 +496,274 @@ def test_any_scene_gives_colours() -> None:
         place = scene(ConstantSky(torch.full((3,), sky)), discs((road,) * 3, semantic, count=count))
         for recipe in (snow(), snow(albedo=1.0, sun=1.0), snow(brightness=0.0)):
             check(illumination_of(place, recipe))
+
+
+# ---- near the camera -----------------------------------------------------------------------------
+
+CLOSE_CELL_M, OPACITY = 0.05, 0.98
+CLOSE_SUN = torch.tensor([math.cos(0.6), 0.0, math.sin(0.6)], dtype=torch.float64)
+GRAIN = Grain(amount=0.5, contrast=0.4, seed=5)
+
+
+def sheet(first_m=2.0, last_m=8.0, half_m=1.5, color=0.7) -> Gaussians:
+    """Level snow at z = 0, ahead along +x, its discs scattered as those of a layer."""
+    x, y = torch.meshgrid(
+        torch.arange(first_m, last_m, CLOSE_CELL_M),
+        torch.arange(-half_m, half_m, CLOSE_CELL_M),
+        indexing="ij",
+    )
+    count = x.numel()
+    scatter = (
+        0.4
+        * CLOSE_CELL_M
+        * (torch.rand(2, count, generator=torch.Generator().manual_seed(1)) - 0.5)
+    )
+    side = SPREAD * CLOSE_CELL_M
+    return Gaussians(
+        means=torch.stack(
+            [x.flatten() + scatter[0], y.flatten() + scatter[1], torch.zeros(count)], 1
+        ),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor([[side, side, 0.01]]).repeat(count, 1),
+        opacities=torch.full((count,), OPACITY),
+        sh=torch.full((count, 1, 3), (color - 0.5) / SH_C0),
+    )
+
+
+def camera(x_m=0.0, y_m=0.0, z_m=1.4, f=500.0, width=320, height=240) -> Camera:
+    """Looking along +x, 20 degrees down."""
+    tilt = math.radians(20)
+    forward = torch.tensor([math.cos(tilt), 0.0, -math.sin(tilt)], dtype=torch.float64)
+    right = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    centre = torch.tensor([x_m, y_m, z_m], dtype=torch.float64)
+    pose = rigid(rotation, -rotation @ centre)
+    return Camera("close", width, height, f, f, width / 2, height / 2, pose)
+
+
+def picture(*gaussians: Gaussians, view: Camera):
+    parts = [PosedGaussians(g) for g in gaussians]
+    return rasterize(parts, view, buffers=(RGB, ALPHA))
+
+
+def colors(gaussians: Gaussians) -> torch.Tensor:
+    return gaussians.sh[:, 0] * SH_C0 + 0.5
+
+
+def test_what_is_split_covers_what_it_covered():
+    snow, view = sheet(1.0, 7.0), camera(f=900.0, width=640, height=480)
+    near = split_near(snow, None, view, CLOSE_SUN, GRAIN)
+    before, after = picture(snow, view=view), picture(near.whole, near.fine, view=view)
+    inside = before.alpha > 0.99
+    assert int(inside.sum()) > 20_000
+    assert float(after.alpha[inside].min()) > 0.97
+    assert float((before.alpha - after.alpha).abs().mean()) < 0.01
+    tone = (after.rgb[inside].mean() - before.rgb[inside].mean()).abs()
+    assert float(tone) < 0.01  # grain is neither lighter nor darker than the snow
+    assert float(after.rgb[inside].std()) > 3 * float(before.rgb[inside].std())
+
+
+def test_near_discs_are_split_most_and_far_ones_not_at_all():
+    snow, view = sheet(0.8, 14.0, half_m=0.6), camera(f=1500.0, width=960, height=720)
+    near = split_near(snow, None, view, CLOSE_SUN, GRAIN)
+    distance = (near.fine.means - view.centre.float()).norm(dim=1)
+    parts = REACH * SPREAD * CLOSE_CELL_M / near.fine.scales[:, 0]  # into how many, along a side
+    assert float(distance.max()) < FARTHEST_M + CLOSE_CELL_M
+    assert set(parts.round().int().tolist()) <= set(range(2, MAX_SPLITS + 1))
+    close, far = parts[distance < 2.5], parts[distance > 5]
+    assert float(close.mean()) > float(far.mean()) + 0.5
+    wide = camera(f=60.0, width=64, height=48)  # whose pixels are coarser than the discs
+    assert split_near(sheet(4.0, 9.0), None, wide, CLOSE_SUN, GRAIN) is None
+    assert split_near(sheet(11.0, 14.0), None, view, CLOSE_SUN, GRAIN) is None
+
+
+def test_grain_belongs_to_the_place():
+    """Two cameras at one distance from a disc split it into the same discs, of the same colours."""
+    snow = sheet(3.0, 3.05, 0.02)
+    here, there = camera(y_m=0.2, f=900.0), camera(y_m=-0.2, f=900.0)
+    one = split_near(snow, None, here, CLOSE_SUN, GRAIN).fine
+    two = split_near(snow, None, there, CLOSE_SUN, GRAIN).fine
+    assert torch.equal(one.means, two.means)
+    assert torch.allclose(colors(one), colors(two), atol=2e-3)  # 1 cm of difference in the fade
+    assert float(colors(one).std()) > 0.005
+    other = split_near(snow, None, here, CLOSE_SUN, Grain(0.5, 0.4, seed=6)).fine
+    assert not torch.allclose(colors(one), colors(other), atol=2e-3)
+
+
+# ---- Against definitions, and on a GPU -----------------------------------------------------------
+
+WRAP = 0.3
+CLOSE = {"f": 900.0, "width": 640, "height": 480}
+
+
+def near_discs(count: int, seed: int, *, far_m: float = 11.0) -> Gaussians:
+    """Snow ahead of the camera, as far as it is split and farther, of many sizes and colours."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(count, 7, generator=generator)
+    tilt = 0.3 * (drawn[:, 5] - 0.5)
+    zero = torch.zeros(count)
+    return Gaussians(
+        means=torch.stack([1.5 + far_m * drawn[:, 0] ** 2, 4 * drawn[:, 1] - 2, zero], 1),
+        quats=torch.stack([torch.cos(tilt), torch.sin(tilt), zero, zero], 1),
+        scales=torch.stack([0.02 + 0.03 * drawn[:, 2], 0.02 + 0.03 * drawn[:, 3], zero + 0.01], 1),
+        opacities=torch.full((count,), 0.98),
+        sh=((drawn[:, 4:] - 0.5) / SH_C0)[:, None],
+        semantic=torch.full((count,), int(SemanticClass.SNOW), dtype=torch.int16),
+    )
+
+
+def moved(gaussians: Gaussians, shift) -> Gaussians:
+    return dataclasses.replace(gaussians, means=gaussians.means + torch.tensor(shift))
+
+
+def crystals(count: int, seed: int, *, spread_m=6.0) -> Crystals:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform((0, -spread_m, 0), (20, spread_m, 0.1), (count, 3)).astype(np.float32)
+    up, around = rng.random(count), 2 * np.pi * rng.random(count)
+    flat = np.sqrt(1 - up * up)
+    mirrors = np.stack([flat * np.cos(around), flat * np.sin(around), up], 1).astype(np.float32)
+    return Crystals(torch.from_numpy(places), torch.from_numpy(mirrors), 0.9)
+
+
+def snow_layers_of(ground: Layer, **actors: Layer) -> SnowLayers:
+    return SnowLayers(ground, actors, tuple(CLOSE_SUN.tolist()), WRAP, 0.1, GRAIN)
+
+
+def layer(gaussians: Gaussians, own: int = 3, **options) -> Layer:
+    return Layer(gaussians, torch.ones(own), **options)
+
+
+def drawn_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Those with an opacity, by place: the GPU lists them in an order of its own."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    held = {name: held_by_or_own(getattr(gaussians, name)).numpy() for name in names}
+    shown = np.flatnonzero(held["opacities"] > 0)
+    order = shown[np.lexsort(np.round(held["means"][shown], 4).T)]
+    return {name: values[order] for name, values in held.items()}
+
+
+def held_by_or_own(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.inner if isinstance(tensor, AwayTensor) else tensor.cpu()
+
+
+def assert_alike(found: Gaussians, expected: Gaussians, *, flips=0, opacity=0.0) -> None:
+    """flips: of splats whose noise may be of another texel. opacity: how far those of glints may be
+    off: a lobe is narrow, and its rim steep.
+    """
+    a, b = drawn_of(found), drawn_of(expected)
+    for name, values in b.items():
+        assert a[name].shape == values.shape, name
+        # Places lie metres from the origin, of which float32 tells 1e-7.
+        atol = opacity if name == "opacities" else 2e-6
+        wrong = np.abs(a[name] - values).reshape(len(values), -1).max(1, initial=0) > (
+            atol + 2e-7 * np.abs(values).reshape(len(values), -1).max(1, initial=0)
+        )
+        assert wrong.sum() <= (flips if name == "sh" else 0), f"{name}: {wrong.sum()}"
+
+
+def count_splits(snow: Gaussians, view: Camera) -> np.ndarray:
+    """Into how many discs along each side every disc is split: what the kernel computes."""
+    means = snow.means.double().numpy()
+    x, y, z = (means @ view.camera_from_world[:3, :3].T.numpy()).T + (
+        view.camera_from_world[:3, 3:].numpy()
+    )
+    far = np.sqrt(x * x + y * y + z * z)
+    left, right, top, bottom = view_limits(view)
+    seen = (z > 0) & (far < FARTHEST_M) & (left * z <= x) & (x <= right * z)
+    seen &= (top * z <= y) & (y <= bottom * z)
+    side = REACH * snow.scales[:, :2].double().amax(1).numpy()
+    count = np.minimum(np.floor(side / (finest_split(view) * far) + 0.5), MAX_SPLITS)
+    return np.where(seen & (count > 1), count, 0).astype(np.int64)
+
+
+@pytest.mark.parametrize("lit", [False, True], ids=["per splat", "per pixel"])
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (4096.0, -2048.0, 64.0)])
+def test_the_kernel_splits_discs_as_its_definition_does(lit, shift):
+    snow, view = (
+        moved(near_discs(300, 1), shift),
+        camera(shift[0], shift[1], 1.4 + shift[2], **CLOSE),
+    )
+    slopes = 0.4 * torch.rand(300, 3, generator=torch.Generator().manual_seed(9)) if lit else None
+    kept = snow.opacities.clone()
+    found = split_near(snow, slopes, view, CLOSE_SUN, GRAIN)
+    splits = count_splits(snow, view)
+    chosen = np.flatnonzero(splits)
+    assert 40 < len(chosen) < 260
+    numbers = CloseView(
+        *(view.centre, torch.from_numpy(sun_step(CLOSE_SUN.numpy()))),
+        torch.from_numpy(shift_m(GRAIN.seed)),
+        *(GRAIN.amount * GRAIN.contrast * RELIEF, GRAIN.amount * MOTTLE, finest_split(view)),
+    )
+    total = int((splits**2).sum())
+    picked = torch.from_numpy(chosen), torch.from_numpy(splits[chosen])
+    expected = split_discs(snow, slopes, *picked, total, numbers)
+    assert torch.equal(snow.opacities, kept)
+    assert torch.equal(found.whole.opacities, expected.whole.opacities)
+    assert int((found.fine.sh[:, 0].std(0) > 0.01).sum()) == 3
+    for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
+        # Both count in float64 and round once: a last bit may differ.
+        pair = getattr(found.fine, name), getattr(expected.fine, name)
+        torch.testing.assert_close(*pair, rtol=2e-7, atol=1e-7)
+    if lit:
+        torch.testing.assert_close(found.fine_slopes, expected.fine_slopes, rtol=2e-7, atol=1e-7)
+
+
+def yawed(angle: float, x: float, y: float) -> torch.Tensor:
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
+    return rigid(turn, torch.tensor([x, y, 0.5], dtype=torch.float64))
+
+
+@pytest.fixture
+def glinting_street():
+    """Snow on the ground and on two vehicles, all of which glints."""
+    normals = torch.nn.functional.normalize(
+        torch.tensor([[0.0, 0.3, 1.0]])
+        + 0.5 * torch.rand(70, 3, generator=torch.Generator().manual_seed(4)),
+        dim=1,
+    )
+    ground = layer(moved(near_discs(300, 6), (12.0, 0.0, 0.0)), crystals=crystals(1500, 7))
+    cars = {
+        name: layer(
+            near_discs(count, seed, far_m=2.0),
+            own=2,
+            slopes=0.3 * torch.ones(count, 3),
+            normals=normals[:count],
+            crystals=crystals(count, seed, spread_m=1.0) if seed == 8 else None,
+        )
+        for name, count, seed in (("a", 70, 8), ("b", 33, 9))
+    }
+    own = {2: near_discs(2, 3), 3: near_discs(3, 4)}
+    actors = tuple(
+        Actor(name, "car", own[2], Track(torch.tensor([0, 10]), torch.stack([pose, pose])),
+              (2.0, 2.0, 1.0))
+        for name, pose in (("a", yawed(0.7, 3.0, 1.0)), ("b", yawed(-2.0, 5.0, -2.0)))
+    )  # fmt: skip
+    return scene_of(own[3], actors), snow_layers_of(ground, **cars)
+
+
+def test_a_street_full_of_snow_is_the_cpus(glinting_street, monkeypatch):
+    """Lit by normals, glinting, in parts that are turned: the same parts in the same order."""
+    scene, cover = glinting_street
+    expected = cover.parts_for(scene, camera(**CLOSE))
+    with pretended_gpu(monkeypatch):
+        found = cover.parts_for(scene, camera(**CLOSE), backend="cuda")
+        again = cover.parts_for(scene, camera(**CLOSE), backend="cuda")
+    assert len(expected) == 3 + 1 + 1 + 2 + 1  # own; ground and glints, twice that or no glints
+    # A part whose crystals all face away is listed all the same, without one that shows.
+    assert [(p.instance_id, p.is_overlay) for p in found] == [
+        (p.instance_id, p.is_overlay) for p in expected
+    ]
+    for a, b, c in zip(found, expected, again, strict=True):
+        assert_alike(a.gaussians, b.gaussians, opacity=2e-4)
+        assert a.world_from_part is b.world_from_part or torch.equal(
+            a.world_from_part, b.world_from_part
+        )
+        for name in ("means", "opacities", "sh"):
+            one, two = (held_by_or_own(getattr(p.gaussians, name)) for p in (a, c))
+            assert torch.equal(one, two)
+    # What is the part's own is one object from frame to frame, on either side.
+    assert all(a.gaussians is b.gaussians is c.gaussians
+               for a, b, c in zip(found[:3], expected[:3], again[:3], strict=True))  # fmt: skip
+    glints = found[4].gaussians
+    assert 0 < int((held_by(glints.opacities) > 0).sum()) < 60

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.effects.snow import height_map as in_threads
-from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
-from augment.effects.snow.height_map import in_order
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
     WHEEL_SHARE,
@@ -26,7 +21,6 @@ from augment.effects.snow.placement import (
 )
 from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
 from augment.effects.snow.surface import is_vehicle
-from augment.effects.snow.surface_kernels import OPEN
 from augment.errors import OutputError, SceneError
 from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
@@ -190,26 +184,6 @@ def test_unknown_scale_or_gravity_and_wrong_settings_are_refused(unchecked) -> N
             PlacementSettings(**{name: value})
 
 
-@pytest.mark.long
-def test_small_gaps_are_bridged_and_posts_stand_out() -> None:
-    ground = sheet((-6, 20), (-8, 8))
-    gap = (ground.means[:, :2] - torch.tensor([5.1, 0.1])).abs().amax(1) < 0.11
-    post = one_gaussian(mean=(7.0, 0.0, 0.7), scale=(0.05, 0.05, 0.3), opacity=0.99)
-    pit = ground.means - torch.tensor([9.1, 0.1, 0.0])
-    means = ground.means.clone()
-    means[(pit[:, :2].abs() < 0.11).all(1), 2] = -1.0
-    broken = dataclasses.replace(ground, means=means).select(~gap)
-    cells = place(drive(broken, post), PlacementSettings(cell_m=0.1)).ground
-    for x in (5.1, 9.1):
-        bridged = within(cells, (x - 0.3, x + 0.3), (-0.2, 0.4))
-        area = float((cells.sizes_m[bridged] ** 2).sum())
-        assert area == pytest.approx(0.36, rel=0.01)
-        assert float(cells.centers_m[bridged, 2].abs().max()) < 0.03
-        assert not bool((cells.neighbours[bridged] == OPEN_EDGE).any())
-    foot = within(cells, (6.95, 7.05), (-0.05, 0.05))
-    assert not bool((foot & (cells.centers_m[:, 2] < 0.3)).any())
-
-
 def hole_at(ground: Gaussians, x: float, y: float, radius: float) -> Gaussians:
     """The ground without its splats about a place."""
     return ground.select((ground.means[:, :2] - torch.tensor([x, y])).norm(dim=1) > radius)
@@ -233,16 +207,6 @@ def test_holes_under_the_path_and_small_ones_are_closed(
         area = float((cells.sizes_m[inside] ** 2).sum())
         assert area == pytest.approx((x + size - max(x - size, 2.5)) * 2 * size, rel=0.15)
         np.testing.assert_allclose(cells.light[inside], 1, atol=0.1)
-
-
-@pytest.mark.parametrize(("height_m", "expected"), [(0.15, False), (0.6, True)])
-def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
-    pavement = [sheet((-6, 20), (1.5, 8), height_m), side_wall(1.5, (-6, 20), (0, height_m))]
-    cells = place(drive(sheet((-6, 20), (-8, 1.5)), *pavement)).ground
-    beside = within(cells, (5, 8), (1.6, 2.2))
-    assert bool((cells.edge_m[beside] < 1).any()) == expected
-    area = float((cells.sizes_m[within(cells, (5, 8), (1, 2))] ** 2).sum())
-    assert expected or area > 2.9
 
 
 @pytest.mark.long
@@ -338,60 +302,12 @@ def test_which_actors_are_vehicles() -> None:
     assert place(walker, PlacementSettings(cell_m=0.2)).actors == {}
 
 
-def test_medians_of_heights() -> None:
-    rng = np.random.default_rng(1)
-    height = rng.normal(size=(9, 11)).astype(np.float32)
-    covered = rng.random((9, 11)) < 0.7
-    out = np.empty_like(height)
-    surface_kernels.median_heights(height, covered, 2, out)
-    for i, j in np.argwhere(covered):
-        window = slice(max(0, i - 2), i + 3), slice(max(0, j - 2), j + 3)
-        assert out[i, j] == pytest.approx(np.median(height[window][covered[window]]), abs=1e-6)
-    assert (out[~covered] == height[~covered]).all()
-
-
-def test_planes_are_found_exactly_and_lines_are_none() -> None:
-    i, j = np.mgrid[:9, :9]
-    height = (0.3 * 0.1 * j - 0.2 * 0.1 * i).astype(np.float32)
-    fitted, slopes = np.empty((9, 9), np.float32), np.empty((9, 9, 2), np.float32)
-    good = np.empty((9, 9), bool)
-    numbers = (2, 0.1, 0.05, 2.0, 0.02)
-    everywhere = np.ones((9, 9), bool)
-    surface_kernels.fit_planes(height, everywhere, *numbers, fitted, slopes, good)
-    assert good[1:-1, 1:-1].all()
-    np.testing.assert_allclose(
-        slopes[good], np.broadcast_to([0.3, -0.2], slopes[good].shape), atol=1e-4
-    )
-    np.testing.assert_allclose(fitted, height, atol=1e-5)
-    ridge = np.zeros((9, 9), bool)
-    ridge[:, 4] = True
-    surface_kernels.fit_planes(height, ridge, *numbers, fitted, slopes, good)
-    assert not good.any()
-
-
-def test_edge_distances_are_those_to_the_nearest_edge() -> None:
-    can_carry = np.zeros((14, 17), bool)
-    can_carry[2:12, 3:15] = True
-    can_carry[5:7, 8] = False  # a hole
-    height = np.zeros(can_carry.shape, np.float32)
-    sides = np.empty((*can_carry.shape, 4), np.int8)
-    surface_kernels.compare_sides(height, height, can_carry, can_carry, 0.1, sides)
-    out = np.empty(can_carry.shape, np.float32)
-    surface_kernels.edge_distances(can_carry, sides, 50.0, out)
-    edges = []
-    for i, j in np.argwhere(can_carry):
-        for side, step in enumerate(((0, -0.5), (0, 0.5), (-0.5, 0), (0.5, 0))):
-            if sides[i, j, side] == OPEN:
-                edges.append((i + step[0], j + step[1]))
-    for i, j in np.argwhere(can_carry):
-        nearest = min(math.hypot(i - a, j - b) for a, b in edges)
-        assert out[i, j] == pytest.approx(nearest, abs=0.1)  # a sweep may miss the very nearest
-
-
 def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
     for field in dataclasses.fields(SnowCells):
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
+
+# ---- supports in files ---------------------------------------------------------------------------
 
 SETTINGS = PlacementSettings(cell_m=0.2)
 
@@ -547,39 +463,3 @@ def test_a_folder_that_cannot_be_written_is_an_error(scene: Scene, tmp_path: Pat
     in_the_way.write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         support_of(dataclasses.replace(scene), SETTINGS, folder=in_the_way)
-
-
-@pytest.fixture(params=[1, 4])
-def threads(request, monkeypatch) -> int:
-    monkeypatch.setattr(in_threads, "thread_count", lambda: request.param)
-    return request.param
-
-
-def test_results_are_in_the_items_order(threads: int) -> None:
-    seen, told = set(), []
-
-    def late_first(item: int) -> int:
-        time.sleep(0.002 * (5 - item))
-        seen.add(threading.current_thread())
-        return item * item
-
-    found = in_order(late_first, range(5), after_each=lambda: told.append(1))
-    assert found == [0, 1, 4, 9, 16]
-    assert len(told) == 5
-    assert (threading.current_thread() in seen) == (threads == 1)
-    assert in_order(late_first, []) == []
-    here = [threading.current_thread()] * 3  # which alone uses a GPU
-    assert in_order(lambda _: threading.current_thread(), range(3), backend="cuda") == here
-
-
-@pytest.mark.usefixtures("threads")
-def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
-    begun = []
-
-    def fails(item: int) -> int:
-        begun.append(item)
-        return 1 // (item - 1)
-
-    with pytest.raises(ZeroDivisionError):
-        in_order(fails, range(1, 500))
-    assert len(begun) < 499

@@ -206,6 +206,8 @@ def test_scenes_without_metres_or_gravity_are_refused_before_anything_is_rendere
     make_plan(recipe_of(snow(depth_m=0.0)), dataclasses.replace(scene, has_metric_scale=False))
 
 
+# ---- labels --------------------------------------------------------------------------------------
+
 ALL = np.full((106, 160), 255, np.uint8)
 
 
@@ -264,6 +266,8 @@ def raised(height_m: float, pitch: float) -> torch.Tensor:
     pose[:3, 3] = -pose[:3, :3] @ torch.tensor([0, 0, height_m], dtype=torch.float64)
     return pose
 
+
+# ---- a street whose true surface is known --------------------------------------------------------
 
 STREET = "procedural:street?seed=3&frames=2&gaussians=110000&parked=4&moving=1&pedestrians=1"
 STREET_CELL_M, REACH_M = 0.1, 10.0

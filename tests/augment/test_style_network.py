@@ -159,6 +159,7 @@ def torchvision_names(state):
     return names | {"classifier.1.weight": torch.zeros(1000, 1280)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", ["lukemelas", "torchvision"])
 def test_imagenet_weights_by_path(b0, scheme, tmp_path):
     own = b0.net.state_dict()
@@ -181,6 +182,7 @@ def test_imagenet_weights_by_path(b0, scheme, tmp_path):
     assert [name for name, value in given.items() if not torch.equal(found[name], value)] == []
 
 
+@pytest.mark.long
 def test_weights_of_another_network(b0, tmp_path):
     path = tmp_path / "weights.pth"
     for content, message in (
@@ -197,6 +199,9 @@ def test_weights_of_another_network(b0, tmp_path):
             torch.save(content, path)
         with pytest.raises(StyleError, match=message):
             load_imagenet_weights(b0, path)
+
+
+# ---- losses and their features -------------------------------------------------------------------
 
 
 def random(*shape, seed=0, dtype=torch.float32) -> torch.Tensor:
@@ -287,31 +292,6 @@ def test_a_constant_picture_has_colours_and_no_edges():
         assert float(colors[0, 0, 0, 0]) == pytest.approx(1.5 / 3**0.5, abs=1e-6)
         assert colors[0, 3:6, 0, 0].tolist() == pytest.approx([0.9, 0.5, 0.1], abs=1e-6)
         assert edges.abs().max() < 1e-6
-
-
-def test_a_ramp_has_one_edge_everywhere():
-    ramp = torch.linspace(0, 1, 64).expand(1, 3, 64, 64)
-    edges = FilterBank()(ramp)[1][..., 2:-2, 2:-2]
-    slope = 2 * 3**0.5 * 2 / 63  # gain, luminance, the pixels of half the size
-    rises, falls = edges[0, :12:3], edges[0, 12::3]  # of luminance, along x, y and diagonals
-    assert torch.allclose(rises[0], torch.tensor(slope), atol=1e-5)
-    assert rises[1].abs().max() < 1e-6 and falls[:2].abs().max() < 1e-6
-    assert torch.allclose(rises[2], torch.tensor(slope / 2**0.5), atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (9, 5), (16, 16)])
-def test_pictures_of_any_size_have_features_with_gradients(shape):
-    picture = random(1, 3, *shape).double().requires_grad_(True)
-    features = FilterBank()(picture)
-    assert len(features) >= 1 and all(torch.isfinite(f).all() for f in features)
-    weights = [random(*f.shape, seed=2).double() for f in features]
-    total = sum((f * w).sum() for f, w in zip(features, weights, strict=True))
-    (gradient,) = torch.autograd.grad(total, picture)
-    step = 1e-6 * torch.randn(picture.shape, dtype=torch.float64)
-    moved = sum((f * w).sum() for f, w in zip(FilterBank()(picture + step), weights, strict=True))
-    assert float((moved - total).detach()) == pytest.approx(
-        float((gradient * step).sum()), rel=1e-4, abs=1e-9
-    )
 
 
 # ---- losses ------------------------------------------------------------------------------------

@@ -268,6 +268,8 @@ def test_resumed_is_uninterrupted_to_the_bit():
         second.load_state(kept, facts)
 
 
+# ---- recolourings and pairs ----------------------------------------------------------------------
+
 STILL = RecolorSettings(*[0.0] * 11)
 
 
@@ -358,6 +360,9 @@ def test_order_of_methods(scored):
     assert full["same"] > max(full["half"], full["below"], full["look"])
     first, again = (score_pairs(closed_method(reinhard_map), scored, repeats=1) for _ in range(2))
     assert first == again != full
+
+
+# ---- on a GPU ------------------------------------------------------------------------------------
 
 
 def test_a_draw_is_the_same_on_every_device(monkeypatch):

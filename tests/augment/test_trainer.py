@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -388,23 +389,6 @@ def test_a_fit_without_depth_or_sky(recorded, changes, depth_weight):
         assert np.isfinite(array).all()
 
 
-def test_views_without_weight_teach_nothing(recorded):
-    empty = recorded.changed(
-        weight=np.zeros((HEIGHT, WIDTH), np.float32), sky=np.zeros((HEIGHT, WIDTH), bool), **NOTHING
-    )
-    trainer = quick(start(), empty)
-    before = {name: getattr(trainer.splats, name).copy() for name in ARRAYS}
-    sky_before = trainer.sky_faces.copy()
-    records = run(trainer, 8)
-    assert all(r.loss == 0 and r.l1 == 0 and r.ssim == 1 for r in records)
-    for name in ("means", "scales", "sh"):
-        assert np.array_equal(getattr(trainer.splats, name), before[name]), name
-    for name in ("quats", "opacities"):  # normalised anew, through the odds and back: roundings
-        got = getattr(trainer.splats, name)
-        np.testing.assert_allclose(got, before[name], rtol=0, atol=1e-6, err_msg=name)
-    assert np.array_equal(trainer.sky_faces, sky_before)
-
-
 def test_an_actor_that_views_do_not_show(recorded):
     """Its track ends before the last two frames: only the first two teach it anything."""
     gone = dataclasses.replace(car(last=1), gaussians=blurred(car().gaussians, 3))
@@ -425,22 +409,7 @@ def test_an_actor_that_views_do_not_show(recorded):
     assert all(math.isfinite(r.loss) for r in records)
 
 
-def test_a_camera_that_sees_nothing(recorded):
-    away = {
-        key: dataclasses.replace(
-            view,
-            camera=dataclasses.replace(
-                camera_ahead(WIDTH, HEIGHT, 32.0, yaw=math.pi), name=key.camera
-            ),
-            **NOTHING,
-        )
-        for key, view in recorded.views.items()
-    }
-    trainer = quick(start(), Recorded(away))
-    records = run(trainer, 8)
-    assert not trainer.splats.age.any() and all(math.isfinite(r.loss) for r in records)
-    assert not np.array_equal(trainer.sky_faces, np.full((6, 4, 4, 3), 0.5, np.float32))
-
+# ---- poses ---------------------------------------------------------------------------------------
 
 NS = 1_000_000_000
 
@@ -471,21 +440,6 @@ def moved(change: np.ndarray) -> np.ndarray:
 def camera_moved(camera, motion: np.ndarray):
     matrix = torch.from_numpy(motion @ camera.camera_from_world.numpy())
     return dataclasses.replace(camera, camera_from_world=matrix)
-
-
-class CameraTimes:
-    """A view source as far as CameraPoses looks at one."""
-
-    def __init__(self, cameras) -> None:
-        self._cameras = {ViewKey(i, camera.name): camera for i, camera in enumerate(cameras)}
-        self.train = tuple(self._cameras)
-        self.test = ()
-
-    def camera(self, key):
-        return self._cameras[key]
-
-    def load(self, key):
-        raise NotImplementedError
 
 
 def test_knots_are_linear_in_time_and_hold_outside():
@@ -543,7 +497,7 @@ def test_a_camera_is_found_again():
     tilt = torch.tensor([1.0, 0.004, -0.006, 0.003], dtype=torch.float64)
     change = rigid(rotmat_from_quat(tilt), torch.tensor([0.05, -0.03, 0.02], dtype=torch.float64))
     start = dataclasses.replace(truth, camera_from_world=change @ truth.camera_from_world)
-    found = CameraPoses(CameraTimes([start]))
+    found = CameraPoses(Recorded({ViewKey(0, "ahead"): SimpleNamespace(camera=start)}))
     assert found.corrected(start) is start  # nothing learnt, nothing changed
     poses, settings, scratch = np.eye(4)[None], RasterSettings(), Scratch()
 
@@ -595,6 +549,8 @@ def test_an_actor_is_pushed_along_its_forces_in_the_world():
     assert track.world_from_actor[0, 1, 3] == pytest.approx(-0.01)
     assert track.world_from_actor[8, 1, 3] == 0.0  # a knot that no view has touched
 
+
+# ---- with gsplat ---------------------------------------------------------------------------------
 
 CONFIG = FitConfig(max_splats=600)
 TUNING = Tuning(sh_every=1, growth=Growth(every=3, start=0.1, stop=0.6))

@@ -26,7 +26,7 @@ from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from tests.scenes import camera_ahead, random_gaussians, random_pose
-from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall
+from tests.snow_scenes import box_car, drive, sheet, side_wall
 
 C0 = 0.28209479177387814  # Y_00
 SKY = (0.3, 0.5, 0.9)
@@ -174,6 +174,8 @@ def test_without_a_map_of_its_own_a_camera_keeps_every_bit(scene):
     assert not np.array_equal(view_of(mapped).rgb, clean.rgb)
 
 
+# ---- what cameras need of a plan -----------------------------------------------------------------
+
 IMAGES = Output(depth="expected", labels=False)
 
 
@@ -256,22 +258,6 @@ def test_actors_keep_their_numbers(surrounded):
     assert view.plan.actors == (2,) and [part.instance_id for part in view.parts] == [0, 2]
     [step] = [s for s in view.plan.steps if s.name == "rasterise"]
     assert "1 of 4 actors (0 absent at this time, 3 out of view)" in step.why
-
-
-def test_reasons_are_the_cameras(surrounded):
-    recipe = Recipe(weather=WEATHERS["both"], output=IMAGES)
-    plan = make_plan(recipe, surrounded)
-    up = around(cameras_of(surrounded)[0])
-    views = [plan_view(plan, surrounded, camera) for camera in up]
-    away = [view for view in views if not view.names]
-    assert away and len(away) < len(views)
-    for view in away:
-        assert {s.name for s in view.steps if s.runs} == {"rasterise", "sky", "depth image"}
-        assert view.buffers == {"rgb", "alpha", "expected_depth"}
-    reasons = {s.name: s.why for s in away[0].steps}
-    assert reasons["flood: bed"] == "no ray of this camera meets the water's plane"
-    assert "can be in view" in reasons["snow: placement and layer"]
-    assert views[0].names == ("snow", "flood")
 
 
 def orthographic(camera: Camera) -> Camera:

@@ -15,22 +15,15 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from recipes.errors import MAX_SHOWN, Problems, RecipeError
+from recipes.errors import MAX_SHOWN, Place, Problems, RecipeError
 from recipes.files import digest_of, read_files, with_digest
 from recipes.load import MAX_BYTES, dump_recipe, load_recipe, parse_recipe, preset_names
+from recipes.ranges import Channels, Choice, Fixed, Normal, TripleLine, Uniform
+from recipes.recipe_file import recipe_file
 from recipes.schema import Recipe
 from recipes.style import Style
-from recipes.template import (
-    Channels,
-    Choice,
-    Fixed,
-    Normal,
-    RecipeTemplate,
-    TripleLine,
-    Uniform,
-    root,
-)
-from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain_value, read_tree
+from recipes.template import RecipeTemplate
+from recipes.yaml_tree import ListNode, MapNode, plain, plain_value, read_tree
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -46,7 +39,7 @@ def smog(field: str) -> str:
 
 def value_of(field: str):
     template = parse_recipe(smog(field), source="r.yaml")
-    return dict(template.values)["weather.smog." + field.split(":")[0]]
+    return template.values["weather.smog." + field.split(":")[0]]
 
 
 S = "r.yaml:4: weather.smog."
@@ -77,31 +70,34 @@ S = "r.yaml:4: weather.smog."
         ("color: [194, 0.2, 0]", "color[0] = 194: must be >= 0 and <= 1; divide 0-255 values by"),
         ("color: [0, 0, {uniform: [0, 2]}]", "color[2].uniform[1] = 2: must be >= 0 and <= 1"),
         ("color: {uniform: [0, [1, 1, 1]]}", "color.uniform[0] = 0: must be [red, green, blue]"),
-        ("color: {uniform: [[0, 0, 0]]}", "must be [from, to], two colours"),
+        ("color: {uniform: [[0, 0, 0]]}", "must be [from, to], each [red, green, blue]"),
         ("color: {normal: {mean: 1}}", "normal is for numbers; a range here is uniform or choice"),
-        ("color: {uniform: [[0, 0, 0], [0, 0, {uniform: [0, 1]}]]}", "the two colours must be wri"),
+        (
+            "color: {uniform: [[0, 0, 0], [0, 0, {uniform: [0, 1]}]]}",
+            "color.uniform[1][2] = {uniform: ...}: must be a nu",
+        ),
         ("probability: 1.5", "probability = 1.5: must be >= 0 and <= 1"),
         ("probability: {uniform: [0, 1]}", "probability = {uniform: ...}: must be a number >= 0 a"),
         # ranges: both ends, mean and options
         ("base_height_m: {uniform: [-1e5, 0]}", "base_height_m.uniform[0] = -1e5: must be >= -1"),
         ("base_height_m: {uniform: [0, x]}", "base_height_m.uniform[1] = 'x': must be a number"),
         ("visibility_m: {uniform: [null, 1]}", "uniform[0] = null: must be a number > 0"),
-        ("base_height_m: {uniform: [3, 1]}", "uniform = [3, 1]: the low end comes first"),
+        ("base_height_m: {uniform: [3, 1]}", "the low end comes first"),
         ("base_height_m: {uniform: [3]}", "base_height_m.uniform = [3]: must be [low, high]"),
-        ("base_height_m: {log_uniform: [0, 1]}", "log_uniform[0] = 0: must be > 0: its logarithm"),
-        ("base_height_m: {normal: [1, 2]}", "must be {mean: ..., std: ..., min: ..., max: ...}"),
-        ("base_height_m: {normal: {mean: 1, std: 1}}", "max: ...}, all four"),
+        ("base_height_m: {log_uniform: [0, 1]}", "log_uniform[0] = 0: must be > 0"),
+        ("base_height_m: {normal: [1, 2]}", "base_height_m.normal = [1, 2]: must be"),
+        ("base_height_m: {normal: {mean: 1, std: 1, min: 0}}", "_m.normal.max: must be given"),
         ("base_height_m: {normal: {mean: 1, std: 1, min: -1e5, max: 2}}", "base_height_m.normal.m"),
         ("base_height_m: {normal: {mean: 1, std: 1, min: 0, max: 1e5}}", "base_height_m.normal.ma"),
-        ("base_height_m: {normal: {mean: 5, std: 1, min: 0, max: 2}}", "base_height_m.normal.mean"),
+        ("base_height_m: {normal: {mean: 5, std: 1, min: 0, max: 2}}", "mean must be from min to"),
         ("base_height_m: {normal: {mean: 1, std: 0, min: 0, max: 2}}", "base_height_m.normal.std"),
-        ("base_height_m: {normal: {mean: 1, std: 1, min: 1, max: 1}}", "base_height_m.normal.max"),
+        ("base_height_m: {normal: {mean: 1, std: 1, min: 1, max: 1}}", "max must be > min"),
         ("base_height_m: {choice: [0, 1, 1e5]}", "choice[2] = 1e5: must be >= -10000"),
         ("base_height_m: {choice: []}", "choice = []: must be a list of at least one option"),
         ("base_height_m: {choice: [0, {uniform: [0, 1e5]}]}", "base_height_m.choice[1].uniform[1]"),
-        ("base_height_m: {choice: [0, 1], weights: [1]}", "weights = [1]: must be 2 numbers, one"),
+        ("base_height_m: {choice: [0, 1], weights: [1]}", "weights must be 2 numbers, one"),
         ("base_height_m: {choice: [0], weights: [x]}", "weights[0] = 'x': must be a number"),
-        ("base_height_m: {choice: [0], weights: [0]}", "weights = [0]: each is 0 or from 1e-9"),
+        ("base_height_m: {choice: [0], weights: [0]}", "each weight is 0 or from 1e-9"),
         ("base_height_m: {choice: [0], weight: [1]}", "base_height_m.weight: no part of a range"),
         ("base_height_m: {uniform: [0, 1], choice: [1]}", "or a range: a mapping with one of"),
         ("base_height_m: {unifrom: [0, 1]}", "no range is called 'unifrom'; did you mean uniform?"),
@@ -211,8 +207,8 @@ def test_right_fields(field: str, value: object) -> None:
 
 def test_whole_numbers_stay_whole_in_ranges() -> None:
     text = "output: {jpeg_quality: {normal: {mean: 80.5, std: 2.5, min: 70, max: 95}}}"
-    ((_, value),) = parse_recipe(text, source="r").values
-    assert repr(value) == "Normal(mean=80.5, std=2.5, low=70, high=95, whole=True)"
+    (value,) = parse_recipe(text, source="r").values.values()
+    assert repr(value) == "Normal(mean=80.5, std=2.5, low=70, high=95)"
 
 
 def test_a_name_is_taken_as_written() -> None:
@@ -222,7 +218,7 @@ def test_a_name_is_taken_as_written() -> None:
 
 def test_aliases_may_repeat_a_range() -> None:
     text = "render: {scale: &r {choice: [0.5, 1]}, near_m: *r}"
-    values = dict(parse_recipe(text, source="r").values)
+    values = parse_recipe(text, source="r").values
     assert values["render.scale"] == values["render.near_m"]
 
 
@@ -235,17 +231,9 @@ def test_variants_without_a_range_are_warned_of(caplog: pytest.LogCaptureFixture
     assert caplog.text == ""
 
 
-def plain(node: Node) -> object:
-    if isinstance(node, ScalarNode):
-        return node.value
-    if isinstance(node, ListNode):
-        return [plain(item) for item in node.items]
-    return {key: plain(value) for key, (_, value) in node.entries.items()}
-
-
 def read(text: str) -> object:
-    problems = Problems("f.yaml")
-    tree = read_tree(text, problems)
+    problems = Problems()
+    tree = read_tree(text, Place("f.yaml"), problems, empty="the file is empty")
     problems.raise_if_any()
     return plain(tree)
 
@@ -286,11 +274,10 @@ def test_keys_are_text_whatever_they_look_like() -> None:
 
 
 def test_lines_count_from_one() -> None:
-    tree = read_tree("# comment\na: 1\nb:\n  - x\n  - y\n", Problems("f"))
-    assert isinstance(tree, MapNode)
-    line, items = tree.entries["b"]
-    assert line == 3 and isinstance(items, ListNode)
-    assert [item.line for item in items.items] == [4, 5]
+    text = "# comment\na: 1\nb:\n  - x\n  - y\n"
+    tree = read_tree(text, Place("f"), Problems(), empty="")
+    assert isinstance(tree, MapNode) and isinstance(items := tree["b"], ListNode)
+    assert [node.place.line for node in (tree["a"], items, *items)] == [2, 3, 4, 5]
 
 
 def test_aliases_stand_for_their_anchor() -> None:
@@ -318,8 +305,8 @@ def test_a_byte_order_mark_is_ignored() -> None:
         ("!x {a: 1}", "f.yaml:1: the tag '!x': tags are not allowed"),
         ("a: 1\n<<: {b: 1}", "f.yaml:2: merge keys (<<) are not read"),
         ("? [a]\n: 1", "f.yaml:1: a key must be plain text"),
-        ("a: *q", "f.yaml:1: *q refers to no anchor above it"),
-        ("a: &q [*q]", "f.yaml:1: *q stands inside its own anchor"),
+        ("a: *q", "f.yaml:1: *q refers to no anchor that ends above it"),
+        ("a: &q [*q]", "f.yaml:1: *q refers to no anchor that ends above it"),
         ("a: 1\nb: \x01", "f.yaml:2: not valid YAML: it holds the character U+0001"),
         ('a: "\\UFFFFFFFF"', "f.yaml:1: not valid YAML"),  # PyYAML lets chr() raise
         ("%YAML 9.1\n--- a", "incompatible YAML document"),
@@ -405,7 +392,7 @@ def test_paths_that_are_no_files(tmp_path: Path) -> None:
 
 
 def test_recipes_need_neither_torch_nor_the_library() -> None:
-    code = "import sys, recipes.load, recipes.load, recipes.json_schema; print(*sys.modules)"
+    code = "import sys, recipes.load, recipes.job; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "augment", "adapters", "tools"} & set(ran.stdout.split())
 
@@ -607,8 +594,8 @@ def test_recipes_made_in_python_get_their_digest(folder: Path) -> None:
     assert full.style.digest == expected and full.style.image == image
     assert full.hash != bare.hash and with_digest(full) == full
     assert read_files(full.style) == {"image": b"an image", "checkpoint": b"a network"}
-    for plain in (Recipe(), Recipe(style=Style(preset="dusk"))):
-        assert with_digest(plain) is plain
+    for without in (Recipe(), Recipe(style=Style(preset="dusk"))):
+        assert with_digest(without) is without
     (folder / "net.safetensors").write_bytes(b"another")
     with pytest.raises(RecipeError, match="one of the files has changed since"):
         with_digest(full)
@@ -629,7 +616,7 @@ def test_what_is_written_from_the_folder_reads_back(folder: Path) -> None:
 
 
 KEYS = sorted(
-    {key for section in root().walk() for key in section.known}
+    {key for section in recipe_file().walk() for key in section.model_fields}
     | {"uniform", "log_uniform", "normal", "choice", "weights", "mean", "std", "min", "max"}
     | {"<<", "visibility_km", "on"}
 )
@@ -660,8 +647,8 @@ FLOW = st.recursive(
     max_leaves=12,
 )
 TOP = st.dictionaries(st.sampled_from(KEYS), FLOW, max_size=5).map(block)
-EFFECTS = root().sections["weather"].sections
-WAVE_KEYS = EFFECTS["flood"].sections["waves"].sections["components"].known
+EFFECTS = recipe_file().INNER["weather"].INNER
+WAVE_KEYS = list(EFFECTS["flood"].INNER["waves"].INNER["components"].model_fields)
 WAVES = st.lists(st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(flow), max_size=3).map(
     lambda items: "{components: [" + ", ".join(items) + "]}"
 )
@@ -669,7 +656,7 @@ WAVES = st.lists(st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(flow),
 
 def effect(name: str, given: dict[str, str], extra: st.SearchStrategy) -> st.SearchStrategy[str]:
     """A recipe of one effect, with what it needs given."""
-    keys = [key for key in EFFECTS[name].known if key not in given and key != "waves"]
+    keys = [key for key in EFFECTS[name].model_fields if key not in given and key != "waves"]
     head = f"weather:\n  {name}:\n"
     fields = st.dictionaries(st.sampled_from(keys), FLOW)
     return st.builds(lambda d, e: block({**given, **d, **e}, head, "    "), fields, extra)

@@ -9,22 +9,22 @@ import pytest
 
 from recipes.flood import Flood
 from recipes.load import load_recipe
+from recipes.ranges import Uniform, as_number
 from recipes.schema import Weather
 from recipes.smog import KOSCHMIEDER
-from recipes.template import Uniform, as_number
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
 def arriving(name: str, distance_m: float) -> tuple[float, float]:
     """Least and greatest share of a colour that arrives from `distance_m` at the base height."""
-    visibility = dict(load_recipe(name).values)["weather.smog.visibility_m"].probes()
+    visibility = load_recipe(name).values["weather.smog.visibility_m"].probes()
     shares = [math.exp(-KOSCHMIEDER * distance_m / as_number(v)) for v in visibility]
     return min(shares), max(shares)
 
 
 def zenith(name: str) -> tuple[float, float]:
-    values = dict(load_recipe(name).values)
+    values = load_recipe(name).values
     shares = [
         math.exp(-KOSCHMIEDER * as_number(height) / as_number(visibility))
         for height in values["weather.smog.scale_height_m"].probes()
@@ -77,7 +77,7 @@ HUB_M, WINDOW_M = 0.3, 0.9
 
 
 def ends(name: str, field: str) -> tuple[float, float]:
-    low, high = dict(load_recipe(name).values)[f"weather.flood.{field}"].probes()
+    low, high = load_recipe(name).values[f"weather.flood.{field}"].probes()
     return as_number(low), as_number(high)
 
 
@@ -133,7 +133,7 @@ TRACKS_TO_M = 0.3  # "auto" draws no tracks in deeper snow
 @pytest.mark.parametrize("name", SNOWS)
 def test_drawn_snow_is_pinned_and_as_deep_as_documented(name: str) -> None:
     first_m, low_m, high_m = SNOWS[name]
-    assert dict(load_recipe(name).values)["weather.snow.depth_m"] == Uniform(low_m, high_m)
+    assert load_recipe(name).values["weather.snow.depth_m"] == Uniform(low_m, high_m)
     variants = [load_recipe(name).resolve(i).weather for i in range(20)]
     snows = [weather.snow for weather in variants if weather.snow is not None]
     assert len(snows) == 20 and all(weather.flood is None for weather in variants)
@@ -164,7 +164,7 @@ STYLES = {
 @pytest.mark.parametrize("name", STYLES)
 def test_styled_presets_are_of_the_styles_documented(name: str) -> None:
     template = load_recipe(name)
-    low, high = dict(template.values)["style.strength"].probes()
+    low, high = template.values["style.strength"].probes()
     rows = [line for line in PAGE.splitlines() if line.startswith(f"| `{name}` |")]
     (row,) = [line for line in rows if f", {low:g} to {high:g} |" in line]
     assert all(f"`{style}`" in row for style in STYLES[name])
@@ -176,10 +176,10 @@ def test_styled_presets_are_of_the_styles_documented(name: str) -> None:
 
 
 def test_weather_of_styled_days() -> None:
-    assert dict(load_recipe("winter-day").values)["weather.snow.depth_m"] == Uniform(0.05, 0.15)
-    low, high = dict(load_recipe("rainy-day").values)["weather.smog.visibility_m"].probes()
+    assert load_recipe("winter-day").values["weather.snow.depth_m"] == Uniform(0.05, 0.15)
+    low, high = load_recipe("rainy-day").values["weather.smog.visibility_m"].probes()
     assert (low, high) == (600, 1500)
-    levels = dict(load_recipe("rainy-day").values)["weather.flood.level_m"]
+    levels = load_recipe("rainy-day").values["weather.flood.level_m"]
     assert levels == Uniform(-0.02, 0.02)
     flood = load_recipe("rainy-day").resolve(0).weather.flood
     assert flood is not None and flood.reference == "median"

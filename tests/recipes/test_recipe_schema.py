@@ -17,15 +17,20 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
-from recipes.json_schema import DIALECT, recipe_json_schema, write_schema
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
+from recipes.ranges import words
+from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
 from recipes.schema import Output, Quality, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.style import Style, style_preset_names
-from recipes.template import CHANNEL, RATE, FieldSpec, Kind, root, words
 
-FIELDS = [spec for section in root().walk() for spec in section.fields.values()]
-NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
+FIELDS = [
+    section.LEAVES[name]
+    for section in recipe_file().walk()
+    for name in section.MODEL.model_fields
+    if name in section.LEAVES
+]
+NUMBERS = [part for leaf in FIELDS if (part := leaf.channel or leaf).is_number]
 
 
 def smoggy(**smog: Any) -> Recipe:
@@ -258,10 +263,10 @@ def test_every_field_is_described() -> None:
     spec=st.sampled_from(NUMBERS),
     value=st.one_of(st.floats(), st.integers(), st.sampled_from([0, 1, 100, 4, 0.9999, 2**63])),
 )
-def test_the_limits_in_messages_are_those_of_the_schema(spec: FieldSpec, value: float) -> None:
+def test_the_limits_in_messages_are_those_of_the_schema(spec: Leaf, value: float) -> None:
     compare = {">": operator.gt, ">=": operator.ge, "<": operator.lt, "<=": operator.le}
     inside = all(compare[sign](value, bound) for sign, bound in spec.limits)
-    right_type = spec.kind is Kind.NUMBER or isinstance(value, int)
+    right_type = spec.kind is float or isinstance(value, int)
     assert spec.accepts(value) == (inside and right_type)
 
 
@@ -275,23 +280,18 @@ def validator() -> Any:
 
 def test_every_field_is_in_the_schema_with_its_description() -> None:
     schema = recipe_json_schema()
-    assert schema["$schema"] == DIALECT
-    for section in root().walk():
-        node = schema
-        for name in filter(None, section.path.split(".")):
-            node = node["properties"][name.removesuffix("[]")]["oneOf"][0]
-            if name.endswith("[]"):
-                assert node["description"].endswith("."), name
-                node = node["items"]
+    assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    for section in recipe_file().walk():
+        node = schema["$defs"][section.__name__] if section.PATH else schema
+        node = node.get("anyOf", [node])[0]  # quality takes a word, too
         assert node["additionalProperties"] is False
-        assert set(node["properties"]) == set(section.known)
-        required = [name for name, spec in section.fields.items() if spec.required]
+        assert set(node["properties"]) == set(section.model_fields)
+        required = [name for name, leaf in section.LEAVES.items() if leaf.required]
         assert node.get("required", []) == required
-        for name, spec in section.fields.items():
-            if name != "version":
-                assert spec.description in node["properties"][name]["description"]
-    visibility = schema["properties"]["weather"]["oneOf"][0]["properties"]["smog"]["oneOf"][0]
-    assert visibility["properties"]["visibility_m"]["description"].endswith("[metres]")
+        for name, leaf in section.LEAVES.items():
+            assert leaf.description in node["properties"][name]["description"]
+    visibility = schema["$defs"]["Smog"]["properties"]["visibility_m"]
+    assert visibility["description"].endswith("[metres]")
 
 
 def test_the_file_is_the_schema(tmp_path: Path) -> None:
@@ -428,12 +428,12 @@ PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="u
 def field_table() -> str:
     """A row for every key of a recipe file, sections in their order."""
     rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
-    for section in root().walk():
-        if section.max_items is not None:
-            path = section.path.removesuffix("[]")
-            allowed = f"a list of up to {section.max_items} mappings, or null"
-            rows.append(f"| `{path}` | {allowed} | `null` | {section.list_description} |\n")
-        for spec in (*section.fields.values(), *section.extra.values()):
+    for section in recipe_file().walk():
+        if section.MAX_ITEMS is not None:
+            path = section.PATH.removesuffix("[]")
+            allowed = f"a list of up to {section.MAX_ITEMS} mappings, or null"
+            rows.append(f"| `{path}` | {allowed} | `null` | {section.LIST_DESCRIPTION} |\n")
+        for spec in section.LEAVES.values():
             known = "" if spec.default is None else f"`{words(spec.default)}`"
             default = "required" if spec.required else "`null`" if spec.nullable else known
             rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")

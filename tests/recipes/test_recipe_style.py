@@ -11,8 +11,9 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.load import parse_recipe
+from recipes.ranges import Choice, NamedFile, Uniform
 from recipes.style import Style, style_preset_names, style_preset_text
-from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
+from recipes.template import RecipeTemplate
 
 
 @pytest.fixture
@@ -115,9 +116,11 @@ def styles(text: str, folder: Path, count: int) -> list[Style | None]:
 
 def test_every_field_takes_ranges(folder: Path) -> None:
     read = template(RANGED, folder)
-    values = dict(read.values)
+    values = read.values
     assert values["style.strength"] == Uniform(0.25, 1)
-    assert values["style.image"] == Choice((Fixed("a.jpg"), Fixed("b.jpg")), (1.0, 1.0))
+    assert values["style.image"] == Choice(
+        (NamedFile("a.jpg", folder), NamedFile("b.jpg", folder)), (1.0, 1.0)
+    )
     assert read.describe_ranges()["style.image"] == "one of a.jpg, b.jpg"
     drawn = [style for style in styles(RANGED, folder, 30) if style is not None]
     assert len({style.strength for style in drawn}) == 30

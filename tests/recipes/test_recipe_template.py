@@ -15,19 +15,10 @@ from hypothesis import strategies as st
 from recipes.errors import RecipeError
 from recipes.flood import Flood, Wave, Waves
 from recipes.load import dump_recipe, parse_recipe
+from recipes.ranges import Channels, Choice, Draws, Fixed, Normal, TripleLine, Uniform, Value
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
-from recipes.template import (
-    Channels,
-    Choice,
-    Draws,
-    Fixed,
-    Normal,
-    RecipeTemplate,
-    TripleLine,
-    Uniform,
-    Value,
-)
+from recipes.template import RecipeTemplate
 
 TEXT = """
 name: foggy
@@ -128,13 +119,12 @@ def test_ranges_in_words() -> None:
 
 def test_a_rule_broken_by_a_draw_is_a_recipe_error() -> None:
     """The last guard, for templates that were not made by the loader."""
-    values = (("weather.smog.visibility_m", Fixed(5.0)), ("weather.smog.color", Fixed("blue")))
-    made = RecipeTemplate("x", "code", values=values, effects=(("weather.smog", 1.0),))
+    smog = {"visibility_m": Fixed(5.0), "color": Fixed("blue")}
+    made = RecipeTemplate("x", "code", given={"weather": {"smog": smog}})
     with pytest.raises(RecipeError, match=r"^code: variant 0: weather.smog.color: Input should"):
         made.resolve(0)
-    values = (("weather.flood.waves.components[1].steepness", Fixed(2.0)),)
-    lists = (("weather.flood.waves.components", 2),)
-    made = RecipeTemplate("x", "code", values=values, lists=lists)
+    waves = {"components": [{}, {"steepness": Fixed(2.0)}]}
+    made = RecipeTemplate("x", "code", given={"weather": {"flood": {"waves": waves}}})
     where = r"variant 0: weather\.flood\.waves\.components\[1\]\.steepness: Input should be less"
     with pytest.raises(RecipeError, match=where):
         made.resolve(0)
@@ -312,13 +302,10 @@ def test_draws_follow_their_distribution(value: Value, cdf, seed: int) -> None:
 @pytest.mark.parametrize(
     ("value", "shares"),
     [
-        (Uniform(1, 4, whole=True), {k: 0.25 for k in (1, 2, 3, 4)}),
+        (Uniform(1, 4), {k: 0.25 for k in (1, 2, 3, 4)}),
+        (Uniform(1, 3, log=True), {k: math.log((k + 1) / k) / math.log(4) for k in (1, 2, 3)}),
         (
-            Uniform(1, 3, whole=True, log=True),
-            {k: math.log((k + 1) / k) / math.log(4) for k in (1, 2, 3)},
-        ),
-        (
-            Normal(2.5, 1.0, 1, 4, whole=True),
+            Normal(2.5, 1.0, 1, 4),
             {
                 k: (NormalDist(2.5).cdf(k + 0.5) - NormalDist(2.5).cdf(k - 0.5))
                 / (NormalDist(2.5).cdf(4.5) - NormalDist(2.5).cdf(0.5))
@@ -355,9 +342,9 @@ class Ends(Draws):
         Normal(0.2, 1e-300, 0.1, 0.3),
         Normal(0.2, 200.0, 0.1, 0.3),
         Normal(0.1, 0.001, 0.1, 0.3),
-        Uniform(1, 3, True),
-        Uniform(1, 3, True, log=True),
-        Normal(2.0, 5.0, 1, 3, True),
+        Uniform(1, 3),
+        Uniform(1, 3, log=True),
+        Normal(2.0, 5.0, 1, 3),
         Uniform(0.5, 0.5),
         Uniform(1 / 3, math.nextafter(1 / 3, 1)),  # rounding to 10 digits would leave the range
     ],
@@ -403,7 +390,7 @@ def test_random_numbers_are_pinned() -> None:
         (Uniform(50.0, 120.0), 99.47355614),
         (Uniform(50.0, 120.0, log=True), 92.83036027),
         (Normal(80.0, 10.0, 50.0, 120.0), 85.45044491),
-        (Uniform(1, 100, True), 71),
+        (Uniform(1, 100), 71),
         (Choice((Fixed("a"), Fixed("b"), Fixed("c")), (1.0, 1.0, 1.0)), "c"),
         (TripleLine((0.0, 0.2, 0.4), (1.0, 0.4, 0.2)), (0.7067650877, 0.3413530175, 0.2586469825)),
     ],

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 from recipes.load import parse_recipe
-from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
+from recipes.ranges import Choice, Fixed, Uniform
+from recipes.template import RecipeTemplate
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -52,10 +53,10 @@ WRONG = {
         ("absorption_per_m: 3", "= 3: must be [red, green, blue], each a number >= 0 and <= 10000"),
         ("absorption_per_m: [1, 2, {uniform: [0, x]}]", "_m[2].uniform[1] = 'x': must be a number"),
         ("absorption_per_m: {uniform: [1, [1, 1, 1]]}", "uniform[0] = 1: must be [red, green, blu"),
-        ("absorption_per_m: {uniform: [[1, 1, 1]]}", "must be [from, to], two triples of rates"),
+        ("absorption_per_m: {uniform: [[1, 1, 1]]}", "must be [from, to], each [red, green, blue]"),
         (
             "absorption_per_m: {uniform: [[1, 1, 1], [2, 2, {uniform: [2, 3]}]]}",
-            "the two triples of rates must be written out, without ranges",
+            "uniform[1][2] = {uniform: ...}: must be a number",
         ),
         ("absorption_per_m: {log_uniform: [1, 2]}", "a range here is uniform or choice"),
         ("waves: breeze", "waves = 'breeze': must be a mapping, with preset, count, direction_deg"),
@@ -101,10 +102,10 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(
 def test_a_flood_without_a_level() -> None:
     missing = "weather.flood.level_m: must be given, a number >= -10000 and <= 10000 (metres)"
     assert problems("seed: 1\nweather:\n  flood: {}") == (f"r.yaml:3: {missing}",)
-    assert problems("weather:\n  flood: {probability: -1}") == (
+    assert set(problems("weather:\n  flood: {probability: -1}")) == {
         "r.yaml:2: weather.flood.probability = -1: must be >= 0 and <= 1",
         f"r.yaml:2: {missing}",
-    )
+    }
     (null,) = problems("weather:\n  flood: {level_m: null}")
     assert null.startswith("r.yaml:2: weather.flood.level_m = null: must be a number >= -10000")
 
@@ -220,7 +221,7 @@ weather:
 
 
 def test_every_field_takes_ranges_at_every_depth() -> None:
-    values = dict(template(RANGED).values)
+    values = template(RANGED).values
     assert values["weather.snow.depth_m"] == Uniform(0.05, 0.2)
     assert values["weather.snow.light.sun"] == Choice((Fixed(None), Fixed(0.5)), (1.0, 1.0))
     weather = [template(RANGED).resolve(i).weather for i in range(30)]

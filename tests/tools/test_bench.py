@@ -1,7 +1,12 @@
-"""The benches: how the harness measures, and one small run of each subject."""
+"""The benches: how the harness measures, one small run of each subject, and the rule of tiers."""
 
+from __future__ import annotations
+
+import dataclasses
+import importlib.machinery
 import importlib.util
 import json
+import math
 import os
 import time
 
@@ -9,22 +14,30 @@ import numpy as np
 import pytest
 import torch
 
+from augment.cameras import Camera
 from augment.errors import ClimateGSError
+from augment.jobs.quality import Trial
 from augment.render.constants import RasterSettings
-from augment.render.reference import project_parts
+from augment.render.reference import blend_weights, order_by_depth, project_parts
 from augment.scene import PosedGaussians
+from recipes.schema import KNOBS, TIERS, knobs_of, settings_of
 from tests.streets import SMALL_STREET, open_street
-from tools.bench import EFFECTS, dataset, fit, flood, jobs, raster, scenes, snow, style
-from tools.bench.harness import (
-    WallClock,
-    peak_mib_in_subprocess,
-    replace_marked,
-    rounds,
-    run_in_subprocess,
-    spread,
-    spread_ratio,
-)
+from tools.bench import EFFECTS, dataset, fit, flood, gpu, jobs, raster, scenes, snow, style, trade
+from tools.bench.gpu import GpuCase, Timing, count_blends, measure
+from tools.bench.harness import WallClock, rounds, run_in_subprocess, spread, spread_ratio
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect, random_scene
+from tools.bench.trade import (
+    DEPTH,
+    JPEG,
+    WHOLE,
+    Standard,
+    Unmeasured,
+    depth_figures,
+    flicker,
+    settings_of_trade,
+    tier_from,
+    trade_recipe,
+)
 from tools.cli import main
 
 
@@ -65,15 +78,6 @@ def test_spreads_are_quantiles_and_ratios_are_taken_pair_by_pair():
     assert spread_ratio([2.0, 9.0, 8.0], [1.0, 3.0, 8.0])["median"] == 2.0
 
 
-def test_a_document_keeps_all_but_what_is_between_its_markers():
-    page = "# Speed\n\n<a>\nof another day\n<b>\n\nEnd.\n"
-    written = replace_marked(page, "<a>", "<b>", "new\n")
-    assert written == "# Speed\n\n<a>\n\nnew\n\n<b>\n\nEnd.\n"
-    assert replace_marked(written, "<a>", "<b>", "new") == written
-    with pytest.raises(ValueError, match="no '<c>'"):
-        replace_marked(page, "<c>", "<b>", "new")
-
-
 @pytest.mark.long
 def test_work_in_a_subprocess_ends_in_a_record_whatever_its_end(capfd):
     assert run_in_subprocess(dict, ({"a": 1},), 60)["a"] == 1
@@ -83,17 +87,6 @@ def test_work_in_a_subprocess_ends_in_a_record_whatever_its_end(capfd):
     assert run_in_subprocess(dict, (), 0) == {"left_out": "no time was left"}
 
 
-@pytest.mark.long
-def test_peak_memory_holds_the_images_and_little_more():
-    extra = peak_mib_in_subprocess(raster.frame_of, (RasterCase(2_000, 1600, 1200),))
-    if extra is None:
-        pytest.skip("/proc does not tell resident memory here")
-    images = 1600 * 1200 * 4 * 4 / 2**20  # rgb and alpha, float32: 29 MiB, and as much again
-    assert 0.95 * images < extra < 4 * images  # for the state of the tiles and scratch
-    with pytest.raises(RuntimeError, match=r"memory of int.*failed"):
-        peak_mib_in_subprocess(int, ("x",))
-
-
 def test_without_the_source_checkout_the_command_says_so(monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main(["bench", "raster"]) == 2
@@ -101,23 +94,6 @@ def test_without_the_source_checkout_the_command_says_so(monkeypatch, capsys):
 
 
 # ---- scenes and views ---------------------------------------------------------------------------
-
-
-def test_the_random_scene_is_as_described():
-    gaussians, camera = random_scene(RasterCase(20_000, 640, 480))
-    assert (camera.width, camera.height, camera.fx, camera.fy) == (640, 480, 520.0, 520.0)
-    assert len(gaussians) == 20_000 and gaussians.sh_degree == 3
-    z, left, up = gaussians.means.double().unbind(1)  # the camera looks along +x
-    assert 2 <= float(z.min()) < 2.01 and 19.99 < float(z.max()) <= 20
-    for offsets, half in ((left, 320 / 520), (up, 240 / 520)):
-        reach = (offsets.abs() / z).max()
-        assert 1.09 * half < float(reach) <= 1.1 * half * (1 + 1e-6)  # float32 means
-    scales = gaussians.scales
-    assert 0.004 <= float(scales.min()) < 0.00401 and 0.0599 < float(scales.max()) <= 0.06 + 1e-8
-    assert float(gaussians.opacities.min()) == pytest.approx(0.005)
-    splats = project_parts([PosedGaussians(gaussians)], camera, RasterSettings())
-    inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([640, 480]))).all(1)
-    assert float(inside.double().mean()) == pytest.approx(1 / 1.1**2, abs=0.01)
 
 
 # ---- subjects -----------------------------------------------------------------------------------
@@ -199,3 +175,244 @@ def test_fit_measures_steps_at_a_fixed_number_of_splats():
     assert fits[0][1] == 2 and fits[0][2] > 10
     with pytest.raises(ClimateGSError, match="no recorded images"):
         fit.measure(scene="procedural:street?seed=3&frames=1&gaussians=60000", case=case)
+
+
+SMALL = RasterCase(40, 20, 17)
+
+
+def test_blends_are_those_of_the_definition():
+    from augment.render.cuda.driver import list_tiles, project
+    from augment.render.cuda.splats import gather_inputs
+
+    gaussians, camera = random_scene(RasterCase(60, 20, 17))
+    opaque, large = gaussians.opacities.clamp_min(0.9), 30 * gaussians.scales
+    parts = [PosedGaussians(dataclasses.replace(gaussians, opacities=opaque, scales=large))]
+    settings = RasterSettings(transmittance_stop=0.05)
+    seen = project(gather_inputs(parts, camera, settings, None, None, with_color=False))
+    tiles = list_tiles(seen, camera, None)
+    counted = count_blends(seen, tiles, camera, settings)
+    splats = order_by_depth(project_parts(parts, camera, settings))
+    y, x = torch.meshgrid(torch.arange(17) + 0.5, torch.arange(20) + 0.5, indexing="ij")
+    pixels = torch.stack([x.reshape(-1), y.reshape(-1)])
+    weights, after = blend_weights(splats, pixels, torch.ones(340), settings)
+    assert counted["done"] == int((weights > 0).sum()) > 2000
+    assert bool((after[-1] <= 0.05).any())  # some pixels are finished before their lists end
+    lengths = tiles.tile_offsets.diff()
+    assert counted["listed"] == int((lengths * torch.tensor([256, 64, 16, 4])).sum())
+    assert counted["done"] <= counted["reached"] <= counted["listed"]
+    assert counted["entries"] <= int(lengths.sum()) and counted["used"] <= len(gaussians)
+
+
+@pytest.mark.long
+def test_a_gpus_frame_has_stages_a_floor_and_launches(monkeypatch):
+    """Kernels interpreted on a tiny scene."""
+    with gpu.TorchOps() as ops:
+        rows = torch.ones(6).reshape(2, 3)[1]  # one operation and two views of it
+        assert float((rows * 2).sum()) == 6
+    assert ops.count == 3
+    clock = Timing(repeats=1, warm_up=0, clock=TickingClock())
+    ceilings = gpu.measure_ceilings(clock, copy_bytes=1 << 12, programs=2, steps=3)
+    assert ceilings == gpu.Ceilings(bytes_per_s=2 * 4096, blends_per_s=2 * gpu.LANES * 3)
+    found = gpu.measure_raster(SMALL, clock, gpu.Ceilings(bytes_per_s=1e6, blends_per_s=1e6))
+    assert found["same_bits"] and found["stages_ms"].keys() == {"project", "list", "blend"}
+    assert found["ms"]["clean"]["median"] == 1000 and found["smog_over_clean"]["median"] == 1
+    floor, shown = found["floor"], found["floor"]["visible"]
+    assert floor["splats"] == 40 and 0 < floor["used"] <= shown <= 40
+    # Means, scales and opacity of all, key and count; of those in view quaternion, 16 functions of
+    # SH, record and rectangle.
+    moved = floor["bytes_of"]
+    assert moved["project"] == 40 * (28 + 8) + shown * (16 + 192 + 64 + 8)
+    assert moved["list"] == 40 * 8 + shown * 8 + 4 * floor["pairs"] + 4 * 5
+    assert moved["blend"] == 4 * floor["entries"] + 64 * floor["used"] + 20 * 17 * 16
+    scene, camera = gpu.interpreted_street()
+    recipes = gpu.frame_recipes(0.4)
+    found = gpu.count_launches(scene, camera, {n: recipes[n] for n in ("clean", "smog")})
+    clean, smog = found["launches"].values()
+    assert clean["triton"] == smog["triton"] > 0  # fog costs the projection, and no launch
+    monkeypatch.setattr(gpu, "run_section", lambda *_: {"left_out": "no time was left"})
+    sections = measure(GpuCase(), timing=clock, in_processes=False)["facts"]["sections"]
+    assert "could not be measured" in sections["raster"]["left_out"]
+    with pytest.raises(ValueError, match=r"sections are ceilings, .*; got y"):
+        measure(GpuCase(), sections=("y",), timing=clock)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_commands_say_so(capsys):
+    for words in (["gpu"], ["raster", "--device", "cuda"], ["trade", "--device", "cuda"]):
+        assert main(["bench", *words]) == 2
+        assert "there is no GPU to measure here" in capsys.readouterr().err
+
+
+@pytest.mark.gpu
+def test_a_small_run_on_a_gpu(tmp_path):
+    case = dataclasses.replace(
+        gpu.QUICK, load={"copy_bytes": 1 << 24, "programs": 264, "steps": 256}
+    )
+    result = measure(case, timing=Timing(3, 1), json_file=tmp_path / "gpu.json")
+    sections = result["facts"]["sections"]
+    assert not [name for name in gpu.SECTIONS if "failed" in sections[name]]
+    assert sections["raster"]["same_bits"] and sections["raster"]["peak_mib"] > 0
+
+
+def test_settings_differ_from_reference_in_one_knob():
+    recipe = trade_recipe("all")
+    assert None not in (recipe.style, *dict(recipe.weather).values())
+    (_, best), *others = settings_of_trade(recipe)
+    paths = [knob.path for knob in knobs_of(recipe)]
+    assert {row["knob"] for row, _ in others} == {*paths, WHOLE}
+    good = settings_of(best)
+    for row, setting in (each for each in others if each[0]["knob"] != WHOLE):
+        own = settings_of(setting)
+        moved = {path: own[path] for path in paths if own[path] != good[path]}
+        assert moved == {row["knob"]: row["value"]} or row["value"] == good[DEPTH]
+
+
+# ---- Errors whose answer is known ----------------------------------------------------------------
+
+# A wall 10 m ahead, seen twice by a camera that stands still, so that nothing moves.
+WALL = Camera("wall", 40, 30, 30.0, 30.0, 20.0, 15.0, torch.eye(4, dtype=torch.float64))
+GREY = np.full((30, 40, 3), 100, np.uint8)
+
+
+def standard(depth_m=10.0):
+    depth, alpha = np.full((30, 40), depth_m, np.float32), np.ones((30, 40), np.float32)
+    return Standard(WALL, Trial(GREY, None, 0.0), depth, alpha, alpha > 0)
+
+
+def test_flicker_is_what_changes_of_an_error():
+    errors = np.random.default_rng(0).integers(-20, 20, (2, 30, 40, 3))
+    one, two = (GREY + errors).astype(np.uint8)
+    walls = (standard(), standard())
+    assert flicker(walls, (one, one)) == pytest.approx(0, abs=1e-12)
+    assert flicker(walls, (GREY, GREY)) == 0
+    # Drawn anew it is the root of two; of 3600 numbers, and the border is left out.
+    expected = math.sqrt(2) * math.sqrt((errors[0] ** 2).mean()) / 255
+    assert flicker(walls, (one, two)) == pytest.approx(expected, rel=0.05)
+    assert math.isnan(flicker((standard(), standard(15.0)), (one, two)))
+
+
+def test_depth_figures_of_a_known_case():
+    right = np.array([[10.0, 10.0, 10.0, 10.0, 10.0]])
+    own = np.array([[10.0, 10.04, 10.5, 0.0, 99.0]], np.float32)  # right, near, far off, none
+    where = np.array([[True, True, True, True, False]])
+    known = depth_figures([own], [right], [where])
+    assert known["off_5cm"] == pytest.approx(0.5)
+    assert known["abs_rel"] == pytest.approx((0 + 0.004 + 0.05) / 3, rel=1e-5)
+    assert depth_figures([None], [right], [where]) == {"abs_rel": None, "off_5cm": None}
+    assert depth_figures([own], [right], [where & False])["off_5cm"] is None
+    assert depth_figures([0 * own], [right], [where])["off_5cm"] == 1
+
+
+# ---- The rule, in tables made up -----------------------------------------------------------------
+
+STOP, CLIP = "render.transmittance_stop", "render.radius_clip_px"
+
+
+def row(knob, value, over_reference, worst_flip, settings=None):
+    figures = {"over_reference": over_reference, "worst_flip": worst_flip}
+    given = {} if settings is None else {"settings": settings}
+    return {"knob": knob, "value": value, **figures, **given}
+
+
+def table(**recipes):
+    entries = [{"recipe": name, "rows": rows} for name, rows in recipes.items()]
+    return {"scene": "made up", "recipes": entries}
+
+
+def whole(worst_flip, stop=1e-4, clip=0.0):
+    return row(WHOLE, "some name", 0.5, worst_flip, {STOP: stop, CLIP: clip})
+
+
+SINGLE = [
+    row(STOP, 0.05, 0.80, 0.03),
+    row(STOP, 0.01, 0.90, 0.01),
+    row(STOP, 1e-3, 0.95, 0.001),
+    row(CLIP, 2.0, 0.70, 0.04),
+    row(CLIP, 1.0, 0.85, 0.015),
+]
+BOTH = [*SINGLE, whole(0.018, stop=0.01, clip=1.0)]
+
+
+def test_the_rule_takes_what_saves_most_within_the_bound():
+    less = whole(0.018, stop=1e-3, clip=1.0)
+    too_much = [whole(0.03, stop=stop, clip=1.0) for stop in (0.01, 1e-3)]
+    only_stop = [row for row in SINGLE if row["knob"] == STOP]
+    for why, tables, tier in (
+        ("the fastest within the bound", table(clean=BOTH), {STOP: 0.01, CLIP: 1.0}),
+        (
+            "the worst recipe counts",
+            table(clean=[*SINGLE, less], snow=[*SINGLE, less, row(STOP, 0.01, 0.90, 0.05)]),
+            {STOP: 1e-3, CLIP: 1.0},
+        ),
+        (
+            "what saves most comes first, and the others fit beside it",
+            table(clean=[*SINGLE, too_much[0], less]),
+            {STOP: 1e-3, CLIP: 1.0},
+        ),
+        ("or do not", table(clean=[*SINGLE, *too_much]), {CLIP: 1.0}),
+        (
+            "a recipe with one of the knobs needs no rendering together",
+            table(clean=BOTH, snow=only_stop),
+            {STOP: 0.01, CLIP: 1.0},
+        ),
+        (
+            "times of values that change nothing are noise",
+            table(
+                clean=[row(STOP, 0.05, 0.5, 0.0), row(CLIP, 2.0, 0.5, 0.0)],
+                snow=[row(STOP, 0.05, 0.5, 0.0), row(CLIP, 2.0, 1.0, 0.01)],
+            ),
+            {},
+        ),
+        (
+            "a slower value that errs more is never taken",
+            table(clean=[row(STOP, 0.05, 0.9, 0.015), row(STOP, 0.01, 0.8, 0.01)]),
+            {STOP: 0.01},
+        ),
+    ):
+        assert tier_from([tables], 0.02) == tier, why
+    with pytest.raises(Unmeasured) as missing:  # what has not been rendered together
+        tier_from([table(clean=SINGLE)], 0.02)
+    (asked,) = missing.value.args
+    moved = {path: value for path, value in asked.items() if value != KNOBS[path].reference}
+    assert moved == {STOP: 0.01, CLIP: 1.0}
+
+
+def test_published_tiers_and_document_are_those_of_the_published_tables():
+    tables = trade.read_tables()
+    assert {name: dict(settings) for name, settings in TIERS.items()} == trade.tiers_from(tables)
+    files = [r["flip"] for r in trade.rows_of(tables) if (r["knob"], r["value"]) == (JPEG, 92)]
+    assert len(files) == sum(len(table["recipes"]) for table in tables)
+    assert min(files) >= trade.BOUNDS["balanced"]  # invisible: less than a good JPEG's error
+    assert trade.PAGE.read_text() == trade.document(trade.PAGE.read_text(), tables)
+
+
+@pytest.mark.long
+def test_published_figures_make_a_chart(tmp_path):
+    pytest.importorskip("matplotlib")
+    trade.draw_chart(tmp_path / "chart.png", trade.read_tables()[0])
+    assert (tmp_path / "chart.png").stat().st_size > 10_000
+
+
+@pytest.mark.long
+def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
+    some = ("render.scale", DEPTH, JPEG)
+    monkeypatch.setattr(trade, "open_scene", open_street)
+    monkeypatch.setattr(
+        trade, "knobs_of", lambda r: tuple(k for k in knobs_of(r) if k.path in some)
+    )
+    case = trade.TradeCase(width=64, repeats=1, memory=False)
+    found = trade.bench_trade(SMALL_STREET, ["flood"], case)
+    assert json.loads(json.dumps(found.figures, allow_nan=False)) is not None
+    rows = {(row["knob"], row["value"]): row for row in trade.rows_of([found.figures])}
+    tables = trade.printable(found.figures)["tables"]
+    assert sum(len(table["rows"]) for table in tables) == len(rows)
+    best = rows[WHOLE, trade.REFERENCE]
+    assert (best["flip"], best["psnr"], best["ssim"], best["flicker"]) == (0, None, 1, 0)
+    assert (best["off_5cm"], best["abs_rel"], best["over_reference"]) == (0, 0, 1)
+    coarse, finer = rows["render.scale", 0.25], rows["render.scale", 0.75]
+    assert coarse["flip"] > finer["flip"] > 0 and coarse["psnr"] < finer["psnr"]
+    assert coarse["ssim"] < finer["ssim"] < 1 and coarse["off_5cm"] > finer["off_5cm"] > 0
+    assert rows[DEPTH, "median"]["flip"] == 0  # the recipe's own
+    assert rows[DEPTH, "none"]["off_5cm"] is None
+    assert rows[DEPTH, "median"]["depth_against"] == trade.TRUTH  # the street's surfaces
+    assert 0.01 < rows[DEPTH, "median"]["abs_rel"] < 0.3  # a pixel of this picture is 15 of its own

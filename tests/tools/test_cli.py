@@ -1,21 +1,34 @@
 """The `climategs` command as a user runs it, on a scene small enough to be quick."""
 
+from __future__ import annotations
+
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import cv2
+import numba
 import pytest
 import torch
+from fitted_scenes import assert_same, fitted_scene
 
+from adapters.base import open_scene
 from augment.dataset import WeatherDataset
+from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.files.ply import write_ply
-from augment.scene import Gaussians
+from augment.files.scene_file import load_scene_parts, save_scene
+from augment.scene import Gaussians, Scene
+from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
-from tools.cli import main
-from tools.render import resolve_recipes
+from tests.snow_scenes import box_car, drive, sheet
+from tools import explain
+from tools.cli import ExportOptions, GenerateOptions, main
+from tools.explain import explain_recipe, explanation_text, measure_passes
+from tools.output import compiling_noted
+from tools.render import ended_by_sigterm, generate_dataset
 
 FOG = """
 version: 1
@@ -98,6 +111,7 @@ def test_render_a_flood_and_read_it_back(scene_uri, tmp_path, capsys):
     assert "flood: bed" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_job_says_at_its_start_that_sweeps_and_depth_differ(tmp_path, capsys):
     scene = "procedural:street?seed=3&frames=1&gaussians=60000&lidar_columns=16"
     (tmp_path / "seen-through.yaml").write_text(
@@ -164,16 +178,6 @@ def test_inspect_says_what_is_there_and_writes_json(scene_uri, tmp_path, capsys)
     assert "400" in capsys.readouterr().out
 
 
-def test_explain_names_every_pass(scene_uri, recipe, tmp_path, capsys):
-    target = tmp_path / "plan.json"
-    assert main(["explain", recipe, "--scene", scene_uri, "--json", str(target)]) == 0
-    text = capsys.readouterr().out
-    assert "runs   smog per Gaussian" in text and "skips  sky" in text
-    facts = json.loads(target.read_text())
-    assert facts["variants"] == 2
-    assert 5 <= facts["recipe"]["weather"]["smog"]["visibility_m"] <= 50
-
-
 def test_recipes_lists_prints_and_exports(tmp_path, capsys):
     assert main(["recipes"]) == 0
     assert "dense-fog" in capsys.readouterr().out.split()
@@ -235,24 +239,6 @@ def test_style_presets_are_listed_and_printed(capsys):
     assert "{apply, train, presets}" in capsys.readouterr().err
 
 
-def test_a_defect_keeps_its_traceback(monkeypatch):
-    from tools import cli
-
-    def broken() -> int:
-        raise ZeroDivisionError("a defect")
-
-    monkeypatch.setitem(cli.COMMANDS, "recipes", broken)
-    with pytest.raises(ZeroDivisionError):
-        main(["recipes"])
-
-
-def test_scale_is_recorded_in_the_recipe(recipe):
-    (half, _) = resolve_recipes([recipe], scale=0.5)
-    (whole, _) = resolve_recipes([recipe])
-    assert half.render.scale == 0.5 and half.hash != whole.hash
-    assert half.weather == whole.weather
-
-
 def test_help_loads_neither_torch_nor_the_kernels():
     """What keeps `climategs --help` instant; its time itself is measured by hand, not here."""
     code = (
@@ -268,3 +254,206 @@ def test_help_loads_neither_torch_nor_the_kernels():
     )
     assert result.returncode == 0, result.stderr
     assert "render" in result.stdout
+
+
+# ---- explain -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    road = sheet((-2.0, 24.0), (-4.0, 4.0), semantic=1)
+    return drive(road, actors=[box_car(start=(8.0, -2.0), size=(3.0, 1.8, 1.0))])
+
+
+def explained(monkeypatch, tmp_path, scene: Scene, recipe: str, **options):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(recipe)
+    monkeypatch.setattr(explain, "open_scene", lambda uri: scene)
+    facts = explain_recipe(str(path), "test:sheets", **options)
+    return facts, explanation_text(facts)
+
+
+def test_shares_of_a_frame_add_up(scene):
+    times = measure_passes(Recipe(output=Output(depth="none", labels=False)), scene)
+    assert times["views"] == 2 and times["frame_ms"] > 0
+    assert times["folded"] == times["once_s"] == {}
+    assert sum(times["share"].values()) == pytest.approx(1)
+    assert {"rasterise", "sky", "view plan", "8 bits", "everything else"} <= set(times["share"])
+    assert not any(name.startswith(("flood", "snow", "style")) for name in times["share"])
+
+
+def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch, tmp_path):
+    recipe = "weather: {smog: {visibility_m: 40}}\noutput: {depth: none, labels: false}\n"
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe)
+    assert "smog per Gaussian" in facts["times"]["folded"]
+    lines = {line[9:].split("  ")[0].strip(): line for line in page.splitlines()}
+    assert "%" in lines["rasterise"] and "(" in lines["smog per Gaussian"]
+    assert "%" not in lines["flood: bed"] and "2 views spread over" in page
+    assert "actors can be in view in 2 of 2, 1.0 of 1 on average" in page
+    monkeypatch.setattr(explain, "measure_passes", None)  # not called
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
+
+
+def test_compiling_is_said_before_it_is_done(capsys):
+    @numba.njit
+    def doubled(x):
+        return 2 * x
+
+    for said in (
+        ["compiling kernels (once; kept for the next run) ...", "compiled the kernels in"],
+        [],
+    ):
+        with compiling_noted():
+            doubled(2)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == len(said) and all(map(str.startswith, lines, said))
+
+
+def test_settings_are_those_of_the_quality(monkeypatch, tmp_path, scene):
+    facts, text = explained(monkeypatch, tmp_path, scene, "quality: reference\n", times=False)
+    assert facts["settings"]["render.scale"] == 1 and "\nquality reference:\n" in text
+    open_ = "quality: {max_flip: 0.1}\nrender: {scale: 0.5}\n"
+    facts, text = explained(monkeypatch, tmp_path, scene, open_, times=False)
+    assert facts["settings"]["render.scale"] == 0.5 and not facts["is_chosen"]
+    assert "quality max_flip 0.1, chosen in view of the scene when a job starts" in text
+    _, text = explained(monkeypatch, tmp_path, scene, "{}\n", times=False)
+    assert "\nno quality is asked for:\n" in text
+
+
+# ---- generate ------------------------------------------------------------------------------------
+
+
+def test_what_is_no_shard() -> None:
+    assert GenerateOptions(out="o", status=True, shard="07/8")
+    for text in ("", "1", "/", "0/3", "4/3", "-1/3", "1/3/5", "a/b", "1 of 3", "1/", "1.0/2",
+                 "1/" + "9" * 5000):  # fmt: skip
+        with pytest.raises(ClimateGSError, match="write i/n with i from 1 to n, as in 2/8"):
+            GenerateOptions(out="o", status=True, shard=text)
+
+
+def test_sigterm_is_as_ctrl_c() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), ended_by_sigterm():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_job_whose_scenes_cannot_be_opened(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "job.yaml").write_text("scenes: [missing]\nrecipes: [clear]\n")
+    job, out = tmp_path / "job.yaml", tmp_path / "out"
+    assert main(["generate", str(job), "--out", str(out), "--executor", "serial"]) == 2
+    said = capsys.readouterr().err
+    assert "none of its scenes can be used" in said and str(tmp_path / "missing") in said
+    with pytest.raises(ClimateGSError, match="none of its scenes"):
+        generate_dataset(GenerateOptions(job=job, out=str(out), executor="serial", dry_run=True))
+
+
+# ---- export --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def uri(tmp_path: Path) -> str:
+    save_scene(fitted_scene(), tmp_path / "scene")
+    return f"scene:{tmp_path / 'scene'}"
+
+
+def export_scene(scene: str, out: Path, **options) -> int:
+    return ExportOptions(scene=scene, out=out, **options).run()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_file_is_the_scene(uri, tmp_path, capsys):
+    assert export_scene(uri, tmp_path / "new" / "drive") == 0
+    path = tmp_path / "new" / "drive.climategs"
+    assert names(tmp_path / "new") == ["drive.climategs"]
+    said = capsys.readouterr()
+    assert f"wrote {path} (0.0 MB)" in said.out and "read from test:recording" in said.out
+    assert "is not there" in said.err  # the note of the opened scene
+    assert_same(load_scene_parts(path), fitted_scene(), but=("source",))
+    for again in (open_scene(str(path)), open_scene(f"scene:{path}")):
+        assert_same(again, fitted_scene(), but=("source", "problems"))
+        assert again.source == f"scene:{path}"
+
+    export_scene(f"scene:{path}", tmp_path / "half.climategs", half=True)
+    assert "0.05 degrees" in capsys.readouterr().out
+    half = open_scene(str(tmp_path / "half.climategs"))
+    assert half.made_by["precision"] == "float16"
+    assert torch.equal(half.background.means, fitted_scene().background.means)
+    export_scene(str(path), tmp_path / "folder", kind="scene")
+    assert_same(load_scene_parts(tmp_path / "folder"), fitted_scene(), but=("source",))
+
+
+def test_a_recording_is_found_from_the_exported_file(tmp_path, monkeypatch):
+    street = "procedural:street?seed=5&frames=2&gaussians=60000&lidar_columns=16&parked=0"
+    save_scene(fitted_scene(recorded_source=street), tmp_path / "scene")
+    export_scene(f"scene:{tmp_path / 'scene'}", tmp_path / "a")
+    scene = open_scene(str(tmp_path / "a.climategs"))
+    assert scene.problems == fitted_scene().problems and len(scene.boxes(1)) > 0
+    # A recording named relative to where the scene was saved, and not there today.
+    monkeypatch.chdir(tmp_path)
+    save_scene(fitted_scene(recorded_source="pandaset:raw/002"), "scene")
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    export_scene(f"scene:{tmp_path / 'scene'}", Path("b"))
+    again = load_scene_parts("b.climategs")
+    assert again.recorded_source == f"pandaset:{tmp_path}/raw/002"
+    assert again.problems == fitted_scene().problems
+
+
+def test_baked_files_have_cameras_beside_them(uri, tmp_path, capsys, caplog):
+    for kind in ("ply", "splat"):
+        assert export_scene(uri, tmp_path / kind / "a", kind=kind, frame=5) == 0
+        assert names(tmp_path / kind) == [f"a.{kind}", "cameras.json"]
+        said = capsys.readouterr().out
+        assert f"wrote {tmp_path / kind / 'cameras.json'}" in said
+        assert "note: the sky is left out" in said
+        assert "stand still where they are in frame 5" in said
+        again = open_scene(str(tmp_path / kind / f"a.{kind}"))
+        assert (
+            again.camera_names == ("ahead", "left") and len(again.background) == 50
+        )  # no actor then
+    assert not caplog.messages  # what is lost is said once
+    export_scene(uri, tmp_path / "ply" / "b.ply", kind="ply")
+    said = capsys.readouterr()
+    assert "stand still where they are in frame 4" in said.out and "not this" not in said.err
+    (tmp_path / "ply" / "cameras.json").write_text("[]")
+    export_scene(uri, tmp_path / "ply" / "b.ply", kind="ply", overwrite=True)
+    assert "not this scene's; it is left as it is" in capsys.readouterr().err
+    assert (tmp_path / "ply" / "cameras.json").read_text() == "[]"
+
+
+def test_what_is_refused(uri, tmp_path):
+    for kind, name in (("file", "a.ply"), ("ply", "a.climategs"), ("scene", "a.splat")):
+        with pytest.raises(
+            ClimateGSError, match=rf"is named as --kind \w+ .* is --kind {kind}: say"
+        ):
+            export_scene(uri, tmp_path / name, kind=kind)
+    with pytest.raises(SceneError, match="has no frame 7; it has 4 to 5"):
+        export_scene(uri, tmp_path / "a", kind="ply", frame=7)
+    with pytest.raises(OutputError, match="root"):
+        export_scene(uri, Path("/"))
+    assert {Path(name).parent.name for name in names(tmp_path)} == {"scene"}
+
+
+def test_what_is_there_is_replaced_only_if_wanted(uri, tmp_path):
+    for kind, suffix in {"file": "climategs", "ply": "ply", "splat": "splat"}.items():
+        path = tmp_path / f"a.{suffix}"
+        path.write_text("keep")
+        with pytest.raises(OutputError, match=r"is there already: .* --overwrite"):
+            export_scene(uri, tmp_path / "a", kind=kind)
+        assert path.read_text() == "keep"
+        export_scene(uri, tmp_path / "a", kind=kind, overwrite=True)
+        assert path.stat().st_size > 1000
+        (tmp_path / f"b.{suffix}").mkdir()
+        with pytest.raises(OutputError, match="is a folder"):
+            export_scene(uri, tmp_path / "b", kind=kind, overwrite=True)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "holiday.jpg").touch()
+    for kind in ("scene", "ply-parts"):
+        with pytest.raises(OutputError, match="holds something else"):
+            export_scene(uri, tmp_path / "photos", kind=kind, overwrite=True)
+    assert names(tmp_path / "photos") == ["holiday.jpg"]

@@ -102,10 +102,10 @@ def test_readers_refuse_changed_manifests_and_never_fail_otherwise(
     assert outcomes(out) == {"read": len(READERS)}
     whole = pq.read_table(out / "manifest.parquet")
     rng, found = random.Random(0), Counter[str]()
-    for changed in rng.sample(list(changed_tables(whole, rng)), k=20):
+    for changed in rng.sample(list(changed_tables(whole, rng)), k=8):
         pq.write_table(changed, out / "manifest.parquet")
         found += outcomes(out)
-    assert found["refused"] > 30 and found["read"] > 8
+    assert found["refused"] > 8 and found["read"] > 3
 
 
 def changed_notes(note: Any, rng: random.Random) -> Iterator[bytes]:

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,24 +13,14 @@ from fake_fit import Fakes, FakeTrainer
 from safetensors import SafetensorError
 
 from adapters.base import open_scene
-from adapters.training_views.depth_priors import DepthPriors
 from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
-from augment.reconstruct.view import ViewKey
 from tools import fit, training
 from tools.cli import main
-from tools.fit import (
-    GROWTH,
-    estimate_steps,
-    fit_scene,
-    held_out_range,
-    open_to_fit,
-    sample_keys,
-    state_folder,
-)
-from tools.options import FitOptions, parse_depth
-from tools.training import RESERVE, Checkpoint, load_checkpoint, save_checkpoint
+from tools.fit import fit_scene, held_out_range, open_to_fit, state_folder
+from tools.options import FitOptions
+from tools.training import Checkpoint, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
@@ -84,36 +73,6 @@ def test_a_run_writes_scene_checkpoint_and_report(options, capsys):
     assert "| 6 | 20.0 |" in streams.out and f"scene:{options.out}" in streams.out
     assert streams.err.count("a view lacks its mask") == 1  # said by scene and views alike
     assert outcome.report["problems"] == ["frame 3 has no sweep", "a view lacks its mask"]
-
-
-def test_history_has_averages_and_evaluations(options):
-    rows = run(options, Fakes()).report["history"]
-    averages = [row for row in rows if "loss" in row]
-    assert [row["step"] for row in averages] == [50, 100]
-    assert averages[0]["stage_s"] == pytest.approx({"load": 0.001, "forward": 0.002})
-    assert averages[0]["ssim"] == 0.5 and averages[0]["splats"] == 400
-    tests = [row for row in rows if row.get("split") == "test"]
-    assert [row["step"] for row in tests] == list(range(0, 121, 12))
-    assert tests[-1]["psnr"] > tests[0]["psnr"]
-    assert len(tests) == sum(row.get("split") == "train" for row in rows)
-
-
-def test_the_same_command_gives_the_same_bytes(options, tmp_path):
-    run(options, Fakes())
-    again = but(options, out=tmp_path / "again")
-    run(again, Fakes())
-    assert written(options.out) == written(again.out)
-    other = but(options, out=tmp_path / "other", seed=1)
-    run(other, Fakes())
-    assert written(options.out) != written(other.out)
-
-
-def test_without_held_out_views_the_others_are_looked_at(options):
-    whole = but(options, holdout="none")
-    fakes = Fakes()
-    rows = run(whole, fakes).report["history"]
-    assert {row["split"] for row in rows if "psnr" in row} == {"train"}
-    assert "held_out=" not in fakes.opened[0]
 
 
 def test_a_loss_that_is_no_number_ends_the_run(options, monkeypatch):
@@ -179,22 +138,6 @@ def test_an_interrupted_run_leaves_a_scene_and_goes_on(options, tmp_path, number
     assert resumed.report["seconds"] > resumed.report["seconds_of_this_run"] > 0
 
 
-def test_an_ignored_signal_stays_ignored(options):
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        assert run(options, Fakes(before_step=interrupter(5, signal.SIGINT))).code == 0
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def test_a_stopped_run_evaluates_some_views_only(options, monkeypatch):
-    monkeypatch.setattr(fit, "EVALUATED_WHEN_STOPPED", 2)
-    fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
-    outcome = run(options, fakes)
-    assert [len(test) for test in fakes.reported] == [2]
-    assert "figures are of 2 of the 6 held-out views" in outcome.report["problems"][-1]
-
-
 def test_a_second_interruption_stops_at_once(options):
     def twice(step):
         if step in (70, 71):
@@ -245,27 +188,6 @@ def test_other_settings_are_refused_by_name(options):
     assert written(options.out) == before
 
 
-def test_what_does_not_change_the_result_may_change(options):
-    run(options, Fakes(before_step=interrupter(5, signal.SIGINT)))
-    assert run(but(options, image_cache_mb=7), Fakes()).code == 0
-
-
-def test_overwrite_begins_anew(options, tmp_path):
-    run(options, Fakes())
-    other = but(options, seed=5, overwrite=True)
-    assert run(other, Fakes()).code == 0
-    plain = but(other, out=tmp_path / "plain")
-    run(plain, Fakes())
-    assert written(options.out) == written(plain.out)
-    assert len(list(state_folder(options.out).glob("*.safetensors"))) == 1
-
-
-def test_data_that_changed_is_refused(options):
-    run(options, Fakes(before_step=interrupter(5, signal.SIGINT)))
-    with pytest.raises(OutputError, match="frames was 6, now 4; train views was 6, now 4"):
-        run(options, Fakes(numbers=range(4)))
-
-
 def test_minutes_become_steps_once(drive, tmp_path, capsys):
     options = FitOptions(scene=drive, out=tmp_path / "scene", minutes=1e-6)
     fakes = Fakes()
@@ -279,59 +201,6 @@ def test_minutes_become_steps_once(drive, tmp_path, capsys):
     # naming the number of steps it became is the same request
     asked = but(options, minutes=None, steps=steps)
     assert run(asked, Fakes()).code == 0
-
-
-def test_the_number_of_steps_survives_a_kill(drive, tmp_path):
-    options = FitOptions(scene=drive, out=tmp_path / "scene", minutes=0.001)
-    calls = []
-
-    def kill(step):
-        calls.append(step)
-        if step == 0 and calls.count(0) == 2:  # the first step that counts
-            raise Killed
-
-    with pytest.raises(Killed):
-        run(options, Fakes(before_step=kill))
-    planned = load_checkpoint(state_folder(options.out)).steps
-    fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
-    assert run(options, fakes).report["steps"] == planned
-    assert len(fakes.trainers) == 1  # not timed again
-
-
-def test_estimate():
-    class Timed:
-        now = 0.0
-
-        def run_step(self):
-            self.now += 0.1 + load_s
-            return SimpleNamespace(stage_s={"load": load_s})
-
-    def estimated(budget_s, grows, views=100):
-        trainer = Timed()
-        clock = lambda: trainer.now  # noqa: E731
-        return estimate_steps(lambda _: trainer, budget_s, views=views, grows=grows, clock=clock)
-
-    load_s = 0.0
-    steps, step_s = estimated(600, grows=False)
-    assert step_s == pytest.approx(0.1)
-    assert steps % 50 == 0
-    assert steps == pytest.approx(600 * (1 - RESERVE) / 0.1, abs=51)  # rounded down to 50
-    assert estimated(600, grows=True)[0] == pytest.approx(steps / GROWTH, abs=51)
-    assert estimated(0.01, grows=True)[0] == 1
-    load_s = 0.9  # reading 100 views once takes 90 s, and is done once
-    steps, step_s = estimated(600, grows=False)
-    assert step_s == pytest.approx(0.1)
-    assert steps == pytest.approx((600 * (1 - RESERVE) - 90) / 0.1, abs=51)
-    assert estimated(600, grows=False, views=10**6)[0] > 1000  # some time is left for steps
-
-
-def test_sampled_views_take_turns_between_cameras():
-    keys = [ViewKey(f, c) for f in range(0, 26, 2) for c in ("a", "b", "c")]
-    chosen = sample_keys(keys, 6)
-    assert len(chosen) == 6 and [k.camera for k in chosen] == ["a", "b", "c"] * 2
-    assert len({k.frame for k in chosen}) == 6
-    assert sample_keys(keys[:2], 6) == (keys[0], keys[1])
-    assert sample_keys([], 6) == ()
 
 
 def test_held_out_frames_as_a_range():
@@ -407,23 +276,6 @@ def test_mistakes_exit_with_2_before_anything_is_opened(tmp_path, capsys):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_that_never_began_leaves_nothing(drive, tmp_path):
-    options = FitOptions(scene=drive, out=tmp_path / "scene", steps=1)
-    with pytest.raises(ClimateGSError, match="no recorded images"):
-        run(options, Fakes(recorded=False))
-    with pytest.raises(ClimateGSError, match="--holdout says which frames"):
-        run(but(options, scene=f"{drive}?held_out=1::2"), Fakes())
-    assert [p.name for p in tmp_path.iterdir()] == ["drive"]
-
-
-def test_overwriting_with_data_that_cannot_be_opened_keeps_what_is_there(options):
-    run(options, Fakes())
-    with pytest.raises(ClimateGSError, match="no recorded images"):
-        run(but(options, overwrite=True), Fakes(recorded=False))
-    fakes = Fakes()
-    assert run(options, fakes).code == 0 and fakes.opened == []  # finished as before
-
-
 def test_what_else_is_in_the_output_folder_is_kept(options):
     options.out.mkdir()
     (options.out / "diary.txt").write_text("mine")
@@ -442,17 +294,6 @@ def test_two_runs_at_once_are_refused(options):
     refused = pytest.raises(OutputError, match="being written by another job")
     with OutputLock(state_folder(options.out)), refused:
         run(options, Fakes())
-
-
-def test_depth_priors(tmp_path):
-    for text, priors in {
-        "none": {"lidar": False},
-        "lidar": {},
-        "relative:DIR": {"lidar": False, "relative_dir": tmp_path},
-        "DIR": {"lidar": False, "metric_dir": tmp_path},
-        "metric:DIR,lidar": {"metric_dir": tmp_path},
-    }.items():
-        assert parse_depth(text.replace("DIR", str(tmp_path))) == DepthPriors(**priors)
 
 
 def checkpoint(**more) -> Checkpoint:
@@ -521,15 +362,6 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
                 continue
             with pytest.raises(OutputError, match=rf"{name} is damaged.*--overwrite"):
                 load_checkpoint(tmp_path)
-
-
-def test_a_checkpoint_of_another_making_is_refused(tmp_path):
-    save_checkpoint(tmp_path, checkpoint(step=1, arrays={"a": np.ones(1)}))
-    plan = json.loads((tmp_path / "fit.json").read_text())
-    for change in ({"version": 1}, {"unknown": 1}, {"state": {"file": "x"}}, {"step": "no"}):
-        (tmp_path / "fit.json").write_text(json.dumps({**plan, **change}))
-        with pytest.raises(OutputError, match=r"fit.json is (damaged|of version 1, .*--overwrite)"):
-            load_checkpoint(tmp_path)
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ from tools.bench.harness import (
 from tools.bench.scenes import RasterCase, random_scene, street_uri
 
 # Labels and LiDAR are left out of the comparison: they are work that bare rendering does not do.
-PLAIN = "output: {labels: false, lidar: false}\n"
+PLAIN = {"output.labels": False, "output.lidar": False}
 BLOCK_IMAGES = 12  # several variants in small blocks: both workers have work to the end
 BARE = "a loop: render, encode, write"
 TINY_CAMERAS, TINY_PERIOD_NS = ("front", "rear"), 100_000_000
@@ -110,9 +110,8 @@ def measure(
 
 
 def _compare(case: JobsCase, folder: Path, repeats: int) -> list[tuple]:
-    template = load_recipe("dense-fog")
-    values = (*template.values, *parse_recipe(PLAIN, source="bench", name="bench").values)
-    template = dataclasses.replace(template, values=values, variants=case.variants)
+    template = load_recipe("dense-fog", PLAIN)
+    template = dataclasses.replace(template, variants=case.variants)
     job = _job(case.scene, template, folder, scale=case.scale, block_images=BLOCK_IMAGES)
     ways: dict[str, Callable[[Path], float]] = {
         BARE: partial(_bare, case.scene, job.recipes),
@@ -204,7 +203,7 @@ def _job(
 
 def _run_long_job(images: int, out: Path) -> Mapping[str, float]:
     frames = -(-images // len(TINY_CAMERAS))
-    template = parse_recipe(PLAIN, source="tiny", name="tiny")
+    template = parse_recipe("{}", source="tiny", name="tiny", overrides=PLAIN)
     job = _job(f"tiny:{frames}", template, out, open_scene=open_tiny, renderer=render_tiny)
     job = dataclasses.replace(job, executor="serial")
     result = run_generate(job, progress=False)

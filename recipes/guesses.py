@@ -1,0 +1,142 @@
+"""How messages show what was written in a recipe, and what they guess was meant."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from typing import TYPE_CHECKING
+
+from recipes.errors import join, nearest_word, short
+from recipes.schema import SECTIONS
+from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode
+
+if TYPE_CHECKING:
+    from recipes.recipe_file import Leaf, Section
+
+RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
+
+_YAML_1_1_FLAGS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
+_NUMBER_WITH_UNIT = re.compile(r"[-+]?[0-9.]+\s*[A-Za-z/%]+[0-9]?")
+_UNIT = re.compile(
+    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
+)
+
+
+def show(node: Node) -> str:
+    """The node as written, on one short line; text that is no number in quotes."""
+    if isinstance(node, ScalarNode):
+        if node.value is None:
+            return "null"
+        text = short(node.text)
+        return repr(text) if isinstance(node.value, str) else text
+    if isinstance(node, ListNode):
+        if len(node) <= 4 and all(isinstance(item, ScalarNode) for item in node):
+            return f"[{', '.join(map(show, node))}]"
+        return f"a list of {len(node)}"
+    keys = [f"{short(key, 20)}: ..." for key in list(node)[:4]]
+    return "{" + ", ".join(keys) + ("}" if len(keys) == len(node) else ", ...}")
+
+
+# ---- Values --------------------------------------------------------------------------------------
+
+
+def guess_value(node: Node, leaf: Leaf) -> str:
+    """What was probably meant by a refused value, as the end of a message; '' without a guess."""
+    if isinstance(node, ListNode) and leaf.is_number and leaf.rangeable and len(node) == 2:
+        return f"; a range is written {{uniform: {show(node)}}}"
+    value = node.value if isinstance(node, ScalarNode) else None
+    if isinstance(value, str):
+        return _guess_text(value.strip(), leaf)
+    is_channel = leaf.path.endswith("color[]")
+    if is_channel and isinstance(value, int | float) and 1 < value <= 255:
+        return "; divide 0-255 values by 255"
+    return ""
+
+
+def _guess_text(text: str, leaf: Leaf) -> str:
+    if leaf.kind is bool and text.lower() in _YAML_1_1_FLAGS:
+        return f"; write {_YAML_1_1_FLAGS[text.lower()]}"
+    if leaf.words:
+        near = nearest_word(text, leaf.words)
+        return f"; did you mean {near}?" if near else ""
+    if leaf.is_number:
+        if _DECIMAL_COMMA.fullmatch(text):
+            return "; decimals take a point"
+        if _NUMBER_WITH_UNIT.fullmatch(text):
+            return "; write the number alone"
+        with contextlib.suppress(ValueError):
+            float(text)
+            return "; write it without quotes"
+    return ""
+
+
+def why_no_range(node: MapNode, leaf: Leaf) -> str:
+    """Why a mapping in the place of a value is no range."""
+    if not leaf.rangeable:
+        return f"must be {leaf.allowed()}; it cannot be a range"
+    kinds = [key for key in node if key in RANGE_KINDS]
+    if len(kinds) == 1:
+        possible = "choice" if leaf.channel is None else "uniform or choice"
+        return f"{kinds[0]} is for numbers; a range here is {possible}"
+    for key in node:
+        near = nearest_word(key, RANGE_KINDS)
+        if near is not None and near != key:
+            return f"no range is called {short(key)!r}; did you mean {near}?"
+    ranges = ", ".join(RANGE_KINDS)
+    return f"must be {leaf.allowed()}, or a range: a mapping with one of {ranges}"
+
+
+# ---- Keys ----------------------------------------------------------------------------------------
+
+
+def why_no_key(key: str, section: type[Section], root: type[Section]) -> str:
+    """Why `key` is refused in a section and which known one is nearest."""
+    if key in RANGE_KINDS:
+        return "a range stands for one field, not for a whole section"
+    nearest = _nearest_key(key, section, root)
+    if nearest is not None:
+        leaf = section.LEAVES.get(nearest)
+        unit = f" ({leaf.unit})" if leaf and leaf.unit else ""
+        return f"unknown field; did you mean {nearest}{unit}?"
+    elsewhere = [
+        (other.PATH, name)
+        for name in dict.fromkeys((key, _synonyms().get(key, key)))
+        for other in root.walk()
+        if name in other.model_fields and other is not section
+    ]
+    below = [place for place in elsewhere if place[0].startswith(f"{section.PATH}.")]
+    if elsewhere:
+        places = [
+            join(path, name) if path else f"{name} at the top" for path, name in below or elsewhere
+        ]
+        return f"unknown field here; did you mean {' or '.join(places)}?"
+    return f"unknown field; known here: {', '.join(section.model_fields)}"
+
+
+def _nearest_key(key: str, section: type[Section], root: type[Section]) -> str | None:
+    known, low = tuple(section.model_fields), key.lower().replace("-", "_")
+    if low in known:
+        return low
+    bases = {_base(name): name for name in known}
+    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
+        return bases[_base(low)]
+    synonyms = _synonyms()
+    for meant in (synonyms.get(low), synonyms.get(_base(low))):
+        if meant in known:
+            return meant
+    if any(low in other.model_fields for other in root.walk()):
+        return None  # spelt well, but in another place
+    near = nearest_word(_base(low), bases)
+    return nearest_word(low, known) or (bases[near] if near else None)
+
+
+def _synonyms() -> dict[str, str]:
+    """What a key may have been meant to be, where the section has it."""
+    meant = (pair for model in SECTIONS.values() for pair in model.meant_by)
+    return {word: key for key, words in meant for word in words.split()}
+
+
+def _base(name: str) -> str:
+    """The name without its unit."""
+    return _UNIT.sub("", name) or name

@@ -1,0 +1,249 @@
+"""How one field of a recipe gets its value: a fixed one, or a draw from a range.
+
+The random numbers are pure functions of (seed, variant, path of the field): no generator hands its
+state from draw to draw, so a new field or variant leaves all others alone. Drawn floats have 10
+significant digits: exp, log and erf differ in the last bit by platform.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
+from typing import TypeGuard
+
+from recipes.files import file_below
+
+_DOMAIN = "climategs recipe draw 1"  # a change of the scheme changes this, never silently a number
+
+Triple = tuple[float, float, float]  # a colour, or three rates
+Plain = bool | int | float | str | Triple | None
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The random numbers of one variant."""
+
+    seed: int
+    variant: int
+
+    def unit(self, path: str) -> float:
+        """The number in [0, 1) that belongs to `path`: 53 bits of a SHA-256."""
+        key = json.dumps([_DOMAIN, self.seed, self.variant, path])
+        digest = hashlib.sha256(key.encode()).digest()
+        return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53
+
+
+# What a template holds for a field has `is_range`, False where every variant gets the same; `draw`,
+# the value of one variant, the path naming its random number; `probes`, the extreme values and
+# every option, all of which must be allowed; and `describe`, the range in words, without its unit.
+
+
+@dataclass(frozen=True)
+class Fixed:
+    value: Plain
+    is_range = False
+
+    def draw(self, draws: Draws, path: str) -> Plain:
+        return self.value
+
+    def probes(self) -> tuple[Plain, ...]:
+        return (self.value,)
+
+    def describe(self) -> str:
+        return words(self.value)
+
+
+@dataclass(frozen=True)
+class NamedFile(Fixed):
+    """The name of a file as it is written; a draw has its absolute path."""
+
+    value: str
+    folder: Path
+
+    def draw(self, draws: Draws, path: str) -> str:
+        try:
+            return str(file_below(self.folder, self.value))
+        except ValueError as error:
+            raise ValueError(f"{path} = {self.value!r}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Every value from low to high alike; both ends included where they are whole numbers.
+
+    log: of the logarithm, as often between 10 and 20 as between 100 and 200; 0 < low.
+    """
+
+    low: float
+    high: float
+    log: bool = False
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> float:
+        unit, low, high, whole = draws.unit(path), self.low, self.high, isinstance(self.low, int)
+        if self.log:
+            top = high + 1 if whole else high  # k stands for the reals in [k, k + 1)
+            start, end = math.log(low), math.log(top)
+            drawn = math.exp(start + unit * (end - start))
+        elif whole:
+            drawn = low + unit * (high - low + 1)
+        else:
+            drawn = low + unit * (high - low)
+        return _whole(drawn, low, high) if whole else _rounded(drawn, low, high)
+
+    def probes(self) -> tuple[float, ...]:
+        return (self.low, self.high)
+
+    def describe(self) -> str:
+        kind = "log-uniform" if self.log else "uniform"
+        return f"{kind} from {words(self.low)} to {words(self.high)}"
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal, cut off at low and high, by the inverse of its distribution. low <= mean <= high.
+
+    Draws are whole where low and high are, which the mean and the deviation need not be.
+    """
+
+    mean: float
+    std: float
+    low: float
+    high: float
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> float:
+        whole = isinstance(self.low, int)
+        margin = 0.5 if whole else 0.0  # a whole number stands for the reals that round to it
+        normal = NormalDist(self.mean, self.std)
+        below = normal.cdf(self.low - margin)
+        inside = normal.cdf(self.high + margin) - below
+        # inv_cdf takes no 0 or 1; the values it would give there are cut off to an end anyway
+        probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
+        drawn = normal.inv_cdf(probability)
+        if whole:
+            return _whole(drawn + 0.5, self.low, self.high)
+        return _rounded(drawn, self.low, self.high)
+
+    def probes(self) -> tuple[float, ...]:
+        return (self.low, self.high)
+
+    def describe(self) -> str:
+        return (
+            f"normal with mean {words(self.mean)} and deviation {words(self.std)}, "
+            f"from {words(self.low)} to {words(self.high)}"
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of the options, which may be ranges themselves. weights: >= 0, their sum > 0."""
+
+    options: tuple[Value, ...]
+    weights: tuple[float, ...]
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Plain:
+        remaining = draws.unit(path) * math.fsum(self.weights)
+        chosen = -1
+        for index, weight in enumerate(self.weights):
+            if weight > 0:
+                chosen = index
+                if remaining < weight:
+                    break
+                remaining -= weight
+        return self.options[chosen].draw(draws, f"{path}.choice[{chosen}]")
+
+    def probes(self) -> tuple[Plain, ...]:
+        return tuple(probe for option in self.options for probe in option.probes())
+
+    def describe(self) -> str:
+        total = math.fsum(self.weights)
+        even = len(set(self.weights)) == 1
+        parts = [
+            option.describe() + ("" if even else f" ({100 * weight / total:.3g} %)")
+            for option, weight in zip(self.options, self.weights, strict=True)
+        ]
+        return f"one of {', '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class TripleLine:
+    """On the straight line from one to another: one random number, so no odd mixtures."""
+
+    start: Triple
+    end: Triple
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Triple:
+        unit = draws.unit(path)
+        ends = zip(self.start, self.end, strict=True)
+        return as_triple(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+
+    def probes(self) -> tuple[Triple, ...]:
+        return (self.start, self.end)
+
+    def describe(self) -> str:
+        return f"uniform from {words(self.start)} to {words(self.end)}"
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Three channels that are drawn one by one."""
+
+    channels: tuple[Value, Value, Value]
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Triple:
+        return as_triple(c.draw(draws, f"{path}[{i}]") for i, c in enumerate(self.channels))
+
+    def probes(self) -> tuple[Triple, ...]:
+        probes = [[as_number(probe) for probe in channel.probes()] for channel in self.channels]
+        return (as_triple(map(min, probes)), as_triple(map(max, probes)))
+
+    def describe(self) -> str:
+        return f"[{', '.join(channel.describe() for channel in self.channels)}]"
+
+
+Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
+
+
+def _rounded(drawn: float, low: float, high: float) -> float:
+    return min(max(float(f"{drawn:.10g}"), low), high)
+
+
+def _whole(drawn: float, low: float, high: float) -> int:
+    return min(max(math.floor(drawn), int(low)), int(high))
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether this is a number; True and False are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_number(value: Plain) -> float:
+    """The value of a field that was checked to hold a number."""
+    assert is_number(value), value
+    return value
+
+
+def as_triple(values: Iterable[Plain]) -> Triple:
+    """The three channels of a field that was checked to hold a colour or rates."""
+    red, green, blue = map(as_number, values)
+    return (red, green, blue)
+
+
+def words(value: Plain) -> str:
+    """A value as it would be written in a recipe, floats shortened."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(words(channel) for channel in value)}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)

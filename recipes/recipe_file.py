@@ -1,0 +1,643 @@
+"""What a recipe file may say: models derived from those of `schema`, each value widened to a value
+or a range. With them pydantic reads the nodes of a YAML tree and writes the JSON Schema.
+
+Read is what the file gives, as mappings with a `ranges.Value` for each field.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import operator
+import types
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
+
+from annotated_types import Gt, MaxLen
+from pydantic import (
+    BaseModel,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    create_model,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
+from pydantic_core import core_schema as cs
+from typing_extensions import TypeAliasType
+
+from recipes.errors import Place, Problems, dotted, join, readable
+from recipes.fields import Closed, Digest, FilePath, Number, Unit, Whole
+from recipes.files import file_below
+from recipes.guesses import RANGE_KINDS, guess_value, show, why_no_key, why_no_range
+from recipes.ranges import (
+    Channels,
+    Choice,
+    Fixed,
+    NamedFile,
+    Normal,
+    Plain,
+    TripleLine,
+    Uniform,
+    Value,
+    as_number,
+    as_triple,
+    is_number,
+    words,
+)
+from recipes.schema import SECTIONS, Recipe
+from recipes.yaml_tree import MAX_NODES, ListNode, MapNode, Node, ScalarNode
+
+MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
+
+# the end of a field's name says its unit
+UNITS = {
+    "_per_m": "1/metre",
+    "_m": "metres",
+    "_deg": "degrees",
+    "_ntu": "nephelometric turbidity units",
+}
+_LIMITS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+
+Given = dict[str, Any]  # of a section: a Value for a field, Given for a section, list of Given
+
+
+_TAGS = [f"<{form}>" for form in ("value", *RANGE_KINDS)]  # in pydantic's locations of errors
+
+
+# ---- One value, or a range of values -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A field that holds a value. Its `type`, in a model, reads a node into a `ranges.Value`.
+
+    path: as in a file, with [] for the items of a list. annotation: of the value where it is not
+    null. title: what it is in words, where the type does not say enough.
+    """
+
+    path: str
+    annotation: Any
+    nullable: bool = False
+    rangeable: bool = True
+    description: str = ""
+    required: bool = True
+    default: Any = None
+    title: str | None = None
+
+    @classmethod
+    def of(cls, path: str, info: FieldInfo, *, rangeable: bool) -> Leaf:
+        """The one of a model's field."""
+        inner, nullable = _without_none(info.annotation)
+        required = info.is_required()
+        return cls(
+            path=path,
+            annotation=Annotated[inner, *info.metadata] if info.metadata else inner,
+            nullable=nullable,
+            rangeable=rangeable,
+            description=_one_line(info.description),
+            required=required,
+            default=None if required else info.default,
+            title=info.title,
+        )
+
+    @cached_property
+    def type(self) -> Any:
+        """For annotations: a type with a name, since an option of a choice is of the same type."""
+        return TypeAliasType(self.path, Annotated[Any, self])  # pyright: ignore
+
+    @cached_property
+    def kind(self) -> Any:
+        """float, int, bool, str, tuple (a colour or three rates), Literal, or a union of these."""
+        kind = self.annotation
+        while get_origin(kind) is Annotated:
+            kind = get_args(kind)[0]
+        return get_origin(kind) or kind
+
+    @property
+    def is_number(self) -> bool:
+        return self.kind in (int, float)
+
+    @cached_property
+    def channel(self) -> Leaf | None:
+        """What each of the three numbers of a colour or rates is."""
+        if self.kind is not tuple:
+            return None
+        return Leaf(f"{self.path}[]", get_args(self.annotation)[0], rangeable=self.rangeable)
+
+    @property
+    def unit(self) -> str | None:
+        """The unit in words; None for a pure number."""
+        name = self.path.removesuffix("[]")
+        return next((unit for end, unit in UNITS.items() if name.endswith(end)), None)
+
+    # ---- What is allowed, by the value's JSON Schema
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[Any]:
+        return TypeAdapter(self.annotation)
+
+    @cached_property
+    def _schema(self) -> JsonSchemaValue:
+        return self._adapter.json_schema()
+
+    @property
+    def limits(self) -> tuple[tuple[str, float], ...]:
+        """Pairs such as (">", 0.0)."""
+        return tuple((sign, self._schema[k]) for k, sign in _LIMITS.items() if k in self._schema)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What it may be besides true and false, where that can be listed."""
+        parts = (self._schema, *self._schema.get("anyOf", ()))
+        listed = [part.get("enum", [part["const"]] if "const" in part else []) for part in parts]
+        return tuple(str(word) for each in listed for word in each)
+
+    def accepts(self, value: object) -> bool:
+        """Whether the recipe's model takes this value."""
+        if value is None:
+            return self.nullable
+        try:
+            self._adapter.validate_python(value)
+        except ValidationError:
+            return False
+        return True
+
+    def allowed(self, value: object = None) -> str:
+        """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
+        if self.channel is not None:
+            text = f"[red, green, blue], each {self.channel.allowed()}"
+        elif self.is_number:
+            text = self._allowed_number(value) + (f" ({self.unit})" if self.unit else "")
+        elif self.kind is bool or "anyOf" in self._schema:
+            *first, last = ("true", "false", *self.words)
+            text = f"{', '.join(first)} or {last}"
+        elif self.words:
+            text = f"one of {', '.join(self.words)}"
+        else:
+            text = self.title or self._schema.get("title", "text")
+        return text + (", or null" if self.nullable and not is_number(value) else "")
+
+    def _allowed_number(self, value: object) -> str:
+        limits = " and ".join(f"{sign} {_plain(bound)}" for sign, bound in self.limits)
+        right_type = is_number(value) and (isinstance(value, int) or self.kind is float)
+        if limits and right_type and value == value:
+            return limits
+        return f"{'a number' if self.kind is float else 'a whole number'} {limits}".strip()
+
+    # ---- Reading
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        literal = self._literal_schema(handler)
+        if not self.rangeable:
+            return literal
+        schemas = {"value": literal, **_range_schemas(self, handler)}
+
+        def form_of(node: Node) -> str:
+            kinds = [kind for kind in RANGE_KINDS if isinstance(node, MapNode) and kind in node]
+            return f"<{kinds[0]}>" if len(kinds) == 1 and kinds[0] in schemas else "<value>"
+
+        tagged = {f"<{form}>": schema for form, schema in schemas.items()}
+        return cs.tagged_union_schema(tagged, form_of)
+
+    def _literal_schema(self, handler: GetCoreSchemaHandler) -> CoreSchema:
+        if self.channel is not None:
+            schema: CoreSchema = cs.tuple_schema([handler.generate_schema(self.channel.type)] * 3)
+        else:
+            schema = handler.generate_schema(self.annotation)
+        if self.nullable:
+            schema = cs.nullable_schema(schema)
+        return cs.no_info_wrap_validator_function(self._read, schema)
+
+    def _read(self, node: Node, handler: ValidatorFunctionWrapHandler) -> Value:
+        if isinstance(node, MapNode):
+            raise refusal(why_no_range(node, self))
+        if self.channel is not None and isinstance(node, ListNode) and len(node) == 3:
+            channels = handler(node)
+            fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
+            return Fixed(as_triple(fixed)) if len(fixed) == 3 else Channels(channels)
+        if isinstance(node, ListNode):
+            raise refusal(f"must be {self.allowed()}{guess_value(node, self)}")
+        # a name may look like a number
+        value = node.text if self.kind is str and node.value is not None else node.value
+        try:
+            read = handler(value)
+        except ValidationError:
+            raise refusal(f"must be {self.allowed(value)}{guess_value(node, self)}") from None
+        is_file = self.annotation == FilePath and read is not None
+        return _named_file(node) if is_file else Fixed(read)
+
+
+def refusal(text: str) -> PydanticCustomError:
+    """What pydantic is to say of a node."""
+    return PydanticCustomError("recipe", text)  # type: ignore[arg-type]
+
+
+def _named_file(node: ScalarNode) -> NamedFile:
+    """The name of a file as it is written, where that file can be read."""
+    folder = node.place.folder
+    if folder is None:
+        text = "this text is in no file, so there is no folder to look in; save it as one"
+        raise refusal(text)
+    try:
+        file_below(folder, node.text)
+    except ValueError as error:
+        raise refusal(str(error)) from None
+    return NamedFile(node.text, folder)
+
+
+# ---- Ranges --------------------------------------------------------------------------------------
+
+_MEAN = Leaf("mean", Annotated[Number, Field(allow_inf_nan=False)], rangeable=False)
+_STD = Leaf("std", Annotated[Number, Field(gt=0, allow_inf_nan=False)], rangeable=False)
+_WEIGHT = Leaf("weight", Annotated[Number, Field(ge=0, le=1e9)], rangeable=False)
+
+
+def _range_schemas(leaf: Leaf, handler: GetCoreSchemaHandler) -> dict[str, CoreSchema]:
+    """Of a range of each kind that the field takes."""
+    generate = handler.generate_schema
+    options = cs.list_schema(generate(leaf.type), min_length=1)
+    schemas = {
+        "choice": _mapping_schema(
+            _choice,
+            choice=_list_schema(options, range(1, MAX_NODES), "a list of at least one option"),
+            weights=cs.list_schema(generate(_WEIGHT.type)),
+        )
+    }
+    end = replace(leaf, nullable=False, rangeable=False)
+
+    def pair(end: Leaf, text: str = "[low, high]") -> CoreSchema:
+        both = cs.tuple_schema([generate(end.type)] * 2)
+        return _list_schema(both, [2], text)
+
+    if leaf.channel is not None:
+        line = pair(end, "[from, to], each [red, green, blue]")
+        schemas["uniform"] = _mapping_schema(_line, uniform=line)
+    elif leaf.is_number:
+        above_0 = replace(end, annotation=Annotated[end.annotation, Gt(0)])
+        schemas["uniform"] = _mapping_schema(_interval, uniform=pair(end))
+        schemas["log_uniform"] = _mapping_schema(_interval, log_uniform=pair(above_0))
+        parts = {"mean": _MEAN, "std": _STD, "min": end, "max": end}
+        normal = {name: generate(part.type) for name, part in parts.items()}
+        schemas["normal"] = _mapping_schema(_normal, normal=_mapping_schema(dict, **normal))
+    return schemas
+
+
+def _mapping_schema(build: Callable[[Given], Any], **fields: CoreSchema) -> CoreSchema:
+    keys = {
+        name: cs.typed_dict_field(schema, required=name != "weights")
+        for name, schema in fields.items()
+    }
+    typed = cs.typed_dict_schema(keys, extra_behavior="forbid")
+    return cs.no_info_after_validator_function(build, typed)
+
+
+def _list_schema(schema: CoreSchema, counts: Container[int], text: str) -> CoreSchema:
+    """text: what must stand there, said of what is no list of so many items."""
+
+    def check(node: Node) -> Node:
+        if not isinstance(node, ListNode) or len(node) not in counts:
+            raise refusal(f"must be {text}")
+        return node
+
+    return cs.no_info_before_validator_function(check, schema)
+
+
+def _interval(given: Given) -> Uniform:
+    ((kind, ends),) = given.items()
+    low, high = (as_number(end.value) for end in ends)
+    if low > high:
+        raise refusal("the low end comes first")
+    return Uniform(low, high, log=kind == "log_uniform")
+
+
+def _normal(given: Given) -> Normal:
+    parts = given["normal"]
+    mean, std, low, high = (as_number(parts[name].value) for name in ("mean", "std", "min", "max"))
+    if not low < high:
+        raise refusal("max must be > min")
+    if not low <= mean <= high:
+        raise refusal(f"mean must be from min to max, {low:g} to {high:g}")
+    if std > MAX_STD_PER_WIDTH * (high - low):
+        raise refusal(f"std must be <= {MAX_STD_PER_WIDTH} (max - min); wider is uniform")
+    return Normal(mean, std, low, high)
+
+
+def _choice(given: Given) -> Choice:
+    options = tuple(given["choice"])
+    weights = [as_number(weight.value) for weight in given.get("weights", ())]
+    if "weights" in given and len(weights) != len(options):
+        raise refusal(f"weights must be {len(options)} numbers, one for each option")
+    # bounds keep the sum finite and every share representable
+    if weights and (not any(weights) or any(0 < weight < 1e-9 for weight in weights)):
+        raise refusal("each weight is 0 or from 1e-9 to 1e9, and one is above 0")
+    return Choice(options, tuple(weights) or (1.0,) * len(options))
+
+
+def _line(given: Given) -> TripleLine:
+    start, end = given["uniform"]
+    return TripleLine(start.value, end.value)
+
+
+# ---- Sections: mappings of fields ----------------------------------------------------------------
+
+
+class Section(Closed):
+    """The base of the models of a file's mappings. What one reads is a dict of what is given.
+
+    PATH: dotted, with [] for the items of a list. MODEL: the one of `schema`, which draws are
+    checked against. LEAVES, INNER: its fields and sections. MAX_ITEMS: set where a list of up to so
+    many such mappings stands, which LIST_DESCRIPTION describes.
+    """
+
+    PATH: ClassVar[str] = ""
+    MODEL: ClassVar[type[BaseModel]]
+    LEAVES: ClassVar[dict[str, Leaf]]
+    INNER: ClassVar[dict[str, type[Section]]]
+    MAX_ITEMS: ClassVar[int | None] = None
+    LIST_DESCRIPTION: ClassVar[str] = ""
+
+    @classmethod
+    def walk(cls) -> Iterator[type[Section]]:
+        """This section, then all below it."""
+        yield cls
+        for section in cls.INNER.values():
+            yield from section.walk()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _read(cls, node: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+        shorthand = getattr(cls.MODEL, "SHORTHAND", None)
+        if isinstance(node, ScalarNode) and node.value is None and cls.MAX_ITEMS is None:
+            return None  # 'weather:' with nothing below it: it is empty, an effect absent
+        if isinstance(node, ScalarNode) and shorthand is not None:
+            node = MapNode(node.place, {shorthand: node})
+        if not isinstance(node, MapNode):
+            raise refusal(f"must be a mapping, with {', '.join(cls.model_fields)}")
+        section = handler(node)
+        read = {name: getattr(section, name) for name in section.model_fields_set}
+        given = {name: read[name] for name in cls.model_fields if read.get(name) is not None}
+        if broken := list(broken_rules(cls, given)) if cls.PATH else []:
+            raise PydanticCustomError("rule", "\n".join(broken))  # type: ignore[arg-type]
+        return given
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        written = handler(schema)
+        extra = cls.MODEL.model_config.get("json_schema_extra") or {}
+        assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"
+        handler.resolve_ref_schema(written).update(extra)
+        if (shorthand := getattr(cls.MODEL, "SHORTHAND", None)) is not None:
+            return {"anyOf": [written, {"enum": [*cls.LEAVES[shorthand].words]}]}
+        return written
+
+
+def recipe_file() -> type[Section]:
+    """The model of a recipe file, which holds those of all its sections."""
+    return _recipe_file(tuple(SECTIONS.items()))
+
+
+@functools.lru_cache(2)
+def _recipe_file(sections: tuple[tuple[str, type[BaseModel]], ...]) -> type[Section]:
+    """sections: those of Recipe at the time."""
+    return _section("", Recipe)
+
+
+def read_file(tree: MapNode, problems: Problems) -> Given:
+    """What a tree says; all that is wrong with it is added to the problems."""
+    try:
+        return recipe_file().model_validate(tree)  # type: ignore[return-value]
+    except ValidationError as error:
+        for item in error.errors(include_url=False, include_context=False):
+            place, text = _problem(item)
+            for line in text.splitlines():
+                problems.add(place, line)
+    return {}
+
+
+def _problem(item: ErrorDetails) -> tuple[Place, str]:
+    """Where it is, and what to say of it."""
+    kind, node, last = item["type"], item["input"], item["loc"][-1]
+    above = [part for part in item["loc"][:-1] if part not in _TAGS]
+    location = [*above, last] if kind == "extra_forbidden" or last not in _TAGS else above
+    path, section = dotted(location), recipe_file()
+    for part in above:
+        section = section.INNER.get(str(part), section)
+    in_range = len(item["loc"]) > len(location)
+    if kind == "extra_forbidden":
+        why = why_no_key(str(last), section, recipe_file())
+        return node.place, f"{path}: {'no part of a range' if in_range else why}"
+    if kind == "missing":
+        what = "" if in_range else f", {section.LEAVES[str(last)].allowed()}"
+        return node.place, f"{path}: must be given{what}"
+    if kind == "rule":
+        return node.place, "\n".join(f"{path}: {text}" for text in item["msg"].splitlines())
+    return node.place, f"{path} = {show(node)}: {item['msg'].replace('Input should', 'must', 1)}"
+
+
+_PARENT = Field(
+    min_length=1,
+    max_length=4096,
+    title="a preset's name, or a file in the recipe's folder or below it",
+)
+_EXTRA_LEAVES = (
+    Leaf(
+        "variants",
+        Annotated[Whole, Field(ge=1, le=1_000_000)],
+        rangeable=False,
+        description="How many recipes are drawn from this file.",
+        required=False,
+        default=1,
+    ),
+    Leaf(
+        "extends",
+        Annotated[str, Strict(), _PARENT],
+        rangeable=False,
+        description="The recipe whose fields hold where this file gives none.",
+        required=False,
+    ),
+)
+
+
+def _section(
+    path: str,
+    model: type[BaseModel],
+    *,
+    is_effect: bool = False,
+    list_info: FieldInfo | None = None,
+) -> type[Section]:
+    leaves: dict[str, Leaf] = {}
+    inner: dict[str, type[Section]] = {}
+    fields: dict[str, Any] = {}
+
+    def add(leaf: Leaf) -> None:
+        name = leaf.path.rpartition(".")[2]
+        text = leaf.description + (f" [{leaf.unit}]" if leaf.unit else "")
+        default = ... if leaf.required else leaf.default
+        fields[name], leaves[name] = (leaf.type, Field(default=default, description=text)), leaf
+
+    for name, info in model.model_fields.items():
+        below = join(path, name)
+        kind, nullable = _without_none(info.annotation)
+        arguments = get_args(kind)
+        if get_origin(kind) is tuple and arguments[1:] == (...,):
+            item = inner[name] = _section(f"{below}[]", arguments[0], list_info=info)
+            most, reader = (
+                Field(max_length=item.MAX_ITEMS),
+                WrapValidator(partial(_read_list, item)),
+            )
+            fields[name] = (Annotated[list[item] | None, most, reader], None)
+        elif isinstance(kind, type) and issubclass(kind, BaseModel):
+            inner[name] = _section(below, kind, is_effect=nullable)
+            fields[name] = (inner[name] | None, None)
+        else:
+            add(Leaf.of(below, info, rangeable=bool(path) and kind != Digest))
+    own = _EXTRA_LEAVES if not path else ()
+    if is_effect:
+        text = "Share of the variants that have this effect."
+        own = (Leaf(join(path, "probability"), Unit, False, False, text, False, 1.0),)
+    for leaf in own:
+        add(leaf)
+    title = "ClimateGS recipe" if not path else model.__name__
+    made = create_model(title, __base__=Section, __doc__=_one_line(model.__doc__), **fields)
+    made.PATH, made.MODEL, made.LEAVES, made.INNER = path, model, leaves, inner
+    if list_info is not None:
+        limits = [rule.max_length for rule in list_info.metadata if isinstance(rule, MaxLen)]
+        made.MAX_ITEMS, made.LIST_DESCRIPTION = limits[0], _one_line(list_info.description)
+    return made
+
+
+def _read_list(item: type[Section], node: Node, handler: ValidatorFunctionWrapHandler) -> Any:
+    if isinstance(node, ScalarNode) and node.value is None:
+        return None
+    if not isinstance(node, ListNode) or len(node) > (item.MAX_ITEMS or 0):
+        with_fields = f"each with {', '.join(item.model_fields)}"
+        raise refusal(f"must be a list of up to {item.MAX_ITEMS} mappings, {with_fields}; or null")
+    return handler(node)
+
+
+def _without_none(annotation: Any) -> tuple[Any, bool]:
+    """The annotation without `| None`, and whether None was there."""
+    if get_origin(annotation) not in (Union, types.UnionType):
+        return annotation, False
+    members = [member for member in get_args(annotation) if member is not type(None)]
+    return functools.reduce(operator.or_, members), len(members) < len(get_args(annotation))
+
+
+def _one_line(text: str | None) -> str:
+    return " ".join((text or "").split())
+
+
+def _plain(number: float) -> str:
+    """A number without exponent or trailing zeros where it is short so."""
+    whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
+    return str(int(number)) if whole else repr(number)
+
+
+# ---- Rules between the fields of a section, tried at the ends of their ranges before any draw ----
+
+
+def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
+    """What the section's model says against any combination of the ranges' ends, each text once."""
+    found: set[str] = set()
+    ends = {
+        name: _ends(value, section.LEAVES.get(name))
+        for name, value in given.items()
+        if name in section.MODEL.model_fields and not isinstance(value, dict)
+    }
+    for combination in itertools.product(*ends.values()):
+        corner = dict(zip(ends, combination, strict=True))
+        try:
+            section.MODEL.model_validate(corner)
+        except ValidationError as error:
+            drawn = [_drawn(name, given[name], end) for name, end in corner.items()]
+            where = f" (in a draw with {', '.join(filter(None, drawn))})" if any(drawn) else ""
+            texts = dict.fromkeys(readable(error))
+            yield from (f"{text}{where}" for text in texts if text not in found)
+            found.update(texts)
+
+
+def _drawn(name: str, value: Value | list[Given], end: Any) -> str:
+    """Where a range stands in a draw; '' for what is no range."""
+    if isinstance(value, list):
+        low, high = _list_ends(value)
+        which = "low" if end == low else "high"
+        return f"all {name} at the {which} ends of their ranges" if low != high else ""
+    return f"{name} = {words(end)}" if value.is_range else ""
+
+
+def _ends(value: Value | list[Given], leaf: Leaf | None) -> list[Any]:
+    """What a rule between fields can depend on: the extreme numbers, null, and every word.
+
+    A handful, for the product over a section's fields. No rule compares colours or names of files.
+    """
+    if isinstance(value, list):
+        return _list_ends(value)
+    probes = value.probes()
+    numbers = [p for p in probes if is_number(p)]
+    triples = [p for p in probes if isinstance(p, tuple)]
+    others = [p for p in probes if p is None or isinstance(p, str | bool)]
+    if leaf is not None and leaf.kind is str:
+        others = sorted(others, key=lambda p: p is not None)[: 1 + (None in others)]
+    ends: list[Plain] = [min(numbers), max(numbers)] if numbers else []
+    return list(dict.fromkeys([*ends, *triples[:1], *others]))
+
+
+def _list_ends(items: list[Given]) -> list[tuple[dict[str, Any], ...]]:
+    """All numbers of a list's mappings at their low ends, then all at their high ends.
+
+    Not every combination, of which there may be 2^300: no rule over a list's items trades one
+    number off against another.
+    """
+    return [tuple({k: _outer(v)[end] for k, v in item.items()} for item in items) for end in (0, 1)]
+
+
+def _outer(value: Value) -> tuple[Plain, Plain]:
+    """The least and the greatest number; of what is none, the first and the last option."""
+    probes = value.probes()
+    numbers = [p for p in probes if is_number(p)]
+    return (min(numbers), max(numbers)) if numbers else (probes[0], probes[-1])
+
+
+# ---- JSON Schema ---------------------------------------------------------------------------------
+
+
+class _FileSchema(GenerateJsonSchema):
+    """Text may stand in a file without quotes, though it looks like a number."""
+
+    def str_schema(self, schema: cs.StringSchema) -> JsonSchemaValue:
+        return {**super().str_schema(schema), "type": ["string", "number", "boolean"]}
+
+
+def recipe_json_schema() -> JsonSchemaValue:
+    """JSON Schema (draft 2020-12) of a recipe file, for editors that complete and check YAML.
+
+    What JSON Schema cannot say (which end is the lower, rules between draws) is left to loading.
+    """
+    schema = recipe_file().model_json_schema(schema_generator=_FileSchema)
+    return {"$schema": _FileSchema.schema_dialect, **schema}
+
+
+def write_schema(path: str | Path) -> None:
+    """Write the schema to a file, as indented UTF-8 JSON.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = json.dumps(recipe_json_schema(), indent=2, ensure_ascii=False)
+    Path(path).write_text(text + "\n", encoding="utf-8")
