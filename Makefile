@@ -3,6 +3,7 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TEST_STAMP := $(VENV)/.installed-for-tests
 # One more than there are cores: some tests wait for disks, timers and other processes.
 TEST_WORKERS := $(shell expr $$(nproc 2>/dev/null || echo 1) + 1)
 # Python compiles a module when it first imports it, and most of what comes along never is: compiling
@@ -10,7 +11,7 @@ TEST_WORKERS := $(shell expr $$(nproc 2>/dev/null || echo 1) + 1)
 COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint bench check-system clean
+.PHONY: help setup setup-tests demo test test-all lint bench check-system clean
 
 help:
 	@echo "make demo   install, render the embedded street under five recipes, say where the pictures are"
@@ -19,16 +20,25 @@ help:
 	@echo "make lint   formatting, style and types"
 	@echo "make bench  time the rasteriser on this machine"
 
+# What the demo takes, and what the tests take besides: three times as much.
 setup: $(STAMP)
+
+setup-tests: $(TEST_STAMP)
 
 # torch comes first and alone: constraints.txt pins the version whose CPU build pip finds.
 $(STAMP): pyproject.toml constraints.txt | check-system
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade "pip>=23.1"
 	$(BIN)/pip install --quiet $(COMPILE) torch --constraint constraints.txt
-	$(BIN)/pip install --quiet $(COMPILE) --constraint constraints.txt --editable ".[test]" \
-	  >$(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
-	touch $(STAMP)
+	$(call install,".[video]")
+	touch $@
+
+$(TEST_STAMP): $(STAMP)
+	$(call install,".[test]")
+	touch $@
+
+install = $(BIN)/pip install --quiet $(COMPILE) --constraint constraints.txt --editable $(1) \
+	>$(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
 
 check-system:
 	@command -v $(PYTHON) >/dev/null || { \
@@ -62,13 +72,13 @@ demo: setup
 
 PYTEST := $(BIN)/python -m pytest -q --numprocesses $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder
 
-test: setup
+test: setup-tests
 	$(PYTEST) -m "not long"
 
-test-all: setup
+test-all: setup-tests
 	$(PYTEST)
 
-lint: setup
+lint: setup-tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright

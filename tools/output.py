@@ -8,8 +8,9 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from functools import cache, partial
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,34 +40,43 @@ def print_images(result: Any, took: str) -> None:
 
 
 @contextlib.contextmanager
-def compiling_noted(*, on_gpu: bool = False) -> Iterator[None]:
+def compiling_noted(modules: Sequence[str] = (), *, on_gpu: bool = False) -> Iterator[None]:
     """Says that kernels are compiled before the first of them is, and at the end how long it took.
 
-    What lies in numba's cache is loaded in silence. Triton does not tell beforehand: on a GPU what
-    takes longer than SILENT_S is taken to compile.
+    From the first on, other processes compile those of the modules whose names begin so. What lies
+    in numba's cache is loaded in silence. Triton does not tell beforehand: on a GPU what takes
+    longer than SILENT_S is taken to compile.
     """
     from numba.core.event import Event, TimingListener, install_listener
 
+    from augment.render.compile_ahead import compile_ahead
+
     note = "compiling kernels (once; kept for the next run) ..."
-    say_once = cache(partial(print_note, note))
+    beside, started = ExitStack(), time.perf_counter()
+
+    @cache
+    def say_once() -> float:
+        print_note(note)
+        if modules:
+            beside.enter_context(compile_ahead(modules))
+        return time.perf_counter()
 
     class Announcer(TimingListener):
         def on_start(self, event: Event) -> None:
             say_once()
             super().on_start(event)
 
-    announcer, started = Announcer(), time.perf_counter()
     timer = threading.Timer(SILENT_S, say_once)
     timer.daemon = True
     if on_gpu:
         timer.start()
     try:
-        with install_listener("numba:compile", announcer):
+        with beside, install_listener("numba:compile", Announcer()):
             yield
     finally:
         timer.cancel()
     if say_once.cache_info().misses:
-        seconds = time.perf_counter() - started if on_gpu else announcer.duration
+        seconds = time.perf_counter() - (started if on_gpu else say_once())
         print_note(f"compiled the kernels in {seconds:.1f} s")
 
 

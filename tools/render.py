@@ -40,7 +40,6 @@ from augment.plan import make_plan
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu import driver as cpu
 from augment.render.cuda.runtime import is_interpreted
-from augment.render.threads import thread_count
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
 from augment.views import render_view
@@ -79,7 +78,7 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
     """
     on_gpu = renders_on_gpu(backend)
-    with compiling_noted(on_gpu=on_gpu):
+    with compiling_noted(kernel_modules(recipes), on_gpu=on_gpu):
         if not on_gpu:
             warm_up(recipes)
             return
@@ -89,24 +88,11 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
         process.join()
 
 
-@contextlib.contextmanager
-def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
-    """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
-
-    numba compiles one kernel at a time in a process, and finds in its cache what another process
-    has compiled: `warm_up` in this one goes on from the first recipe until they meet.
-    """
-    if thread_count() < 2:
-        yield
-        return
-    spawn = multiprocessing.get_context("spawn")
-    beside = spawn.Process(target=_warm_recipes, args=(recipes[::-1],), daemon=True)
-    beside.start()
-    try:
-        yield
-        beside.join()
-    finally:
-        beside.kill()
+def kernel_modules(recipes: Sequence[Recipe]) -> list[str]:
+    """How the names of modules begin that hold the recipes' kernels for the CPU."""
+    present = [e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)]
+    folders = (type(effect).__module__.removesuffix(".effect") for effect in present)
+    return ["augment.kernels", "augment.render", *folders]
 
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
@@ -318,7 +304,7 @@ def render_recipes(options: RenderOptions) -> int:
     out, backend = options.out, options.backend
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
-    with compiling_noted(on_gpu=renders_on_gpu(backend)):
+    with compiling_noted(kernel_modules(tried), on_gpu=renders_on_gpu(backend)):
         warm_up(tried, backend)
     scene = open_scene(options.scene)
     if options.camera_path is None:
@@ -427,9 +413,9 @@ def run_demo(out: Path, frames: int) -> int:
     """The embedded street under five recipes, and pictures of it. Returns the exit code."""
     started = time.perf_counter()
     uri = f"procedural:street?seed=3&frames={frames}"
-    print_note(f"building {uri} and compiling the kernels (kept for the next run)")
+    print_note(f"building {uri}")
     recipes = [load_recipe(name).resolve(0) for name in DEMO_RECIPES]
-    with warming_up_beside(recipes):
+    with compiling_noted(["adapters.street", *kernel_modules(recipes)]):
         scene = open_scene(uri)
         warm_up(recipes)
     ready = time.perf_counter()

@@ -27,7 +27,7 @@ Form = str | list[Any]  # of a type, in JSON
 
 
 def describe_type(kind: Any) -> Form:
-    """A kernel argument's type: 'float32', 'float32[2]C', or a list of a tuple's class and parts."""
+    """A type that JSON can hold: 'int64', 'float32[2]C', or a list of a tuple's class and parts."""
     if isinstance(kind, types.Array):
         return f"{kind.dtype}[{kind.ndim}]{kind.layout}{'' if kind.mutable else ' read-only'}"
     if isinstance(kind, types.BaseTuple):
