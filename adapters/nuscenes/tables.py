@@ -539,16 +539,6 @@ class FrameFiles:
     images: Mapping[str, SensorFile]
 
 
-@dataclass(frozen=True)
-class FrameToken:
-    """What a frame's image or sweep is in the tables. token: of its row in sample_data. filename:
-    relative to the dataset's folder."""
-
-    token: str
-    filename: str
-    is_key_frame: bool
-
-
 def scene_frames(
     tables: SceneTables, *, sweeps: bool
 ) -> tuple[tuple[FrameFiles, ...], tuple[str, ...]]:
@@ -576,21 +566,6 @@ def scene_frames(
             )
     frames = zip(chosen, images, strict=True)
     return tuple(FrameFiles(i, *frame) for i, frame in enumerate(frames)), tuple(problems)
-
-
-def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameToken]]:
-    """What every frame of a scene is in the dataset's tables: by frame number (Frame.index, those
-    too that frames= leaves out) and channel (LIDAR_TOP among them), missing files included."""
-    options = NuScenesOptions.from_query("nuscenes", query)
-    tables = read_tables(Path(path), options.version, options.scene)
-    frames, _ = scene_frames(tables, sweeps=options.sweeps == "1")
-    return {
-        frame.index: {
-            file.channel: FrameToken(file.token, file.filename, file.is_key_frame)
-            for file in (frame.sweep, *frame.images.values())
-        }
-        for frame in frames
-    }
 
 
 def _match(sweeps: Sequence[SensorFile], files: Sequence[SensorFile]) -> dict[int, SensorFile]:

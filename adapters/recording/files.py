@@ -46,7 +46,8 @@ from augment.semantics import SemanticClass
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CALIBRATION = "calibration.json"
-_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
+_HINT = "docs/scenes.md shows what is in it"
+_IF_MISSING = f"a recording needs it, {_HINT}"
 _RIGID = 1e-4  # rotations written with six digits are off by a few millionths
 
 
@@ -224,7 +225,7 @@ class Calibration:
 def read_calibration(root: Path) -> Calibration:
     """The calibration of the recording in a folder."""
     path, content = _content(root)
-    settings = validated(_Settings, content, str(path))
+    settings = validated(_Settings, content, str(path), hint=_HINT)
     frames = sorted((_frame(path, entry) for entry in settings.frames), key=lambda f: f.index)
     for before, after in itertools.pairwise(frames):
         if after.index == before.index:
@@ -250,7 +251,7 @@ def read_calibration(root: Path) -> Calibration:
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
     """The calibration's lidar_classes alone."""
     path, content = _content(root)
-    return validated(_Settings, content, str(path)).lidar_classes
+    return validated(_Settings, content, str(path), hint=_HINT).lidar_classes
 
 
 def _content(root: Path) -> tuple[Path, dict[str, Any]]:
@@ -283,7 +284,7 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
 def _frame(path: Path, content: Any) -> Frame:
     number = content.get("frame") if isinstance(content, dict) else None
     where = f"{path}, frame {number!r:.20}"
-    entry = validated(_FrameEntry, content, where)
+    entry = validated(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
     for name, camera in entry.cameras.items():
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
