@@ -433,7 +433,9 @@ def field_table() -> str:
             path = section.PATH.removesuffix("[]")
             allowed = f"a list of up to {section.MAX_ITEMS} mappings, or null"
             rows.append(f"| `{path}` | {allowed} | `null` | {section.LIST_DESCRIPTION} |\n")
-        for spec in section.LEAVES.values():
+        for name, spec in section.LEAVES.items():
+            if name == "probability":  # told once, above the table
+                continue
             known = "" if spec.default is None else f"`{words(spec.default)}`"
             default = "required" if spec.required else "`null`" if spec.nullable else known
             rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")
