@@ -37,7 +37,7 @@ from adapters.street.splats import (
     shadow_gaussians,
     splat,
 )
-from adapters.street.world import MovingBody, Street, build_street
+from adapters.street.world import Street, build_street
 from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.errors import SceneError
@@ -76,7 +76,11 @@ def build_scene(parameters: StreetParameters) -> Scene:
     street = build_street(parameters)
     eyes, times = _eyes(parameters)
     static = plan_splats(street.static, eyes)
-    moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
+    moving = []
+    for mover in street.movers:
+        turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
+        seen_from = (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
+        moving.append(plan_splats(mover.body, seen_from))
     coarseness = coarseness_for([static, *moving], parameters.gaussians)
     actors = []
     for mover, plan in zip(street.movers, moving, strict=True):
@@ -106,12 +110,6 @@ def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
     count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MAX_EYES))
     times = np.linspace(0, last - first, count).round().astype(np.int64) + first
     return camera_path(parameters, times), times
-
-
-def _eyes_from(mover: MovingBody, eyes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The same places as a mover sees them."""
-    turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
-    return (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
 
 
 # ---- What the street's surfaces really are: distance, normal, class and colour along any ray -----

@@ -40,18 +40,19 @@ def value_noise(points: np.ndarray, seed: int = 0) -> np.ndarray:
     share = (points - base).astype(np.float32)
     share = share * share * (3 - 2 * share)
     index = sum(base[:, k].astype(np.int64) * _STEPS[k] for k in range(points.shape[1]))
-    index = index + seed * 7919
+    index = (index + seed * 7919) & (TABLE_SIZE - 1)
 
     def blend(offset: int, axes: int) -> np.ndarray:
         if axes == 0:
-            return _TABLE[(index + offset) & (len(_TABLE) - 1)]
+            return _TABLE[offset:][index]
         low, high = blend(offset, axes - 1), blend(offset + _STEPS[axes - 1], axes - 1)
         return low + share[:, axes - 1] * (high - low)
 
     return blend(0, points.shape[1])
 
 
-_TABLE = 2 * hashed(np.arange(1 << 16, dtype=np.int32)[:, None], 1) - 1
+TABLE_SIZE = 1 << 16
+_TABLE = np.tile(2 * hashed(np.arange(TABLE_SIZE, dtype=np.int32)[:, None], 1) - 1, 2)
 _STEPS = (1, 40503, 12289)  # far apart in the table, whichever few cells are compared
 
 

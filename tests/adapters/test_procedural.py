@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from shown import assert_same_bits
 
 from adapters.base import open_scene
 from adapters.procedural import StreetTruth, TrueView, open_procedural, open_truth
@@ -45,6 +46,7 @@ from adapters.street.layout import (
     pavement_z,
     road_z,
 )
+from adapters.street.light import build_sky
 from adapters.street.raycast import build_tree
 from adapters.street.splats import Cells, cell_counts, make_cells, total_cells
 from adapters.street.world import build_street
@@ -54,8 +56,6 @@ from augment.scene import Scene
 from augment.semantics import SemanticClass
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
-SMALL = {"gaussians": "60000", "frames": "2", "width": "64", "height": "36"}
-SMALL |= {"parked": "1", "moving": "1", "pedestrians": "1"}  # one of each kind
 
 
 @pytest.fixture(scope="module")
@@ -68,20 +68,17 @@ def truth() -> StreetTruth:
     return open_truth(QUERY)
 
 
-@pytest.mark.parametrize(
-    ("query", "message"),
-    [
+def test_invalid_queries_say_what_is_wrong():
+    for query, message in (
         ({"sede": "3"}, "unknown option 'sede'; .* seed: .*; frames: "),
         ({"seed": "three"}, "seed: Input should be a valid integer.*got three"),
         ({"seed": "-1"}, "seed: Input should be greater than or equal to 0"),
         ({"frames": "301"}, "frames: Input should be less than or equal to 300 .got 301"),
         ({"frames": "2.5"}, "frames: Input should be a valid integer"),
         ({"speed_mps": "nan"}, "speed_mps: Input should be"),
-    ],
-)
-def test_invalid_queries_say_what_is_wrong(query, message):
-    with pytest.raises(AdapterError, match=message):
-        open_procedural(query)
+    ):
+        with pytest.raises(AdapterError, match=message):
+            open_procedural(query)
 
 
 def test_canonical_uri_opens_the_same_parameters():
@@ -92,17 +89,13 @@ def test_canonical_uri_opens_the_same_parameters():
     assert parse_parameters(dict(pair.split("=") for pair in text.split("&"))) == parameters
 
 
-def test_same_query_gives_the_same_bits_and_another_seed_does_not():
+def test_same_query_gives_the_same_bits_and_another_seed_does_not(scene):
     state = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first = open_procedural({**SMALL, "seed": "8"})
     build_street.cache_clear()
-    again = open_scene(first.source)
-    for a, b in zip(_all_gaussians(first), _all_gaussians(again), strict=True):
-        for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
-            assert torch.equal(getattr(a, name), getattr(b, name)), name
-    assert torch.equal(first.sky.faces, again.sky.faces)
-    other = StreetParameters(seed=9)
-    assert not np.array_equal(draw_layout(other).trees, draw_layout(StreetParameters(seed=8)).trees)
+    build_sky.cache_clear()
+    assert_same_bits(scene, open_scene(scene.source))
+    other, own = (draw_layout(StreetParameters(seed=seed)) for seed in (9, 8))
+    assert not np.array_equal(other.trees, own.trees)
     assert torch.equal(state[0], torch.random.get_rng_state())
     assert np.array_equal(state[1], np.random.get_state()[1])  # noqa: NPY002
 
@@ -110,9 +103,9 @@ def test_same_query_gives_the_same_bits_and_another_seed_does_not():
 def test_scene_is_complete_and_finite(scene):
     assert scene.name == "street-seed3"
     assert scene.source == "procedural:street?seed=3&width=480&height=270"
-    total = sum(len(g) for g in _all_gaussians(scene))
-    assert 150_000 <= total <= 300_000
-    for gaussians in _all_gaussians(scene):
+    every = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    assert 280_000 <= sum(len(gaussians) for gaussians in every) <= 300_000
+    for gaussians in every:
         for name in ("means", "quats", "scales", "opacities", "sh"):
             assert torch.isfinite(getattr(gaussians, name)).all(), name
         assert gaussians.scales.min() > 0
@@ -249,10 +242,6 @@ def test_truth_sees_moving_things_where_they_are(truth):
         assert hits.instance[0] == 1 and hits.semantic[0] == SemanticClass.VEHICLE
         assert 10 - mover.size_m[2] / 2 - 1e-9 < hits.distance[0] < 10
         assert hits.normal[0, 2] > 0.5
-
-
-def _all_gaussians(scene: Scene) -> list:
-    return [scene.background, *(actor.gaussians for actor in scene.actors)]
 
 
 def _smooth_pixels(view: TrueView) -> np.ndarray:
@@ -443,13 +432,12 @@ def test_cameras_fire_as_the_beam_passes():
 
 
 def test_motion_agrees_with_its_track():
-    street = build_street(StreetParameters(seed=1, frames=3, moving=2, pedestrians=1))
-    for mover in street.movers:
-        track = mover.motion.track
-        times = START_NS + np.array([-350_000_000, -90_000_000, 0, 37_000_001, 1_000_000_000])
-        centres, present = mover.motion.at(times)
-        for time, centre, there in zip(times, centres, present, strict=True):
-            pose = track.pose_at(int(time))
+    layout = draw_layout(StreetParameters(seed=1, frames=3, moving=2, pedestrians=1))
+    times = START_NS + np.array([-350_000_000, -90_000_000, 0, 37_000_001, 1_000_000_000])
+    for mover in layout.movers:
+        motion = motion_of(mover, layout, 1.5, 0.0)
+        for time, centre, there in zip(times, *motion.at(times), strict=True):
+            pose = motion.track.pose_at(int(time))
             assert (pose is not None) == there
             if pose is not None:
                 # Both interpolate linearly; they differ by the rounding of times in seconds.
@@ -457,10 +445,7 @@ def test_motion_agrees_with_its_track():
 
 
 def test_motion_ends_where_the_street_does():
-    parameters = StreetParameters(seed=1, frames=300, moving=2, pedestrians=0)
-    street = build_street(parameters)
-    oncoming = street.movers[1]
-    assert len(oncoming.motion.times_ns) < 302
-    assert oncoming.motion.centres[:, 0].min() > street.layout.x0
-    again = motion_of(street.layout.movers[1], street.layout, oncoming.size_m[2], 0.0)
-    assert np.array_equal(again.times_ns, oncoming.motion.times_ns)
+    layout = draw_layout(StreetParameters(seed=1, frames=300, moving=2, pedestrians=0))
+    oncoming = motion_of(layout.movers[1], layout, 1.5, 0.0)
+    assert len(oncoming.times_ns) < 302
+    assert oncoming.centres[:, 0].min() > layout.x0
