@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, Text, read_json, validated
+from adapters.plain_files import Number, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -444,7 +444,6 @@ _CLASSES: tuple[tuple[str, int], ...] = (
     ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
     ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
 )  # fmt: skip
-_ClassNames = dict[Annotated[str, Field(pattern="^[0-9]{1,9}$")], Text]
 
 
 @dataclass(frozen=True, eq=False)
@@ -584,8 +583,12 @@ def class_meanings(root: Path) -> dict[int, int]:
     path = root / "annotations" / "semseg" / "classes.json"
     if not path.exists():
         return {number: meaning for number, (_, meaning) in enumerate(_CLASSES, start=1)}
-    names = validated(_ClassNames, read_json(path), f"{path} must map class numbers to names")
-    meaning = dict(_CLASSES)
+    names, meaning = read_json(path), dict(_CLASSES)
+    for key, name in names.items():
+        if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
+            raise AdapterError(
+                f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
+            )
     return {int(n): meaning.get(name, SemanticClass.UNKNOWN) for n, name in names.items()}
 
 

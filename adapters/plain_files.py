@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import reprlib
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
@@ -123,7 +124,8 @@ def validated(
     names = ".".join(map(str, found["loc"]))
     said = re.sub(r"^(Value error, |\w+ should )", "", str(found["msg"]))
     said = said if said.startswith("must ") else f"must {said}"
-    said = "is missing" if found["type"] == "missing" else f"{said}; got {found['input']!r:.100}"
+    got = reprlib.repr(found["input"])  # of a file's every entry it would be as large as the file
+    said = "is missing" if found["type"] == "missing" else f"{said}; got {got}"
     raise AdapterError(f"{where}: {names}{' ' if names else ''}{said}. {hint}")
 
 

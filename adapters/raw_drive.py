@@ -248,7 +248,9 @@ def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.n
     return ((points > low_m) & (points < high_m)).all(axis=1)
 
 
-def is_usable(sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray):
+def is_usable(
+    sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray
+) -> np.ndarray:
     """Which returns are finite, of a surface, and not in the recording car's box ego_m [2, 3] in
     its own axes, bool [N]. points_m: the sweep's in float64."""
     with np.errstate(all="ignore"):

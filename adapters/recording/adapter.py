@@ -298,9 +298,9 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
     files = lidar_files(root)
     known = [frame for frame in frames if frame.index in files]
     missing = [frame.index for frame in frames if frame.index not in files] if files else []
-    problems = [f"lidar/: the files of {some(missing)} are missing, their points too"] * bool(
-        missing
-    )
+    problems = []
+    if missing:
+        problems.append(f"lidar/: the files of {some(missing)} are missing, their points too")
     raws, timeless = [], []
     for frame in tqdm(known, desc="LiDAR", unit="frame", disable=None):
         sweep, numbers, has_times = _read_returns(files[frame.index], frame, calibration)

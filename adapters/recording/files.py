@@ -161,15 +161,18 @@ def _box(corners: tuple[_Vector, _Vector]) -> np.ndarray:
     return box
 
 
-def _classes(names: Mapping[str, str]) -> Mapping[int, int]:
+def _classes(names: Any) -> Mapping[int, int] | None:
+    if names is None:
+        return None
     meanings = {member.name.lower(): int(member) for member in SemanticClass}
     meanings["none"] = NO_SURFACE
     try:
-        return {int(number): meanings[name.lower()] for number, name in names.items()}
-    except (ValueError, KeyError) as error:
-        raise ValueError(
-            f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
-        ) from None
+        known = {int(number): meanings[str(name).lower()] for number, name in names.items()}
+        np.array([*known], np.int64)
+    except (AttributeError, ValueError, KeyError, OverflowError) as error:
+        text = f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
+        raise ValueError(text) from None
+    return known
 
 
 _Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
@@ -192,7 +195,7 @@ class _FrameEntry(BaseModel):
     frame: Annotated[_Nanoseconds, Field(ge=0)]
     timestamp_ns: _Nanoseconds
     world_from_ego: _Pose
-    cameras: dict[str, _CameraEntry]
+    cameras: dict[str, Any]
 
 
 class _Settings(BaseModel):
@@ -202,7 +205,7 @@ class _Settings(BaseModel):
     has_metric_scale: Any = True
     ego_above_ground_m: Number = 0.0
     ego_box_m: Annotated[tuple[_Vector, _Vector], AfterValidator(_box)] | None = None
-    lidar_classes: Annotated[dict[str, str], AfterValidator(_classes)] | None = None
+    lidar_classes: Annotated[Any, AfterValidator(_classes)] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,14 +289,16 @@ def _frame(path: Path, content: Any) -> Frame:
     where = f"{path}, frame {number!r:.20}"
     entry = validated(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
-    for name, camera in entry.cameras.items():
+    for name, values in entry.cameras.items():
+        own = f"{where}, camera {name!r:.80}"
+        camera = validated(_CameraEntry, values, own, hint=_HINT)
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns
         try:
             cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
         except ValueError as error:
-            raise AdapterError(f"{where}, camera {name!r}: {error}") from None
+            raise AdapterError(f"{own}: {error}") from None
     return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from drives import changed
-from shown import assert_same_bits, psnr, psnr_of, render
+from shown import psnr, psnr_of, render
 
 from adapters.base import open_scene
 from adapters.kitti.adapter import boxes_at, find_source, kitti_labels, open_kitti
@@ -149,23 +148,6 @@ def test_sweeps_pass_through_in_the_datasets_world(scene):
     assert sweep.columns["intensity"][-1] == np.float32(0.99)
     assert (sweep.columns["timestamp_ns"] == scene.frame(2).timestamp_ns).all()
     assert scene.lidar(9) is None
-
-
-def test_labels_alone_are_the_scenes_and_survive_pickling(scene, drive):
-    for labels in (kitti_labels(str(drive), QUERY), pickle.loads(pickle.dumps(scene.labels))):
-        np.testing.assert_array_equal(labels.lidar(1).points_m, scene.lidar(1).points_m)
-        np.testing.assert_array_equal(labels.boxes(1).centers_m, scene.boxes(1).centers_m)
-
-
-def test_held_out_frames_leave_no_trace(copy):
-    query = QUERY | {"held_out": "1::2", "voxel_m": "0.4"}
-    held = open_kitti(str(copy), query)
-    for path in copy.glob("image_*/data/0000000001.png"):
-        cv2.imwrite(str(path), np.zeros((street.HEIGHT, street.WIDTH, 3), np.uint8))
-    roof = np.array([[5.0, 0, 2, 0], [5.1, 0, 2, 0]] * 500, "<f4")
-    (copy / "velodyne_points/data/0000000001.bin").write_bytes(roof.tobytes())
-    assert_same_bits(held, open_kitti(str(copy), query))
-    assert len(held.frames) == 3 and set(held.frame(1).image_paths) == {"image_02", "image_03"}
 
 
 # One frame of the object benchmark

@@ -97,17 +97,6 @@ def test_labels_pass_through(scene):
     assert scene.lidar(7) is None and len(scene.boxes(7)) == 0
 
 
-def test_held_out_frames_leave_no_trace_in_the_gaussians(copy):
-    query = QUERY | {"held_out": "1:2"}
-    held = open_recording(str(copy), query)
-    for path in copy.glob("images/*/000001.png"):
-        cv2.imwrite(str(path), np.zeros((street.HEIGHT, street.WIDTH, 3), np.uint8))
-    columns = recording.sweep_columns(1)
-    recording.write_lidar(copy, 1, columns | {"z": columns["z"] + 3})
-    assert_same_bits(held, open_recording(str(copy), query))
-    assert len(held.frames) == 3 and held.frame(1).image_paths and len(held.boxes(1)) == 2
-
-
 def test_a_world_far_from_its_origin_is_recentred(tmp_path):
     offset = np.array([545_000.25, 4_183_000.5, 12.0])
     moved = open_recording(str(write_recording(tmp_path / "utm", offset_m=offset)), QUERY)
@@ -415,7 +404,7 @@ def put_camera(key: str, value, frame: int = 1):
 EYE = np.eye(4).tolist()
 WRONG_CALIBRATIONS = [
     (put_camera("world_from_camera", [[1, 0, 0, math.nan], *EYE[1:]]),
-     "frame 1: cameras.left_camera.world_from_camera.0.3 must be a finite number; got nan"),
+     "frame 1, camera 'left_camera': world_from_camera.0.3 must be a finite number; got nan"),
     (put(2, "world_from_ego", np.diag([1.0, 1, 2, 1]).tolist()),
      "frame 2: world_from_ego must be a rotation.*off by 3"),
     (put(2, "world_from_ego", np.diag([1.0, -1, 1, 1]).tolist()), "determinant -1"),
@@ -428,11 +417,11 @@ WRONG_CALIBRATIONS = [
     (put(2, "frame", 1), "lists frame 1 twice"),
     (put(2, "frame", -3), "frame must be greater than or equal to 0; got -3"),
     (put(2, "cameras", []), r"frame 2: cameras must be a valid dictionary; got \[\]"),
-    (put_camera("fx", None), "frame 1: cameras.left_camera.fx is missing"),
+    (put_camera("fx", None), "frame 1, camera 'left_camera': fx is missing"),
     (put_camera("fx", -5), "camera 'left_camera': .*fx must be finite and > 0"),
-    (put_camera("fx", "long"), "left_camera.fx must be a valid number; got 'long'"),
-    (put_camera("width", 10**9), "left_camera.width must be less than or equal to"),
-    (put_camera("timestamp_ns", "now"), "left_camera.timestamp_ns must be a valid integer"),
+    (put_camera("fx", "long"), "left_camera': fx must be a valid number; got 'long'"),
+    (put_camera("width", 10**9), "left_camera': width must be less than or equal to"),
+    (put_camera("timestamp_ns", "now"), "left_camera': timestamp_ns must be a valid integer"),
     (lambda c: c.update(frames=[]), r"frames must have at least 1 item .* got \[\]"),
     (lambda c: c.update(frames=3), "frames must be a valid list; got 3"),
     (lambda c: c.update(ego_above_ground_m="low"), "ego_above_ground_m must be a valid number"),
