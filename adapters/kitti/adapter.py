@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +84,7 @@ ATTRIBUTES = (
     "amt_border_l", "amt_border_r", "amt_border_kf",
 )  # fmt: skip
 _SIZE, _POSE = ("l", "w", "h"), ("tx", "ty", "tz", "rx", "ry", "rz")
+_TRACKLET_COLUMNS = ("number", "label", "frame", *_SIZE, *_POSE, *ATTRIBUTES)
 _MAX_BYTES, _MAX_TAGS = 64 * 2**20, 8_000_000
 _OWN_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")  # declares nothing
 _LAST_FRAME = 10**9
@@ -99,8 +100,7 @@ class KittiLabels:
     """Labels of a raw drive, or of one frame of the object benchmark.
 
     sweeps: files relative to the root, by frame. world_from_velodyne: float64 [4, 4] in the
-    dataset's world, by frame; frames without one have no labels. tracklets: of a raw drive that
-    has them.
+    dataset's world, by frame; frames without one have no labels. tracklets: of a raw drive.
     velodyne_from_rectified: of an object folder, where boxes are in label_2/. Sweeps have the
     columns x y z (float64 metres), intensity (the file's reflectance, 0 to 1) and timestamp_ns (the
     frame's: the file has none), in the file's order."""
@@ -109,17 +109,15 @@ class KittiLabels:
     sweeps: Mapping[int, str]
     timestamps_ns: Mapping[int, int]
     world_from_velodyne: Mapping[int, np.ndarray]
-    tracklets: pd.DataFrame | None = None
+    tracklets: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=_TRACKLET_COLUMNS))
     velodyne_from_rectified: np.ndarray | None = None
 
     def boxes(self, frame_index: int) -> Boxes:
         pose = self.world_from_velodyne.get(frame_index)
         if pose is None:
             return Boxes.empty()
-        if self.tracklets is not None:
-            return boxes_at(self.tracklets, frame_index, pose)
         if self.velodyne_from_rectified is None:
-            return Boxes.empty()
+            return boxes_at(self.tracklets, frame_index, pose)
         path = object_label_file(self.root, frame_index)
         if not path.exists():
             return Boxes.empty()
@@ -186,7 +184,7 @@ def read_tracklets(root: Path) -> pd.DataFrame | None:
             numbers = [_number(pose, name, where) for name in _POSE]
             extra = [_number(pose, name, where, otherwise=np.nan) for name in ATTRIBUTES]
             rows.append((number, label, frame, *size_m, *numbers, *extra))
-    return pd.DataFrame(rows, columns=["number", "label", "frame", *_SIZE, *_POSE, *ATTRIBUTES])
+    return pd.DataFrame(rows, columns=_TRACKLET_COLUMNS)
 
 
 def _number(element: ET.Element, name: str, where: str, *, otherwise: float | None = None) -> float:
@@ -462,6 +460,9 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
     poses = _raw_poses(root, calibration_folder, calibration, options, numbers, chosen, sweeps)
     located = poses.world_from_velodyne
     tracklets = read_tracklets(root)
+    labels = KittiLabels(root, sweeps, times, located)
+    if tracklets is not None:
+        labels = replace(labels, tracklets=tracklets)
     missing = [number for number in chosen.numbers if number not in located]
     problems = (
         *problems,
@@ -483,7 +484,7 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
         calibration,
         images,
         image_times,
-        KittiLabels(root, sweeps, times, located, tracklets),
+        labels,
         drive_origin(np.stack([pose[:3, 3] for _, pose in sorted(located.items())])),
         problems,
     )

@@ -16,7 +16,7 @@ from drives import changed
 from shown import psnr, psnr_of, render
 
 from adapters.base import open_scene
-from adapters.kitti.adapter import boxes_at, find_source, kitti_labels, open_kitti
+from adapters.kitti.adapter import ATTRIBUTES, boxes_at, find_source, kitti_labels, open_kitti
 from adapters.kitti.files import kitti_root, oxts_poses, registered_poses
 from adapters.uri import format_uri
 from augment.errors import AdapterError
@@ -445,6 +445,7 @@ def test_single_frames_are_left_out_or_gone_on_without(copy):
     assert len(scene.problems) == 7 and all(part in text for part in expected), text
     assert [frame.index for frame in scene.frames] == [0, 1]
     assert scene.lidar(1) is None and len(scene.lidar(0)) == len(bad)
+    assert len(scene.boxes(0)) == 0 and set(scene.boxes(0).attributes) == set(ATTRIBUTES)
     assert set(scene.frame(0).image_paths) == {"image_03"}
     assert set(scene.frame(1).cameras) == {"image_02", "image_03"}
     with pytest.raises(AdapterError, match=r"none of the 1 images of camera image_03 can be used"):

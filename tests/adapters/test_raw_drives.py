@@ -92,11 +92,13 @@ def _nuscenes(root: Path):
     return labels
 
 
-def _kitti(root: Path, velodyne_from_rectified: np.ndarray | None = None):
+def _kitti(root: Path, matrix: np.ndarray | None = None):
     drive = kitti_files.write_raw(root / "2011_09_26")
     pose = kitti_files.world_from_street() @ kitti_files.street_from_velo(0)
     (name,) = (p.relative_to(drive) for p in drive.glob("velodyne_points/data/*0.bin"))
-    return KittiLabels(drive, {0: str(name)}, {0: 10**18}, {0: pose}, None, velodyne_from_rectified)
+    return KittiLabels(
+        drive, {0: str(name)}, {0: 10**18}, {0: pose}, velodyne_from_rectified=matrix
+    )
 
 
 def _ours(root: Path) -> RecordingLabels:
