@@ -48,7 +48,7 @@ from adapters.street.layout import (
 )
 from adapters.street.light import build_sky
 from adapters.street.raycast import build_tree
-from adapters.street.splats import Cells, cell_counts, make_cells, total_cells
+from adapters.street.splats import Cells, SplatPlan, make_cells
 from adapters.street.world import build_street
 from augment.errors import AdapterError, SceneError
 from augment.render.rasterize import rasterize
@@ -279,9 +279,16 @@ def _some_shapes(rng: np.random.Generator, copies: int) -> Shapes:
     return join(parts)
 
 
-def _edges(shapes: Shapes, cells: Cells) -> np.ndarray:
-    """Sides of cells in metres, [N, 2, 3]."""
-    return cells.sides @ shapes.axes[cells.shape]
+def _plan(shapes: Shapes, *spacing: float, hidden: bool = False) -> SplatPlan:
+    """Splats this far apart along both axes of all shapes."""
+    spacings, seen = np.full((len(shapes), 2), spacing), np.full(len(shapes), hidden)
+    return SplatPlan(None, shapes, spacings, None, seen)
+
+
+def _cells(plan: SplatPlan) -> tuple[Cells, np.ndarray]:
+    """Cells, and their sides in metres [N, 2, 3]."""
+    cells = make_cells(plan.shapes, plan.counts(1.0), plan.hidden)
+    return cells, cells.sides @ plan.shapes.axes[cells.shape]
 
 
 def _brute_force(shapes: Shapes, origin: np.ndarray, direction: np.ndarray) -> float:
@@ -335,11 +342,10 @@ def test_ray_casting_matches_brute_force():
 
 def test_normals_are_unit_and_at_right_angles_to_the_cells():
     shapes = _some_shapes(np.random.default_rng(1), 1)
-    counts = cell_counts(shapes, np.full((len(shapes), 2), 0.05), np.zeros(len(shapes), bool))
-    cells = make_cells(shapes, counts, np.zeros(len(shapes), bool))
+    cells, edges = _cells(_plan(shapes, 0.05))
     normals = shapes.normals(cells.shape, cells.local)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
-    assert np.abs(np.einsum("nak,nk->na", _edges(shapes, cells), normals)).max() < 1e-9
+    assert np.abs(np.einsum("nak,nk->na", edges, normals)).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -355,34 +361,30 @@ def test_normals_are_unit_and_at_right_angles_to_the_cells():
     ],
 )
 def test_cells_cover_each_surface_once(shape, area, tolerance):
-    none = np.zeros(1, bool)
-    counts = cell_counts(shape, np.full((1, 2), 0.04), none)
-    cells = make_cells(shape, counts, none)
-    a, b = _edges(shape, cells).transpose(1, 0, 2)
-    covered = np.linalg.norm(np.cross(a, b), axis=1).sum()
+    _, edges = _cells(_plan(shape, 0.04))
+    covered = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
     assert covered == pytest.approx(area, rel=max(tolerance, 1e-9))
 
 
 def test_lattices_narrow_towards_crisp_edges_only():
     shape = parallelograms((0, 0, 0), (1, 0, 0), (0, 1, 0), LOOK, edges=U0)
-    none = np.zeros(1, bool)
-    cells = make_cells(shape, np.array([[10, 1]]), none)
+    plan = _plan(shape, 0.1, 1.0)
+    cells, _ = _cells(plan)
     order = np.argsort(cells.local[:, 0])
     width = cells.sides[order, 0, 0]
     borders = np.concatenate([[0], np.cumsum(width)])
     assert width[0] < width[1] < width[2] < width[3] == pytest.approx(0.1)
     assert width[-1] == pytest.approx(0.1) and borders[-1] == pytest.approx(1)
     assert np.allclose(cells.local[order, 0], (borders[1:] + borders[:-1]) / 2)
-    assert total_cells(shape, np.array([[10, 1]]), none) == len(width)
+    assert plan.total(1.0) == len(width)
 
 
 def test_hidden_panels_keep_their_cells_clear_of_crisp_edges():
     shape = parallelograms((0, 0, 0), (3, 0, 0), (0, 3, 0), LOOK, edges=ALL_EDGES)
-    hidden = np.ones(1, bool)
-    cells = make_cells(shape, cell_counts(shape, np.full((1, 2), 0.5), hidden), hidden)
+    cells, _ = _cells(_plan(shape, 0.5, hidden=True))
     assert cells.local[:, :2].min() > 0.1 and cells.local[:, :2].max() < 0.9
     small = parallelograms((0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), LOOK)
-    assert cell_counts(small, np.full((1, 2), 0.5), hidden).sum() == 0
+    assert _plan(small, 0.5, hidden=True).counts(1.0).sum() == 0
 
 
 def test_cutting_leaves_exactly_what_lies_outside_the_holes():
