@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, read_json, validated
+from adapters.plain_files import Number, read_image_size, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -135,10 +135,11 @@ class _Lens(BaseModel):
 
 
 class _CameraTrack(NamedTuple):
-    """One camera over the sequence: its lens (pixels), world_from_camera float64 [F, 4, 4] in the
-    dataset's world, and the times int64 [F] of its images."""
+    """One camera over the sequence: its lens and size (width, height), pixels; world_from_camera
+    float64 [F, 4, 4] in the dataset's world, and the times int64 [F] of its images."""
 
     lens: _Lens
+    size: tuple[int, int]
     world_from_camera: np.ndarray
     timestamps_ns: np.ndarray
 
@@ -160,9 +161,12 @@ def read_frames(
     if not folders:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
     cameras = {folder.name: _read_camera(folder, len(times_ns)) for folder in folders}
-    images = usable_images(
-        [Picture(f.name, n, f / f"{n:02d}.jpg") for f in folders for n in chosen.numbers]
-    )
+    pictures = [
+        Picture(folder.name, n, folder / f"{n:02d}.jpg", cameras[folder.name].size)
+        for folder in folders
+        for n in chosen.numbers
+    ]
+    images = usable_images(pictures, every_camera=False)
     origin = drive_origin(world_from_ego[:, :3, 3])
 
     def recentred(pose: np.ndarray) -> torch.Tensor:
@@ -178,7 +182,7 @@ def read_frames(
             cameras={
                 name: Camera(
                     name,
-                    *images.sizes[name],
+                    *camera.size,
                     **camera.lens.model_dump(),
                     camera_from_world=invert_rigid(recentred(camera.world_from_camera[n])),
                     timestamp_ns=int(camera.timestamps_ns[n]),
@@ -222,7 +226,11 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    return _CameraTrack(lens, poses, _read_times(folder / "timestamps.json", frames))
+    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((found for found in seen if not isinstance(found, str)), None)
+    if size is None:
+        raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
+    return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))
 
 
 def _read_times(path: Path, expected: int) -> np.ndarray:

@@ -210,9 +210,8 @@ def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, i
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
-    where = "by the calibration" if picture.size else "as the camera's others"
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, not {size(expected)} {where}; left out"
+    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------

@@ -437,7 +437,7 @@ def test_single_frames_are_left_out_or_gone_on_without(copy):
         "0000000001.bin must be returns of 16 bytes",
         "camera image_02, frame 0: its image is missing",
         "camera image_03, frame 1: ",
-        "is 160x70 pixels, not 160x72 by the calibration; left out",
+        "is 160x70 pixels, its camera 160x72; left out",
         "frame 0: left out 3 returns that are not finite",
         "has no tracklet_labels.xml: no boxes are known",
     )
@@ -598,7 +598,7 @@ def resized(drive: Path) -> None:
         (without("velodyne_points/data"), r"velodyne_points/data holds no sweep"),
         (emptied("velodyne_points/data"), r"there are no LiDAR returns in 3 frames .*has 0 bytes"),
         (emptied("image_03/data"), r"none of the 3 images of camera image_03 .* cut short"),
-        (resized, r"0000000000\.png is 80x36 pixels, not 160x72 by the calib"),
+        (resized, r"0000000000\.png is 80x36 pixels, its camera 160x72"),
         (lambda d: [shutil.rmtree(d / f"image_0{i}") for i in (2, 3)], r"expected image_02/data/"),
         (lambda d: (d.parent / "calib_cam_to_cam.txt").unlink(), r"no calib_cam_to_cam\.txt in it"),
         (lambda d: d.rename(d.parent / "elsewhere"), "is not a folder"),

@@ -522,7 +522,7 @@ def test_missing_and_damaged_files_are_problems(copy):
         "camera CAM_FRONT_LEFT, frame 2: ",
         "is cut short",
         "camera CAM_FRONT_LEFT, frame 10: ",
-        "is 80x48 pixels, not 160x96 by the calibration",
+        "is 80x48 pixels, its camera 160x96",
         "frame 0: lidarseg/",
         "is missing; its points have no class",
         "frame 5: lidarseg/",

@@ -385,7 +385,7 @@ def test_missing_files_of_single_frames_are_problems(copy):
         "00.jpg does not exist",
         "camera left_camera, frame 1: ",
         "01.jpg is cut short",
-        "02.jpg is 80x48 pixels, not 160x96 as the camera's others",
+        "02.jpg is 80x48 pixels, its camera 160x96",
     )
     text = "\n".join(scene.problems)
     assert len(scene.problems) == 6 and all(part in text for part in expected), text

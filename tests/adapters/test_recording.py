@@ -476,7 +476,7 @@ def test_images_that_cannot_be_used_are_problems(copy):
     assert set(frames[1].cameras) == {"front_camera", "left_camera"}
     assert problems[0] == "camera left_camera, frame 0: its image is missing"
     assert "000001.png is cut short" in problems[1]
-    assert "000002.png is 159x96 pixels, not 160x96 by the calibration" in problems[2]
+    assert "000002.png is 159x96 pixels, its camera 160x96" in problems[2]
     more = unlisted_images(copy, frames)
     assert "front_camera: 1 images, such as of frame 77, have no entry" in more[0]
     assert "images/roof belongs to no camera of calibration.json" in more[1]
