@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import nuscenes_files
@@ -344,7 +343,7 @@ PANDASET = Path(__file__).resolve().parents[3] / "shared" / "data" / "pandaset_m
 def test_street_origins_give_back_the_beams() -> None:
     parameters = StreetParameters(frames=2, lidar_columns=16, lidar_rings=8)
     labels = StreetLabels(parameters)
-    origins, directions, times = lidar_rays(SimpleNamespace(parameters=parameters), 1)
+    origins, directions, times = lidar_rays(parameters, 1)
     count = directions.shape[1]
     points = (origins[:, None] + 7.0 * directions).reshape(-1, 3)
     columns = {name: points[:, axis] for axis, name in enumerate("xyz")}
