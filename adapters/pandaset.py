@@ -46,6 +46,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
+    recentred,
     scene_of_drive,
     usable_images,
     world_classes,
@@ -168,23 +169,17 @@ def read_frames(
     ]
     images = usable_images(pictures, every_camera=False)
     origin = drive_origin(world_from_ego[:, :3, 3])
-
-    def recentred(pose: np.ndarray) -> torch.Tensor:
-        pose = pose.copy()
-        pose[:3, 3] -= origin
-        return torch.from_numpy(pose)
-
     frames = tuple(
         Frame(
             index=n,
             timestamp_ns=int(times_ns[n]),
-            world_from_ego=recentred(world_from_ego[n]),
+            world_from_ego=recentred(world_from_ego[n], origin),
             cameras={
                 name: Camera(
                     name,
                     *camera.size,
                     **camera.lens.model_dump(),
-                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n])),
+                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n], origin)),
                     timestamp_ns=int(camera.timestamps_ns[n]),
                 )
                 for name, camera in cameras.items()

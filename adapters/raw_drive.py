@@ -139,6 +139,13 @@ def drive_origin(positions_m: np.ndarray) -> np.ndarray:
     return np.round(positions_m[0]) if far else np.zeros(3)
 
 
+def recentred(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
+    """A pose [4, 4] of the dataset's world in the scene's."""
+    pose = world_from_thing.copy()
+    pose[:3, 3] -= world_origin_m
+    return torch.from_numpy(pose)
+
+
 # ---- Images --------------------------------------------------------------------------------------
 
 

@@ -59,6 +59,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_in_box,
+    recentred,
     scene_of_drive,
     some,
     stored_records,
@@ -391,14 +392,13 @@ def _read_sweeps(
 
 
 def _frame(source: Source, images: DriveImages, number: int) -> Frame:
-    pose = source.labels.world_from_velodyne[number].copy()
-    pose[:3, 3] -= source.world_origin_m
-    ego_from_world = invert_rigid(torch.from_numpy(pose))
+    pose = recentred(source.labels.world_from_velodyne[number], source.world_origin_m)
+    ego_from_world = invert_rigid(pose)
     time = source.labels.timestamps_ns[number]
     return Frame(
         index=number,
         timestamp_ns=time,
-        world_from_ego=torch.from_numpy(pose),
+        world_from_ego=pose,
         cameras={
             name: Camera(
                 name,
