@@ -343,7 +343,8 @@ def render_posed(gaussians, camera, settings=None, smog=None, pose=None):
 )
 def test_gradients_of_every_tensor(variant):
     camera = camera_ahead(4, 3, 7.0)
-    gaussians = smooth_gaussians(3, sh_degree=1 if variant == "classic" else 0)
+    count, sh_degree = (2, 1) if variant == "classic" else (3, 0)
+    gaussians = smooth_gaussians(count, sh_degree=sh_degree)
     pose = slight_pose((0.1, 0.2, -0.1))
     smog = Fog(0.1, (0.7, 0.6, 0.5), 3.0) if variant == "smog" else None
     settings = RasterSettings(antialiased=variant == "antialiased")
