@@ -11,7 +11,6 @@ import io
 import itertools
 import os
 import pickle
-import signal
 import socket
 import subprocess
 import sys
@@ -476,23 +475,6 @@ def test_what_others_left_is_not_listed_or_named(server, remote):
         server.request("PUT", f"{path}/{name}", b"")
     with pytest.raises(OutputError, match="delete what others have put there"):
         remote.list("")
-
-
-@pytest.mark.long
-def test_interrupts_wait_for_the_upload(server, remote):
-    remote.write("a", b"1")
-    server.fail(1, method="PUT", delay_s=0.3)
-    before = len(server.requests)
-
-    def interrupt():
-        wait_for(lambda: len(server.requests) > before)
-        signal.raise_signal(signal.SIGINT)
-
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            remote.write("a", b"22")
-    assert remote.read("a") == b"22"
 
 
 @pytest.mark.long
