@@ -286,7 +286,7 @@ def test_every_field_is_in_the_schema_with_its_description() -> None:
         node = node.get("anyOf", [node])[0]  # quality takes a word, too
         assert node["additionalProperties"] is False
         assert set(node["properties"]) == set(section.model_fields)
-        required = [name for name, leaf in section.LEAVES.items() if leaf.required]
+        required = [name for name, leaf in section.LEAVES.items() if leaf.info.is_required()]
         assert node.get("required", []) == required
         for name, leaf in section.LEAVES.items():
             assert leaf.description in node["properties"][name]["description"]
@@ -436,8 +436,10 @@ def field_table() -> str:
         for name, spec in section.LEAVES.items():
             if name == "probability":  # told once, above the table
                 continue
-            known = "" if spec.default is None else f"`{words(spec.default)}`"
-            default = "required" if spec.required else "`null`" if spec.nullable else known
+            default = spec.info.get_default()
+            known = "" if default is None else f"`{words(default)}`"
+            default = "`null`" if spec.nullable else known
+            default = "required" if spec.info.is_required() else default
             rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")
     return "".join(rows)
 
