@@ -47,6 +47,7 @@ from recipes.ranges import (
     Fixed,
     NamedFile,
     Normal,
+    Plain,
     TripleLine,
     Uniform,
     Value,
