@@ -653,6 +653,9 @@ def test_processes_contend(store, tmp_path):
 @pytest.mark.long
 def test_a_dead_process_is_followed(remote, tmp_path):
     """At once on this machine, after its lifetime elsewhere; where it could, it has released."""
+    with other_process(HOLDER, "0", remote.uri) as process:
+        assert process.wait(60) == 0
+    assert remote.list("") == {}
     local = open_store(tmp_path)
     with other_process(HOLDER, "60", local.uri, remote.uri) as holder:
         assert try_claim(local, "a") is None
@@ -665,9 +668,6 @@ def test_a_dead_process_is_followed(remote, tmp_path):
     wait_for(lambda: won.append(try_claim(remote, "a", SHORT)) or any(won))
     assert try_claim(remote, "a") is None
     won[-1].release()
-    with other_process(HOLDER, "0", remote.uri) as process:
-        assert process.wait(60) == 0
-    assert remote.list("") == {}
 
 
 @pytest.mark.long
@@ -741,17 +741,17 @@ def test_requests_that_arrive_late_hit_no_other_claim(server, remote):
 
 
 @pytest.mark.long
-def test_stores_that_cannot_hold_claims_are_refused(server, remote):
-    server.fail(1000, path="claims/a", status=503)
-    with pytest.raises(OutputError, match=r"cannot read .*claims/a.*run the same command again"):
-        try_claim(remote, "a")
-    for header in ("HTTP_IF_NONE_MATCH", "HTTP_IF_MATCH"):
+def test_stores_that_cannot_hold_claims_are_refused(server):
+    for message, fault in (
+        (r"ignores If-None-Match or If-Match", {"ignore": "HTTP_IF_NONE_MATCH"}),
+        (r"ignores If-None-Match or If-Match", {"ignore": "HTTP_IF_MATCH"}),
+        (r"needs? puts with If-None-Match", {"status": 501}),
+        (r"cannot read .*claims/a.*run the same command again", {"status": 503}),
+    ):
+        store = RemoteStore(server.uri(f"test-{next(_numbers)}"), QUICK)
+        place = {"path": "claims/a"} if fault == {"status": 503} else {"method": "PUT"}
+        server.fail(1000, **fault, **place)
+        with pytest.raises(OutputError, match=message):
+            try_claim(store, "a")
         server.forgive()
-        server.fail(1000, method="PUT", ignore=header)
-        with pytest.raises(OutputError, match="ignores If-None-Match or If-Match"):
-            try_claim(remote, "a")
-        assert remote.list("") == {}
-    server.forgive()
-    server.fail(1000, method="PUT", status=501)
-    with pytest.raises(OutputError, match=r"needs? puts with If-None-Match"):
-        try_claim(remote, "a")
+        assert store.list("") == {}
