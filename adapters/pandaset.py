@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, Text, read_json, validated
+from adapters.plain_files import Number, read_image_size, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -46,6 +46,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
+    recentred,
     scene_of_drive,
     usable_images,
     world_classes,
@@ -135,10 +136,11 @@ class _Lens(BaseModel):
 
 
 class _CameraTrack(NamedTuple):
-    """One camera over the sequence: its lens (pixels), world_from_camera float64 [F, 4, 4] in the
-    dataset's world, and the times int64 [F] of its images."""
+    """One camera over the sequence: its lens and size (width, height), pixels; world_from_camera
+    float64 [F, 4, 4] in the dataset's world, and the times int64 [F] of its images."""
 
     lens: _Lens
+    size: tuple[int, int]
     world_from_camera: np.ndarray
     timestamps_ns: np.ndarray
 
@@ -160,27 +162,24 @@ def read_frames(
     if not folders:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
     cameras = {folder.name: _read_camera(folder, len(times_ns)) for folder in folders}
-    images = usable_images(
-        [Picture(f.name, n, f / f"{n:02d}.jpg") for f in folders for n in chosen.numbers]
-    )
+    pictures = [
+        Picture(folder.name, n, folder / f"{n:02d}.jpg", cameras[folder.name].size)
+        for folder in folders
+        for n in chosen.numbers
+    ]
+    images = usable_images(pictures, every_camera=False)
     origin = drive_origin(world_from_ego[:, :3, 3])
-
-    def recentred(pose: np.ndarray) -> torch.Tensor:
-        pose = pose.copy()
-        pose[:3, 3] -= origin
-        return torch.from_numpy(pose)
-
     frames = tuple(
         Frame(
             index=n,
             timestamp_ns=int(times_ns[n]),
-            world_from_ego=recentred(world_from_ego[n]),
+            world_from_ego=recentred(world_from_ego[n], origin),
             cameras={
                 name: Camera(
                     name,
-                    *images.sizes[name],
+                    *camera.size,
                     **camera.lens.model_dump(),
-                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n])),
+                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n], origin)),
                     timestamp_ns=int(camera.timestamps_ns[n]),
                 )
                 for name, camera in cameras.items()
@@ -222,7 +221,11 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    return _CameraTrack(lens, poses, _read_times(folder / "timestamps.json", frames))
+    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((found for found in seen if not isinstance(found, str)), None)
+    if size is None:
+        raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
+    return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))
 
 
 def _read_times(path: Path, expected: int) -> np.ndarray:
@@ -305,13 +308,6 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
 # ---- Sweeps, and when their sensors saw the boxes ------------------------------------------------
 
 
-class _SensorSweep(NamedTuple):
-    """All returns of a frame. sensor: [N], 0 the spinning one, 1 the forward one."""
-
-    sweep: Sweep
-    sensor: np.ndarray
-
-
 def read_sweeps(
     root: Path, frames: Sequence[Frame], held_out: frozenset[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], tuple[BoxSample, ...], tuple[str, ...]]:
@@ -323,7 +319,7 @@ def read_sweeps(
     moving = _moving_boxes(root, frames, cuboids, origin)
     sweeps, boxes, problems = [], [], []
     for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
-        n, seen = frame.index, None
+        n = frame.index
         lidar = read_lidar(root, n)
         if lidar is None:
             problems.append(f"frame {n}: lidar/{n:02d}.pkl.gz is missing, its points too")
@@ -342,7 +338,7 @@ def read_sweeps(
                 if classes is None
                 else world_classes(classes, meaning),
             )
-            seen = _SensorSweep(sweep, lidar["d"].to_numpy())
+            sensor = lidar["d"].to_numpy()
             if n not in held_out:
                 keep = is_usable(sweep, world, frame.world_from_ego.numpy(), EGO_M)
                 sweeps.append(sweep.select(keep))
@@ -352,11 +348,11 @@ def read_sweeps(
                 f"frame {n}: annotations/cuboids/{n:02d}.pkl.gz is missing; moving objects are "
                 f"interpolated"
             )
-        elif seen is None:
+        elif lidar is None:
             boxes += moving[n]
         else:
-            sensors = sensors_of(table)
-            boxes += [_when_seen(box, seen, sensors[box.row], frame) for box in moving[n]]
+            own = sensors_of(table)
+            boxes += [_when_seen(b, own[b.row], sweep, sensor, frame) for b in moving[n]]
     return tuple(sweeps), tuple(boxes), tuple(problems)
 
 
@@ -386,21 +382,23 @@ def _moving_boxes(
     return by_frame
 
 
-def _when_seen(box: BoxSample, seen: _SensorSweep, sensor: int, frame: Frame) -> BoxSample:
-    """The box at the time when its sensor saw it, as boxes were drawn around returns of 0.1 s: the
-    median time of its returns in the box, else the time of the return of nearest bearing from the
-    car."""
-    points, times = seen.sweep.points, seen.sweep.timestamps_ns
+def _when_seen(
+    box: BoxSample, own: int, sweep: Sweep, sensor: np.ndarray, frame: Frame
+) -> BoxSample:
+    """The box at the time when its own sensor saw it, as boxes were drawn around returns of 0.1 s:
+    the median time of its returns in the box, else the time of the return of nearest bearing from
+    the car. sensor: [N], that of each of the sweep's returns."""
+    points, times = sweep.points, sweep.timestamps_ns
     pose, reach = box.world_from_box, float(np.linalg.norm(box.size_m))
     near = indices_between(points, pose[:3, 3] - reach, pose[:3, 3] + reach)
-    if sensor >= 0:
-        near = near[seen.sensor[near] == sensor]
+    if own >= 0:
+        near = near[sensor[near] == own]
     local = (points[near] - pose[:3, 3]) @ pose[:3, :3]
     inside = near[inside_box(local, box.size_m, _TIMING_MARGIN_M)]
     if len(inside):
         return replace(box, timestamp_ns=int(np.sort(times[inside])[len(inside) // 2]))
     finite = np.isfinite(points[:, 0])
-    ofs = finite & (seen.sensor == sensor) if (seen.sensor == sensor).any() else finite
+    ofs = finite & (sensor == own) if (sensor == own).any() else finite
     if not ofs.any():
         return box
     origin = frame.world_from_ego.numpy()[:2, 3]
@@ -449,7 +447,6 @@ _CLASSES: tuple[tuple[str, int], ...] = (
     ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
     ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
 )  # fmt: skip
-_ClassNames = dict[Annotated[str, Field(pattern="^[0-9]{1,9}$")], Text]
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,9 +498,28 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
     """The objects in the cuboids of some frames: tied by links in both directions, then in one,
     then, without a partner, by overlap: boxes of one class and both sensors that share MIN_OVERLAP
     on average. No tie makes two boxes of one sensor in one frame the same object."""
-    boxes = _Boxes.of(tables)
+    boxes = _Boxes(defaultdict(set), {}, {})
+    named: dict[tuple[str, str], None] = {}
+    for frame, table in tables.items():
+        siblings = table.get("cuboids.sibling_id", table["uuid"])
+        rows = zip(
+            table["uuid"].astype(str), siblings, sensors_of(table), table["label"], strict=True
+        )
+        for uuid, sibling, sensor, label in rows:
+            boxes.frames[uuid].add(frame)
+            boxes.sensors.setdefault(uuid, sensor)
+            kind = class_of_label(str(label))
+            boxes.kinds.setdefault(uuid, kind.name if kind else str(label))
+            named[uuid, sibling] = None
+    links = [pair for pair in named if pair[0] != pair[1] and pair[1] in boxes.frames]
+    links.sort(key=lambda pair: pair[::-1] not in named)
+    total: Counter[tuple[str, str]] = Counter()
+    for table in tables.values():
+        total.update(dict(_overlaps(table, boxes)))
+    mean = {(a, b): s / len(boxes.frames[a] & boxes.frames[b]) for (a, b), s in total.items()}
+    overlapping = [pair for pair, overlap in mean.items() if overlap >= MIN_OVERLAP]
     group = {uuid: [uuid] for uuid in boxes.frames}
-    for a, b in [*_links(tables, boxes), *_overlapping(tables, boxes)]:
+    for a, b in [*links, *sorted(overlapping, key=lambda pair: (-mean[pair], pair))]:
         if group[a] is not group[b] and boxes.are_one(group[a], group[b], (a, b)):
             group[a] += group[b]
             group |= dict.fromkeys(group[b], group[a])
@@ -513,25 +529,13 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
     return Objects({u: min(group[u], key=ranks.__getitem__) for u in order}, ranks)
 
 
-@dataclass(frozen=True, eq=False)
-class _Boxes:
-    """What the tables say of each uuid, in order of first appearance."""
+class _Boxes(NamedTuple):
+    """What the tables say of each uuid, in order of first appearance: its frames, its sensor, and
+    its class, or where that is not known its label."""
 
     frames: dict[str, set[int]]
     sensors: dict[str, int]
-    kinds: dict[str, str]  # the class, or where it is not known the label
-
-    @staticmethod
-    def of(tables: Mapping[int, pd.DataFrame]) -> _Boxes:
-        found = _Boxes(defaultdict(set), {}, {})
-        for frame, table in tables.items():
-            rows = zip(table["uuid"], sensors_of(table), table["label"], strict=True)
-            for uuid, sensor, label in rows:
-                found.frames[str(uuid)].add(frame)
-                found.sensors.setdefault(str(uuid), sensor)
-                kind = class_of_label(str(label))
-                found.kinds.setdefault(str(uuid), kind.name if kind else str(label))
-        return found
+    kinds: dict[str, str]
 
     def are_one(self, a: list[str], b: list[str], tie: tuple[str, str]) -> bool:
         """Whether all these uuids can be one object, two of them being tied: it has a box of each
@@ -545,26 +549,6 @@ class _Boxes:
 
     def same_sensor(self, a: str, b: str) -> bool:
         return self.sensors[a] == self.sensors[b] != _NO_SENSOR
-
-
-def _links(tables: Mapping[int, pd.DataFrame], boxes: _Boxes) -> list[tuple[str, str]]:
-    """Pairs of uuids that name each other, then those of which one names the other."""
-    named: dict[tuple[str, str], None] = {}
-    for table in tables.values():
-        if "cuboids.sibling_id" in table:
-            pairs = zip(table["uuid"].astype(str), table["cuboids.sibling_id"], strict=True)
-            named |= dict.fromkeys((a, b) for a, b in pairs if a != b and b in boxes.frames)
-    return sorted(named, key=lambda pair: pair[::-1] not in named)
-
-
-def _overlapping(tables: Mapping[int, pd.DataFrame], boxes: _Boxes) -> list[tuple[str, str]]:
-    """Pairs of uuids that lie in each other, the most overlapping first."""
-    total: Counter[tuple[str, str]] = Counter()
-    for table in tables.values():
-        total.update(dict(_overlaps(table, boxes)))
-    mean = {(a, b): s / len(boxes.frames[a] & boxes.frames[b]) for (a, b), s in total.items()}
-    tied = [pair for pair, overlap in mean.items() if overlap >= MIN_OVERLAP]
-    return sorted(tied, key=lambda pair: (-mean[pair], pair))
 
 
 def _overlaps(table: pd.DataFrame, boxes: _Boxes) -> Iterator[tuple[tuple[str, str], float]]:
@@ -602,8 +586,12 @@ def class_meanings(root: Path) -> dict[int, int]:
     path = root / "annotations" / "semseg" / "classes.json"
     if not path.exists():
         return {number: meaning for number, (_, meaning) in enumerate(_CLASSES, start=1)}
-    names = validated(_ClassNames, read_json(path), f"{path} must map class numbers to names")
-    meaning = dict(_CLASSES)
+    names, meaning = read_json(path), dict(_CLASSES)
+    for key, name in names.items():
+        if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
+            raise AdapterError(
+                f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
+            )
     return {int(n): meaning.get(name, SemanticClass.UNKNOWN) for n, name in names.items()}
 
 

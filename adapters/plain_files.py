@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import reprlib
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
@@ -110,17 +112,21 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def validated(kind: type[Value], content: object, where: str) -> Value:
-    """What a file holds as a model, or as another type of pydantic's. where: file and place in it,
-    for messages."""
+def validated(
+    kind: type[Value], content: object, where: str, *, hint: str = "Copy the file again"
+) -> Value:
+    """What a file holds as a model, or as another type of pydantic's. where: file and place in it.
+    hint: what to do where it is not such; both for messages."""
     try:
         return _adapter(kind).validate_python(content)
     except ValidationError as error:
         found = error.errors(include_url=False, include_context=False)[0]
-    names = [str(step) for step in found["loc"]]
-    said = str(found["msg"]).removeprefix("Value error, ").replace("Input should", "must")
-    said = "is missing" if found["type"] == "missing" else f"{said}; got {found['input']!r:.200}"
-    raise AdapterError(f"{where}: {'.'.join(names)}{' ' if names else ''}{said}")
+    names = ".".join(map(str, found["loc"]))
+    said = re.sub(r"^(Value error, |\w+ should )", "", str(found["msg"]))
+    said = said if said.startswith("must ") else f"must {said}"
+    got = reprlib.repr(found["input"])  # of a file's every entry it would be as large as the file
+    said = "is missing" if found["type"] == "missing" else f"{said}; got {got}"
+    raise AdapterError(f"{where}: {names}{' ' if names else ''}{said}. {hint}")
 
 
 def array_of(value: object) -> np.ndarray | None:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,7 +38,7 @@ from adapters.street.splats import (
     shadow_gaussians,
     splat,
 )
-from adapters.street.world import MovingBody, Street, build_street
+from adapters.street.world import Street, build_street
 from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.errors import SceneError
@@ -53,30 +54,21 @@ MAX_EYES = 40
 
 
 def open_procedural(query: Mapping[str, str]) -> Scene:
-    """The scene of a procedural street's query (keys as StreetParameters' fields).
+    """The scene of a procedural street's query (keys as StreetParameters' fields): Gaussians,
+    actors, sky, cameras and labels. Equal parameters, equal bits.
 
     Raises:
         AdapterError: unknown keys or values outside their limits.
     """
-    return build_scene(parse_parameters(query))
-
-
-def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
-    """The labels of a street's query.
-
-    Raises:
-        AdapterError: unknown keys or values outside their limits.
-    """
-    return StreetLabels(parse_parameters(query))
-
-
-def build_scene(parameters: StreetParameters) -> Scene:
-    """A street as Gaussians, actors, sky, cameras and labels. Equal parameters, equal bits."""
-    begun = time.perf_counter()
+    parameters, begun = parse_parameters(query), time.perf_counter()
     street = build_street(parameters)
     eyes, times = _eyes(parameters)
     static = plan_splats(street.static, eyes)
-    moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
+    moving = []
+    for mover in street.movers:
+        turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
+        seen_from = (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
+        moving.append(plan_splats(mover.body, seen_from))
     coarseness = coarseness_for([static, *moving], parameters.gaussians)
     actors = []
     for mover, plan in zip(street.movers, moving, strict=True):
@@ -108,17 +100,15 @@ def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
     return camera_path(parameters, times), times
 
 
-def _eyes_from(mover: MovingBody, eyes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The same places as a mover sees them."""
-    turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
-    return (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
+def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
+    """The labels of a street's query; raises as open_procedural does."""
+    return StreetLabels(parse_parameters(query))
 
 
 # ---- What the street's surfaces really are: distance, normal, class and colour along any ray -----
 
 
-@dataclass(frozen=True, eq=False)
-class RayHits:
+class RayHits(NamedTuple):
     """What N rays see. distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards
     the ray's origin; zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's
     index. rgb [N, 3]: display-encoded, with baked light, zero for sky; None unless asked for.
@@ -133,8 +123,7 @@ class RayHits:
     rgb: np.ndarray | None
 
 
-@dataclass(frozen=True, eq=False)
-class TrueView:
+class TrueView(NamedTuple):
     """A camera's image as it should be. rgb float32 [H, W, 3] with sky; depth float64 [H, W]: z,
     infinite for sky; normal [H, W, 3]; semantic int16 [H, W]; instance int32 [H, W]."""
 
@@ -266,13 +255,14 @@ REFLECTIVITY = {
 }
 
 
-def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lidar_rays(
+    parameters: StreetParameters, frame_index: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Origins [C, 3], unit directions [C, R, 3] and times [C] of a sweep of C columns, R rings.
 
     The beam starts behind the car half a frame early, turns clockwise, and looks ahead at the
     frame's time. Ring 0 is the lowest.
     """
-    parameters = street.parameters
     columns, rings = parameters.lidar_columns, parameters.lidar_rings
     turn = (np.arange(columns) + 0.5) / columns - 0.5
     times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
@@ -289,34 +279,6 @@ def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> n
     forward, left, up = SENSOR_M
     c, s = np.cos(yaws), np.sin(yaws)
     return positions + xyz(c * forward - s * left, s * forward + c * left, up)
-
-
-def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
-    """One turn's returns. Columns: x, y, z float64 metres; intensity float32 in [0, 1];
-    timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as images')."""
-    origins, directions, times = lidar_rays(truth.street, frame_index)
-    rings = directions.shape[1]
-    origin, time = np.repeat(origins, rings, axis=0), np.repeat(times, rings)
-    direction = directions.reshape(-1, 3)
-    hits = truth.cast(origin, direction, time, with_rgb=False)
-    kept = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
-    distance, semantic = hits.distance[kept], hits.semantic[kept]
-    points = origin[kept] + distance[:, None] * direction[kept]
-    reflectivity = np.array([REFLECTIVITY.get(value, 0.0) for value in SemanticClass])
-    incidence = np.abs((hits.normal[kept] * direction[kept]).sum(1))
-    intensity = reflectivity[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
-    return LidarSweep(
-        {
-            "x": points[:, 0],
-            "y": points[:, 1],
-            "z": points[:, 2],
-            "intensity": intensity.astype(np.float32),
-            "timestamp_ns": time[kept],
-            "ring": np.tile(np.arange(rings), len(times))[kept].astype(np.uint8),
-            "semantic": semantic.astype(np.uint8),
-            "instance": hits.instance[kept].astype(np.uint16),
-        }
-    )
 
 
 @dataclass(frozen=True)
@@ -352,8 +314,29 @@ class StreetLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep:
+        """One turn's returns. Columns: x, y, z float64 metres; intensity float32 in [0, 1];
+        timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as
+        images')."""
         self._time_ns(frame_index)
-        return sweep(StreetTruth(build_street(self.parameters)), frame_index)
+        origins, directions, times = lidar_rays(self.parameters, frame_index)
+        rings = directions.shape[1]
+        origin, time = np.repeat(origins, rings, axis=0), np.repeat(times, rings)
+        direction = directions.reshape(-1, 3)
+        truth = StreetTruth(build_street(self.parameters))
+        hits = truth.cast(origin, direction, time, with_rgb=False)
+        kept = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
+        distance, semantic = hits.distance[kept], hits.semantic[kept]
+        x, y, z = (origin[kept] + distance[:, None] * direction[kept]).T
+        reflectivity = np.array([REFLECTIVITY.get(value, 0.0) for value in SemanticClass])
+        incidence = np.abs((hits.normal[kept] * direction[kept]).sum(1))
+        intensity = reflectivity[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
+        return LidarSweep({
+            "x": x, "y": y, "z": z, "intensity": intensity.astype(np.float32),
+            "timestamp_ns": time[kept],
+            "ring": np.tile(np.arange(rings), len(times))[kept].astype(np.uint8),
+            "semantic": semantic.astype(np.uint8),
+            "instance": hits.instance[kept].astype(np.uint16),
+        })  # fmt: skip
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
         """The SemanticClass of each return: the sweeps' own numbers."""

@@ -139,6 +139,13 @@ def drive_origin(positions_m: np.ndarray) -> np.ndarray:
     return np.round(positions_m[0]) if far else np.zeros(3)
 
 
+def recentred(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
+    """A pose [4, 4] of the dataset's world in the scene's."""
+    pose = world_from_thing.copy()
+    pose[:3, 3] -= world_origin_m
+    return torch.from_numpy(pose)
+
+
 # ---- Images --------------------------------------------------------------------------------------
 
 
@@ -210,9 +217,8 @@ def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, i
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
-    where = "by the calibration" if picture.size else "as the camera's others"
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, not {size(expected)} {where}; left out"
+    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------
@@ -248,7 +254,9 @@ def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.n
     return ((points > low_m) & (points < high_m)).all(axis=1)
 
 
-def is_usable(sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray):
+def is_usable(
+    sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray
+) -> np.ndarray:
     """Which returns are finite, of a surface, and not in the recording car's box ego_m [2, 3] in
     its own axes, bool [N]. points_m: the sweep's in float64."""
     with np.errstate(all="ignore"):

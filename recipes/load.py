@@ -157,7 +157,7 @@ def _template(
     given = read_file(_with_parents(tree, place, problems), problems)
     problems.raise_if_any()
     top = {
-        key: given.pop(key).value if key in given else leaf.default
+        key: given.pop(key).value if key in given else leaf.info.default
         for key, leaf in recipe_file().LEAVES.items()
     }
     last = top["variant"] + top["variants"] - 1
@@ -200,6 +200,8 @@ def _with_parents(tree: MapNode, place: Place, problems: Problems) -> MapNode:
     """The tree over the one that it extends, which is over its own, and so on."""
     chain = [_identity(place)]
     while (parent := tree.pop("extends", None)) is not None:
+        if isinstance(parent, ScalarNode) and parent.value is None:
+            break
         text, place = _read_parent(parent)
         chain.append(_identity(place))
         if chain[-1] in chain[:-1]:

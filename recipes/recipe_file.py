@@ -12,7 +12,7 @@ import json
 import operator
 import types
 from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
@@ -84,33 +84,25 @@ class Leaf:
     """A field that holds a value. Its `type`, in a model, reads a node into a `ranges.Value`.
 
     path: as in a file, with [] for the items of a list. annotation: of the value where it is not
-    null. title: what it is in words, where the type does not say enough.
+    null. info: what else pydantic knows of the field.
     """
 
     path: str
     annotation: Any
     nullable: bool = False
     rangeable: bool = True
-    description: str = ""
-    required: bool = True
-    default: Any = None
-    title: str | None = None
+    info: FieldInfo = field(default_factory=FieldInfo)
 
     @classmethod
     def of(cls, path: str, info: FieldInfo, *, rangeable: bool) -> Leaf:
         """The one of a model's field."""
         inner, nullable = _without_none(info.annotation)
-        required = info.is_required()
-        return cls(
-            path=path,
-            annotation=Annotated[inner, *info.metadata] if info.metadata else inner,
-            nullable=nullable,
-            rangeable=rangeable,
-            description=_one_line(info.description),
-            required=required,
-            default=None if required else info.default,
-            title=info.title,
-        )
+        annotation = Annotated[inner, *info.metadata] if info.metadata else inner
+        return cls(path, annotation, nullable, rangeable, info)
+
+    @property
+    def description(self) -> str:
+        return _one_line(self.info.description)
 
     @cached_property
     def type(self) -> Any:
@@ -186,7 +178,7 @@ class Leaf:
         elif self.words:
             text = f"one of {', '.join(self.words)}"
         else:
-            text = self.title or self._schema.get("title", "text")
+            text = self.info.title or self._schema.get("title", "text")
         return text + (", or null" if self.nullable and not is_number(value) else "")
 
     def _allowed_number(self, value: object) -> str:
@@ -415,7 +407,7 @@ def recipe_file() -> type[Section]:
 @functools.lru_cache(2)
 def _recipe_file(sections: tuple[tuple[str, type[BaseModel]], ...]) -> type[Section]:
     """sections: those of Recipe at the time."""
-    return _section("", Recipe)
+    return _section("", Recipe, _FileFields)
 
 
 def read_file(tree: MapNode, problems: Problems) -> Given:
@@ -450,75 +442,54 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
     return node.place, f"{path} = {show(node)}: {item['msg'].replace('Input should', 'must', 1)}"
 
 
-_PARENT = Field(
-    min_length=1,
-    max_length=4096,
-    title="a preset's name, or a file in the recipe's folder or below it",
-)
-_EXTRA_LEAVES = (
-    Leaf(
-        "variants",
-        Annotated[Whole, Field(ge=1, le=1_000_000)],
-        rangeable=False,
-        description="How many recipes are drawn from this file.",
-        required=False,
-        default=1,
-    ),
-    Leaf(
-        "extends",
-        Annotated[str, Strict(), _PARENT],
-        rangeable=False,
-        description="The recipe whose fields hold where this file gives none.",
-        required=False,
-    ),
-)
+class _FileFields(Closed):
+    """What a file says besides what a recipe in numbers does."""
+
+    variants: Whole = Field(default=1, ge=1, le=1_000_000)
+    """How many recipes are drawn from this file."""
+    extends: Annotated[str, Strict()] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=4096,
+        title="a preset's name, or a file in the recipe's folder or below it",
+    )
+    """The recipe whose fields hold where this file gives none."""
 
 
-def _section(
-    path: str,
-    model: type[BaseModel],
-    *,
-    is_effect: bool = False,
-    list_info: FieldInfo | None = None,
-) -> type[Section]:
+class _EffectFields(Closed):
+    """What a file says of an effect besides."""
+
+    probability: Unit = 1.0
+    """Share of the variants that have this effect."""
+
+
+def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) -> type[Section]:
+    """extra: its fields may be given besides those of the model, and take no ranges."""
     leaves: dict[str, Leaf] = {}
     inner: dict[str, type[Section]] = {}
     fields: dict[str, Any] = {}
-
-    def add(leaf: Leaf) -> None:
-        name = leaf.path.rpartition(".")[2]
-        text = leaf.description + (f" [{leaf.unit}]" if leaf.unit else "")
-        default = ... if leaf.required else leaf.default
-        fields[name], leaves[name] = (leaf.type, Field(default=default, description=text)), leaf
-
-    for name, info in model.model_fields.items():
+    for name, info in {**model.model_fields, **extra.model_fields}.items():
         below = join(path, name)
         kind, nullable = _without_none(info.annotation)
         arguments = get_args(kind)
         if get_origin(kind) is tuple and arguments[1:] == (...,):
-            item = inner[name] = _section(f"{below}[]", arguments[0], list_info=info)
-            most, reader = (
-                Field(max_length=item.MAX_ITEMS),
-                WrapValidator(partial(_read_list, item)),
-            )
-            fields[name] = (Annotated[list[item] | None, most, reader], None)
+            item = inner[name] = _section(f"{below}[]", arguments[0])
+            (item.MAX_ITEMS,) = (m.max_length for m in info.metadata if isinstance(m, MaxLen))
+            item.LIST_DESCRIPTION = _one_line(info.description)
+            read = WrapValidator(partial(_read_list, item))
+            most = Field(max_length=item.MAX_ITEMS)
+            fields[name] = (Annotated[list[item] | None, most, read], None)
         elif isinstance(kind, type) and issubclass(kind, BaseModel):
-            inner[name] = _section(below, kind, is_effect=nullable)
+            inner[name] = _section(below, kind, _EffectFields if nullable else Closed)
             fields[name] = (inner[name] | None, None)
         else:
-            add(Leaf.of(below, info, rangeable=bool(path) and kind != Digest))
-    own = _EXTRA_LEAVES if not path else ()
-    if is_effect:
-        text = "Share of the variants that have this effect."
-        own = (Leaf(join(path, "probability"), Unit, False, False, text, False, 1.0),)
-    for leaf in own:
-        add(leaf)
-    title = "ClimateGS recipe" if not path else model.__name__
+            rangeable = bool(path) and name not in extra.model_fields and kind != Digest
+            leaf = leaves[name] = Leaf.of(below, info, rangeable=rangeable)
+            text = leaf.description + (f" [{leaf.unit}]" if leaf.unit else "")
+            fields[name] = (leaf.type, Field(default=info.default, description=text))
+    title = model.__name__ if path else "ClimateGS recipe"
     made = create_model(title, __base__=Section, __doc__=_one_line(model.__doc__), **fields)
     made.PATH, made.MODEL, made.LEAVES, made.INNER = path, model, leaves, inner
-    if list_info is not None:
-        limits = [rule.max_length for rule in list_info.metadata if isinstance(rule, MaxLen)]
-        made.MAX_ITEMS, made.LIST_DESCRIPTION = limits[0], _one_line(list_info.description)
     return made
 
 
@@ -555,63 +526,56 @@ def _plain(number: float) -> str:
 def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
     """What the section's model says against any combination of the ranges' ends, each text once."""
     found: set[str] = set()
-    ends = {
-        name: _ends(value, section.LEAVES.get(name))
+    ends = [
+        _ends(name, value, section.LEAVES.get(name))
         for name, value in given.items()
         if name in section.MODEL.model_fields and not isinstance(value, dict)
-    }
-    for combination in itertools.product(*ends.values()):
-        corner = dict(zip(ends, combination, strict=True))
+    ]
+    for corner in itertools.product(*ends):
         try:
-            section.MODEL.model_validate(corner)
+            section.MODEL.model_validate({name: end for name, end, _ in corner})
         except ValidationError as error:
-            drawn = [_drawn(name, given[name], end) for name, end in corner.items()]
-            where = f" (in a draw with {', '.join(filter(None, drawn))})" if any(drawn) else ""
+            drawn = ", ".join(text for _, _, text in corner if text)
             texts = dict.fromkeys(readable(error))
-            yield from (f"{text}{where}" for text in texts if text not in found)
+            new = [text for text in texts if text not in found]
+            yield from (f"{text} (in a draw with {drawn})" if drawn else text for text in new)
             found.update(texts)
 
 
-def _drawn(name: str, value: Value | list[Given], end: Any) -> str:
-    """Where a range stands in a draw; '' for what is no range."""
-    if isinstance(value, list):
-        low, high = _list_ends(value)
-        which = "low" if end == low else "high"
-        return f"all {name} at the {which} ends of their ranges" if low != high else ""
-    return f"{name} = {words(end)}" if value.is_range else ""
-
-
-def _ends(value: Value | list[Given], leaf: Leaf | None) -> list[Any]:
-    """What a rule between fields can depend on: the extreme numbers, null, and every word.
+def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tuple[str, Any, str]]:
+    """What a rule between fields can depend on: the extreme numbers, null, and every word; with
+    the field's name before each, and how it is told behind, where the value is a range.
 
     A handful, for the product over a section's fields. No rule compares colours or names of files.
     """
     if isinstance(value, list):
-        return _list_ends(value)
+        low, high = (tuple(_extremes(item, end) for item in value) for end in (min, max))
+        if low == high:
+            return [(name, low, "")]
+        where = f"all {name} at the %s ends of their ranges"
+        return [(name, low, where % "low"), (name, high, where % "high")]
     probes = value.probes()
     numbers = [p for p in probes if is_number(p)]
-    triples = [p for p in probes if isinstance(p, tuple)]
     others = [p for p in probes if p is None or isinstance(p, str | bool)]
     if leaf is not None and leaf.kind is str:
         others = sorted(others, key=lambda p: p is not None)[: 1 + (None in others)]
-    ends: list[Plain] = [min(numbers), max(numbers)] if numbers else []
-    return list(dict.fromkeys([*ends, *triples[:1], *others]))
+    triples = [p for p in probes if isinstance(p, tuple)]
+    outer: list[Plain] = [min(numbers), max(numbers)] if numbers else []
+    ends: dict[Plain, None] = dict.fromkeys([*outer, *triples[:1], *others])
+    return [(name, end, f"{name} = {words(end)}" if value.is_range else "") for end in ends]
 
 
-def _list_ends(items: list[Given]) -> list[tuple[dict[str, Any], ...]]:
-    """All numbers of a list's mappings at their low ends, then all at their high ends.
+def _extremes(item: Given, of: Callable[[Any], Any]) -> dict[str, Any]:
+    """Of a list's mapping, all numbers at one end.
 
     Not every combination, of which there may be 2^300: no rule over a list's items trades one
     number off against another.
     """
-    return [tuple({k: _outer(v)[end] for k, v in item.items()} for item in items) for end in (0, 1)]
-
-
-def _outer(value: Value) -> tuple[Plain, Plain]:
-    """The least and the greatest number; of what is none, the first and the last option."""
-    probes = value.probes()
-    numbers = [p for p in probes if is_number(p)]
-    return (min(numbers), max(numbers)) if numbers else (probes[0], probes[-1])
+    extremes = {}
+    for name, value in item.items():
+        numbers = [probe for probe in value.probes() if is_number(probe)]
+        extremes[name] = of(numbers) if numbers else value.probes()[0]
+    return extremes
 
 
 # ---- JSON Schema ---------------------------------------------------------------------------------

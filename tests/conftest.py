@@ -75,9 +75,8 @@ _compile_each_kernel_once()
 LONG = {
     f"test_{name}.py"
     for name in (
-        "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
-        "flood_view", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
-        "render_backward", "snow_view",
+        "bench", "cli", "fit", "fit_report", "flood_view", "generate", "generate_ray",
+        "job_workers", "packages", "procedural", "render_backward", "snow_view", "store", "style",
     )
 }  # fmt: skip
 

@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from augment.cameras import Camera
@@ -134,11 +135,15 @@ def slight_pose(translation=(0.1, 0.2, -0.1)) -> torch.Tensor:
     return rigid(rotmat_from_quat(quat), torch.tensor(translation, dtype=torch.float64))
 
 
-GOLDEN = ("edge", "garden_small", "opaque")
-GOLDEN_MODES = (
-    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
-    *(f"a99_classic_sh{degree}" for degree in range(4)),
-)
+# Stored scenes and how they were rendered; all but those of the first take long.
+GOLDEN = [
+    pytest.param(name, mode, marks=[pytest.mark.long] if name != "edge" else [])
+    for name in ("edge", "garden_small", "opaque")
+    for mode in (
+        *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
+        *(f"a99_classic_sh{degree}" for degree in range(4)),
+    )
+]
 
 
 def golden_view(

@@ -17,7 +17,7 @@ from typing import Annotated, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from adapters.plain_files import LARGEST, read_json
+from adapters.plain_files import LARGEST, Number, read_json
 from adapters.world import invert_pose
 from augment.errors import AdapterError
 from augment.jobs.manifest import MAX_SIDE_PX
@@ -115,8 +115,6 @@ def look_at_pose(
 # ---- JSON of other tools: INRIA's cameras.json and nerfstudio's transforms.json ------------------
 
 Model = TypeVar("Model", bound=BaseModel)
-# No texts, true or false, which pydantic otherwise takes for numbers; and none beyond LARGEST.
-Number = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Vector = tuple[Number, Number, Number]
 Row = tuple[Number, Number, Number, Number]
 Pose = Annotated[list[Row], Field(min_length=3, max_length=4)]

@@ -30,8 +30,16 @@ from pydantic import (
     model_validator,
 )
 
-from adapters.camera_files.camera_files import Number, validate
-from adapters.plain_files import array_of, inside, read_json, read_numbers, read_pose, read_yaml
+from adapters.camera_files.camera_files import validate
+from adapters.plain_files import (
+    Number,
+    array_of,
+    inside,
+    read_json,
+    read_numbers,
+    read_pose,
+    read_yaml,
+)
 from adapters.raw_drive import DriveOptions, stored_records
 from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +59,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_in_box,
+    recentred,
     scene_of_drive,
     some,
     stored_records,
@@ -83,7 +84,8 @@ ATTRIBUTES = (
     "state", "occlusion", "occlusion_kf", "truncation", "amt_occlusion", "amt_occlusion_kf",
     "amt_border_l", "amt_border_r", "amt_border_kf",
 )  # fmt: skip
-_POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
+_SIZE, _POSE = ("l", "w", "h"), ("tx", "ty", "tz", "rx", "ry", "rz")
+_TRACKLET_COLUMNS = ("number", "label", "frame", *_SIZE, *_POSE, *ATTRIBUTES)
 _MAX_BYTES, _MAX_TAGS = 64 * 2**20, 8_000_000
 _OWN_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")  # declares nothing
 _LAST_FRAME = 10**9
@@ -108,7 +110,7 @@ class KittiLabels:
     sweeps: Mapping[int, str]
     timestamps_ns: Mapping[int, int]
     world_from_velodyne: Mapping[int, np.ndarray]
-    tracklets: tuple[Tracklet, ...] = ()
+    tracklets: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=_TRACKLET_COLUMNS))
     velodyne_from_rectified: np.ndarray | None = None
 
     def boxes(self, frame_index: int) -> Boxes:
@@ -163,58 +165,62 @@ def object_label_file(root: Path, frame: int) -> Path:
     return file_in(root, f"label_2/{frame:0{OBJECT_DIGITS}d}.txt")
 
 
-@dataclass(frozen=True, eq=False)
-class Tracklet:
-    """One object over T frames from first_frame on.
-
-    size_m: length, width, height. poses: float64 [T, 6], the middle of the box's bottom and its
-    turns about x, y, z, as in the file. attributes: float64 [T, 9], NaN where there is none."""
-
-    label: str
-    size_m: np.ndarray
-    first_frame: int
-    poses: np.ndarray
-    attributes: np.ndarray
-
-
-def read_tracklets(root: Path) -> tuple[Tracklet, ...] | None:
-    """The drive's tracklets in the file's order, or None without the file."""
+def read_tracklets(root: Path) -> pd.DataFrame | None:
+    """The boxes of the drive's tracklets, a row each: number of the tracklet in the file from 0,
+    label, frame, size, pose of the middle of the bottom, and ATTRIBUTES, NaN where there is none.
+    None without the file."""
     path = file_in(root, TRACKLETS)
     if not path.exists():
         return None
-    items = _parsed(path).findall("./tracklets/item")
-    return tuple(_tracklet(item, f"{path}: tracklet {i}") for i, item in enumerate(items))
+    rows = []
+    for number, item in enumerate(_parsed(path).findall("./tracklets/item")):
+        where = f"{path}: tracklet {number}"
+        *size_m, first = (_number(item, name, where) for name in ("l", "w", "h", "first_frame"))
+        if min(size_m) <= 0:
+            raise AdapterError(f"{where}: l, w, h must be metres > 0; got {size_m}")
+        if first % 1 or not 0 <= first <= _LAST_FRAME:
+            raise AdapterError(f"{where}: first_frame must be a frame's number; got {first:g}")
+        label = (item.findtext("objectType") or "").strip() or "unknown"
+        for frame, pose in enumerate(item.findall("./poses/item"), start=int(first)):
+            numbers = [_number(pose, name, where) for name in _POSE]
+            extra = [_number(pose, name, where, otherwise=np.nan) for name in ATTRIBUTES]
+            rows.append((number, label, frame, *size_m, *numbers, *extra))
+    return pd.DataFrame(rows, columns=_TRACKLET_COLUMNS)
 
 
-def boxes_at(tracklets: tuple[Tracklet, ...], frame: int, world_from_velodyne: np.ndarray) -> Boxes:
+def _number(element: ET.Element, name: str, where: str, *, otherwise: float | None = None) -> float:
+    """The finite number in an element. otherwise: where there is no such element."""
+    text = element.findtext(name)
+    if text is None and otherwise is not None:
+        return otherwise
+    try:
+        value = float(text) if text is not None else np.nan
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise AdapterError(f"{where}: <{name}> must hold a finite number; got {text!r:.80}")
+    return value
+
+
+def boxes_at(tracklets: pd.DataFrame, frame: int, world_from_velodyne: np.ndarray) -> Boxes:
     """The boxes of a frame in the world of the pose. A track_id is the tracklet's number in the
-    file, from 0; attributes are ATTRIBUTES, float64."""
-    here = [
-        (number, t, frame - t.first_frame)
-        for number, t in enumerate(tracklets)
-        if 0 <= frame - t.first_frame < len(t.poses)
-    ]
-    rows = [t.attributes[row] for _, t, row in here]
-    values = np.array(rows, np.float64).reshape(-1, len(ATTRIBUTES))
-    world = np.array([world_from_velodyne @ _pose(t, row) for _, t, row in here]).reshape(-1, 4, 4)
+    file; attributes are ATTRIBUTES, float64."""
+    here = tracklets[tracklets["frame"] == frame]
+    sizes_m = here[[*_SIZE]].to_numpy(np.float64)
+    world = np.empty((len(here), 4, 4))
+    for i, (x, y, z, rx, ry, rz) in enumerate(here[[*_POSE]].to_numpy(np.float64)):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_about(2, rz) @ rotation_about(1, ry) @ rotation_about(0, rx)
+        pose[:3, 3] = [x, y, z] + pose[:3, 2] * sizes_m[i, 2] / 2  # of the middle
+        world[i] = world_from_velodyne @ pose
     return Boxes(
-        track_ids=tuple(str(number) for number, _, _ in here),
-        labels=tuple(t.label for _, t, _ in here),
+        track_ids=tuple(map(str, here["number"])),
+        labels=tuple(here["label"]),
         centers_m=np.ascontiguousarray(world[:, :3, 3]),
-        sizes_m=np.array([t.size_m for _, t, _ in here], np.float64).reshape(-1, 3),
+        sizes_m=np.ascontiguousarray(sizes_m),
         quats=quat_from_rotmat(torch.from_numpy(world[:, :3, :3].copy())).numpy(),
-        attributes={name: values[:, i] for i, name in enumerate(ATTRIBUTES)},
+        attributes={name: here[name].to_numpy(np.float64, copy=True) for name in ATTRIBUTES},
     )
-
-
-def _pose(tracklet: Tracklet, row: int) -> np.ndarray:
-    """velodyne_from_box of the box's middle, float64 [4, 4]."""
-    values = tracklet.poses[row]
-    rx, ry, rz = values[3:]
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_about(2, rz) @ rotation_about(1, ry) @ rotation_about(0, rx)
-    pose[:3, 3] = values[:3] + pose[:3, 2] * tracklet.size_m[2] / 2
-    return pose
 
 
 def _parsed(path: Path) -> ET.Element:
@@ -237,39 +243,6 @@ def _parsed(path: Path) -> ET.Element:
     if root.find("tracklets") is None:
         raise AdapterError(f"{path} has no <tracklets>; copy it from the dataset")
     return root
-
-
-def _tracklet(item: ET.Element, where: str) -> Tracklet:
-    size = np.array([_number(item, name, where) for name in ("l", "w", "h")])
-    if not (size > 0).all():
-        raise AdapterError(f"{where}: l, w, h must be metres > 0; got {size.tolist()}")
-    first = _number(item, "first_frame", where)
-    if first % 1 or not 0 <= first <= _LAST_FRAME:
-        raise AdapterError(f"{where}: first_frame must be a frame's number; got {first:g}")
-    rows = item.findall("./poses/item")
-    poses = [[_number(row, name, where) for name in _POSE] for row in rows]
-    attributes = [
-        [np.nan if row.find(name) is None else _number(row, name, where) for name in ATTRIBUTES]
-        for row in rows
-    ]
-    return Tracklet(
-        label=(item.findtext("objectType") or "").strip() or "unknown",
-        size_m=size,
-        first_frame=int(first),
-        poses=np.array(poses, np.float64).reshape(-1, len(_POSE)),
-        attributes=np.array(attributes, np.float64).reshape(-1, len(ATTRIBUTES)),
-    )
-
-
-def _number(element: ET.Element, name: str, where: str) -> float:
-    text = element.findtext(name)
-    try:
-        value = float(text) if text is not None else np.nan
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise AdapterError(f"{where}: <{name}> must hold a finite number; got {text!r}")
-    return value
 
 
 def read_object_lines(path: Path) -> pd.DataFrame:
@@ -419,14 +392,13 @@ def _read_sweeps(
 
 
 def _frame(source: Source, images: DriveImages, number: int) -> Frame:
-    pose = source.labels.world_from_velodyne[number].copy()
-    pose[:3, 3] -= source.world_origin_m
-    ego_from_world = invert_rigid(torch.from_numpy(pose))
+    pose = recentred(source.labels.world_from_velodyne[number], source.world_origin_m)
+    ego_from_world = invert_rigid(pose)
     time = source.labels.timestamps_ns[number]
     return Frame(
         index=number,
         timestamp_ns=time,
-        world_from_ego=torch.from_numpy(pose),
+        world_from_ego=pose,
         cameras={
             name: Camera(
                 name,
@@ -488,6 +460,9 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
     poses = _raw_poses(root, calibration_folder, calibration, options, numbers, chosen, sweeps)
     located = poses.world_from_velodyne
     tracklets = read_tracklets(root)
+    labels = KittiLabels(root, sweeps, times, located)
+    if tracklets is not None:
+        labels = replace(labels, tracklets=tracklets)
     missing = [number for number in chosen.numbers if number not in located]
     problems = (
         *problems,
@@ -509,7 +484,7 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
         calibration,
         images,
         image_times,
-        KittiLabels(root, sweeps, times, located, tracklets or ()),
+        labels,
         drive_origin(np.stack([pose[:3, 3] for _, pose in sorted(located.items())])),
         problems,
     )

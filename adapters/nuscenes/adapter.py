@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -42,6 +41,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
+    recentred,
     scene_of_drive,
     some,
     stored_records,
@@ -381,21 +381,16 @@ def _path(tables: SceneTables, file: SensorFile) -> Path:
 
 
 def _frame(file: FrameFiles, origin: np.ndarray, paths: Mapping[str, str]) -> Frame:
-    def recentred(pose: np.ndarray) -> torch.Tensor:
-        pose = pose.copy()
-        pose[:3, 3] -= origin
-        return torch.from_numpy(pose)
-
     return Frame(
         index=file.index,
         timestamp_ns=file.sweep.timestamp_ns,
-        world_from_ego=recentred(file.sweep.world_from_ego),
+        world_from_ego=recentred(file.sweep.world_from_ego, origin),
         cameras={
             name: Camera(
                 name,
                 *image.size,
                 *image.intrinsic,
-                camera_from_world=invert_rigid(recentred(image.world_from_sensor)),
+                camera_from_world=invert_rigid(recentred(image.world_from_sensor, origin)),
                 timestamp_ns=image.timestamp_ns,
             )
             for name, image in sorted(file.images.items())

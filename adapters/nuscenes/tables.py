@@ -473,7 +473,7 @@ def _read_samples(
         token: row.text("name") for token, row in read_table(folder / "attribute.json").items()
     }
     levels = {t: row.text("level") for t, row in read_table(folder / "visibility.json").items()}
-    by_sample: dict[str, list[tuple[Any, ...]]] = {token: [] for token in samples}
+    by_sample: dict[str, list[_Box]] = {token: [] for token in samples}
     for row in rows.values():
         instance = referred(row, "instance_token", instances, "instance")
         category = referred(instance, "category_token", categories, "category")
@@ -483,14 +483,10 @@ def _read_samples(
         box = row.read(_Annotation)
         if not all(name in names for name in box.attribute_tokens):
             raise row.fault("attribute_tokens", "tokens of rows of attribute.json")
-        width, length, height = box.size
-        by_sample[row.text("sample_token")].append(
-            (
-                *(instance.token, category.name, box.translation, (length, width, height)),
-                *(box.rotation, row.token, ",".join(names[name] for name in box.attribute_tokens)),
-                *(levels[visibility] if visibility else "", box.num_lidar_pts, box.num_radar_pts),
-            )
-        )
+        said = ",".join(names[name] for name in box.attribute_tokens)
+        seen = levels[visibility] if visibility else ""
+        found = _Box(row.token, instance.token, category.name, box, said, seen)
+        by_sample[row.text("sample_token")].append(found)
     read = [
         Sample(token, row.read(_Timed).timestamp * 1000, _boxes(by_sample[token]))
         for token, row in samples.items()
@@ -498,19 +494,30 @@ def _read_samples(
     return tuple(sorted(read, key=lambda sample: sample.timestamp_ns))
 
 
-def _boxes(rows: Sequence[tuple[Any, ...]]) -> Boxes:
-    names, labels, *columns = zip(*rows, strict=True) if rows else [()] * 10
-    kinds = {"token": object, "attributes": object, "visibility": object}
-    kinds |= {"num_lidar_pts": np.int64, "num_radar_pts": np.int64}
+class _Box(NamedTuple):
+    token: str
+    instance: str
+    category: str
+    annotation: _Annotation
+    attributes: str
+    visibility: str
+
+
+def _boxes(rows: Sequence[_Box]) -> Boxes:
+    boxes = [row.annotation for row in rows]
+    sizes_m = np.array([box.size for box in boxes], np.float64).reshape(-1, 3)
     return Boxes(
-        names,
-        labels,
-        centers_m=np.array(columns[0], np.float64).reshape(-1, 3),
-        sizes_m=np.array(columns[1], np.float64).reshape(-1, 3),
-        quats=np.array(columns[2], np.float64).reshape(-1, 4),
+        tuple(row.instance for row in rows),
+        tuple(row.category for row in rows),
+        centers_m=np.array([box.translation for box in boxes], np.float64).reshape(-1, 3),
+        sizes_m=np.ascontiguousarray(sizes_m[:, [1, 0, 2]]),  # length, width, height
+        quats=np.array([box.rotation for box in boxes], np.float64).reshape(-1, 4),
         attributes={
-            name: np.array(column, kind)
-            for (name, kind), column in zip(kinds.items(), columns[3:], strict=True)
+            "token": np.array([row.token for row in rows], object),
+            "attributes": np.array([row.attributes for row in rows], object),
+            "visibility": np.array([row.visibility for row in rows], object),
+            "num_lidar_pts": np.array([box.num_lidar_pts for box in boxes], np.int64),
+            "num_radar_pts": np.array([box.num_radar_pts for box in boxes], np.int64),
         },
     )
 
@@ -537,16 +544,6 @@ class FrameFiles:
     index: int
     sweep: SensorFile
     images: Mapping[str, SensorFile]
-
-
-@dataclass(frozen=True)
-class FrameToken:
-    """What a frame's image or sweep is in the tables. token: of its row in sample_data. filename:
-    relative to the dataset's folder."""
-
-    token: str
-    filename: str
-    is_key_frame: bool
 
 
 def scene_frames(
@@ -576,21 +573,6 @@ def scene_frames(
             )
     frames = zip(chosen, images, strict=True)
     return tuple(FrameFiles(i, *frame) for i, frame in enumerate(frames)), tuple(problems)
-
-
-def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameToken]]:
-    """What every frame of a scene is in the dataset's tables: by frame number (Frame.index, those
-    too that frames= leaves out) and channel (LIDAR_TOP among them), missing files included."""
-    options = NuScenesOptions.from_query("nuscenes", query)
-    tables = read_tables(Path(path), options.version, options.scene)
-    frames, _ = scene_frames(tables, sweeps=options.sweeps == "1")
-    return {
-        frame.index: {
-            file.channel: FrameToken(file.token, file.filename, file.is_key_frame)
-            for file in (frame.sweep, *frame.images.values())
-        }
-        for frame in frames
-    }
 
 
 def _match(sweeps: Sequence[SensorFile], files: Sequence[SensorFile]) -> dict[int, SensorFile]:

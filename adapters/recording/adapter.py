@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -80,7 +81,7 @@ _VECTORS = {
 _REQUIRED = ("frame", "track_id", "label", *(name for names in _VECTORS.values() for name in names))
 _CACHED_FILES = 4  # box files kept: every frame asks for its own part of one
 _DAMAGED = (OutputError, OSError, pa.ArrowException, KeyError, IndexError, TypeError, ValueError)
-Value = TypeVar("Value")
+_LIDAR_FILE = "a LiDAR file with columns x, y, z"
 _FAR_M = 1000.0  # no LiDAR on the ground sees this far
 _OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
 _TOP_QUANTILE = 0.999
@@ -114,7 +115,18 @@ class RecordingLabels:
         return () if path is None else (path,)
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        return sweep_content(file, sweep)
+        """The same columns, types and notes."""
+        with _reading(file, _LIDAR_FILE):
+            table = read_table(file, str(file)).take(pa.array(sweep.columns[INDEX_COLUMN]))
+            for name in {*"xyz", intensity_column(sweep)} - {None}:
+                at = table.schema.get_field_index(name)
+                field = table.schema.field(at)
+                values = np.asarray(sweep.columns[name])
+                values = np.rint(values) if pa.types.is_integer(field.type) else values
+                table = table.set_column(at, field, pa.array(values).cast(field.type, safe=False))
+            sink = pa.BufferOutputStream()
+            pq.write_table(table, sink)
+            return sink.getvalue().to_pybytes()
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
@@ -160,8 +172,7 @@ def all_boxes(root: Path) -> dict[int, FrameBoxes]:
 
 def read_sweep(path: Path) -> LidarSweep:
     """The sweep in a file, every column under its own name."""
-
-    def read() -> LidarSweep:
+    with _reading(path, _LIDAR_FILE):
         if is_ours(path):
             sweep = read_lidar(path)
         else:
@@ -170,36 +181,12 @@ def read_sweep(path: Path) -> LidarSweep:
         _ = sweep.points_m  # numbers, not texts
         return sweep
 
-    return _reading(path, "a LiDAR file with columns x, y, z", read)
-
-
-def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
-    """The LiDAR file with a weathered sweep in place of its own: the same columns, types and
-    notes."""
-
-    def content() -> bytes:
-        table = read_table(path, str(path)).take(pa.array(sweep.columns[INDEX_COLUMN]))
-        for name in {*"xyz", intensity_column(sweep)} - {None}:
-            at = table.schema.get_field_index(name)
-            field = table.schema.field(at)
-            values = np.asarray(sweep.columns[name])
-            values = np.rint(values) if pa.types.is_integer(field.type) else values
-            table = table.set_column(at, field, pa.array(values).cast(field.type, safe=False))
-        sink = pa.BufferOutputStream()
-        pq.write_table(table, sink)
-        return sink.getvalue().to_pybytes()
-
-    return _reading(path, "a LiDAR file with columns x, y, z", content)
-
 
 def read_frame_boxes(path: Path) -> dict[int, FrameBoxes]:
     """The boxes of every frame that has any."""
-
-    def read() -> dict[int, FrameBoxes]:
+    with _reading(path, f"a table of boxes with columns {', '.join(_REQUIRED)}"):
         state = path.stat()
         return _read_boxes(path, state.st_mtime_ns, state.st_size)
-
-    return _reading(path, f"a table of boxes with columns {', '.join(_REQUIRED)}", read)
 
 
 @lru_cache(maxsize=_CACHED_FILES)
@@ -248,10 +235,11 @@ def _column(table: pa.Table, name: str) -> np.ndarray:
     return np.array(table[name].to_numpy())
 
 
-def _reading(path: Path, expected: str, read: Callable[[], Value]) -> Value:
+@contextmanager
+def _reading(path: Path, expected: str) -> Iterator[None]:
     try:
         open_file(path).close()  # to open a pipe would wait for ever
-        return read()
+        yield
     except _DAMAGED as error:
         raise AdapterError(f"{path} is not {expected}: {error}") from error
 
@@ -298,9 +286,9 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
     files = lidar_files(root)
     known = [frame for frame in frames if frame.index in files]
     missing = [frame.index for frame in frames if frame.index not in files] if files else []
-    problems = [f"lidar/: the files of {some(missing)} are missing, their points too"] * bool(
-        missing
-    )
+    problems = []
+    if missing:
+        problems.append(f"lidar/: the files of {some(missing)} are missing, their points too")
     raws, timeless = [], []
     for frame in tqdm(known, desc="LiDAR", unit="frame", disable=None):
         sweep, numbers, has_times = _read_returns(files[frame.index], frame, calibration)

@@ -46,7 +46,8 @@ from augment.semantics import SemanticClass
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CALIBRATION = "calibration.json"
-_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
+_HINT = "docs/scenes.md shows what is in it"
+_IF_MISSING = f"a recording needs it, {_HINT}"
 _RIGID = 1e-4  # rotations written with six digits are off by a few millionths
 
 
@@ -160,15 +161,18 @@ def _box(corners: tuple[_Vector, _Vector]) -> np.ndarray:
     return box
 
 
-def _classes(names: Mapping[str, str]) -> Mapping[int, int]:
+def _classes(names: Any) -> Mapping[int, int] | None:
+    if names is None:
+        return None
     meanings = {member.name.lower(): int(member) for member in SemanticClass}
     meanings["none"] = NO_SURFACE
     try:
-        return {int(number): meanings[name.lower()] for number, name in names.items()}
-    except (ValueError, KeyError) as error:
-        raise ValueError(
-            f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
-        ) from None
+        known = {int(number): meanings[str(name).lower()] for number, name in names.items()}
+        np.array([*known], np.int64)
+    except (AttributeError, ValueError, KeyError, OverflowError) as error:
+        text = f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
+        raise ValueError(text) from None
+    return known
 
 
 _Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
@@ -191,7 +195,7 @@ class _FrameEntry(BaseModel):
     frame: Annotated[_Nanoseconds, Field(ge=0)]
     timestamp_ns: _Nanoseconds
     world_from_ego: _Pose
-    cameras: dict[str, _CameraEntry]
+    cameras: dict[str, Any]
 
 
 class _Settings(BaseModel):
@@ -201,7 +205,7 @@ class _Settings(BaseModel):
     has_metric_scale: Any = True
     ego_above_ground_m: Number = 0.0
     ego_box_m: Annotated[tuple[_Vector, _Vector], AfterValidator(_box)] | None = None
-    lidar_classes: Annotated[dict[str, str], AfterValidator(_classes)] | None = None
+    lidar_classes: Annotated[Any, AfterValidator(_classes)] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +228,7 @@ class Calibration:
 def read_calibration(root: Path) -> Calibration:
     """The calibration of the recording in a folder."""
     path, content = _content(root)
-    settings = validated(_Settings, content, str(path))
+    settings = validated(_Settings, content, str(path), hint=_HINT)
     frames = sorted((_frame(path, entry) for entry in settings.frames), key=lambda f: f.index)
     for before, after in itertools.pairwise(frames):
         if after.index == before.index:
@@ -250,7 +254,7 @@ def read_calibration(root: Path) -> Calibration:
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
     """The calibration's lidar_classes alone."""
     path, content = _content(root)
-    return validated(_Settings, content, str(path)).lidar_classes
+    return validated(_Settings, content, str(path), hint=_HINT).lidar_classes
 
 
 def _content(root: Path) -> tuple[Path, dict[str, Any]]:
@@ -283,16 +287,18 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
 def _frame(path: Path, content: Any) -> Frame:
     number = content.get("frame") if isinstance(content, dict) else None
     where = f"{path}, frame {number!r:.20}"
-    entry = validated(_FrameEntry, content, where)
+    entry = validated(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
-    for name, camera in entry.cameras.items():
+    for name, values in entry.cameras.items():
+        own = f"{where}, camera {name!r:.80}"
+        camera = validated(_CameraEntry, values, own, hint=_HINT)
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns
         try:
             cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
         except ValueError as error:
-            raise AdapterError(f"{where}, camera {name!r}: {error}") from None
+            raise AdapterError(f"{own}: {error}") from None
     return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
 
 

@@ -40,18 +40,19 @@ def value_noise(points: np.ndarray, seed: int = 0) -> np.ndarray:
     share = (points - base).astype(np.float32)
     share = share * share * (3 - 2 * share)
     index = sum(base[:, k].astype(np.int64) * _STEPS[k] for k in range(points.shape[1]))
-    index = index + seed * 7919
+    index = (index + seed * 7919) & (TABLE_SIZE - 1)
 
     def blend(offset: int, axes: int) -> np.ndarray:
         if axes == 0:
-            return _TABLE[(index + offset) & (len(_TABLE) - 1)]
+            return _TABLE[offset:][index]
         low, high = blend(offset, axes - 1), blend(offset + _STEPS[axes - 1], axes - 1)
         return low + share[:, axes - 1] * (high - low)
 
     return blend(0, points.shape[1])
 
 
-_TABLE = 2 * hashed(np.arange(1 << 16, dtype=np.int32)[:, None], 1) - 1
+TABLE_SIZE = 1 << 16
+_TABLE = np.tile(2 * hashed(np.arange(TABLE_SIZE, dtype=np.int32)[:, None], 1) - 1, 2)
 _STEPS = (1, 40503, 12289)  # far apart in the table, whichever few cells are compared
 
 
@@ -334,9 +335,12 @@ class Shapes(np.recarray):
         return normals
 
 
+_OPAQUE = np.dtype((np.void, Shapes.FIELDS.itemsize))  # numpy would compare all fields in Python
+
+
 def join(parts: Sequence[Shapes]) -> Shapes:
     """All parts in one."""
-    return np.concatenate(parts).view(Shapes)
+    return np.concatenate([part.view(_OPAQUE) for part in parts]).view(Shapes.FIELDS, Shapes)
 
 
 def joined(build: Callable[..., Iterable[Shapes]]) -> Callable[..., Shapes]:
@@ -420,12 +424,14 @@ Vectors = Sequence[float] | np.ndarray  # [3] or [P, 3]
 
 def xyz(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float) -> np.ndarray:
     """Vectors [N, 3] of coordinates [N] or one for all."""
-    return np.stack(np.broadcast_arrays(x, y, z), -1)
+    out = np.empty((*np.broadcast(x, y, z).shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, y, z
+    return out
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross products [..., 3]: what np.cross gives, in half its time."""
-    (ax, ay, az), (bx, by, bz) = (np.moveaxis(v, -1, 0) for v in (a, b))
+    (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
     return xyz(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
 
 

@@ -84,16 +84,6 @@ TERRAIN_REACH_M = 230.0
 TERRAIN_Z_M = 0.03
 
 
-class Plot(NamedTuple):
-    """One building or garden. side: +1 left, -1 right of the street."""
-
-    x0: float
-    x1: float
-    side: int
-    seed: int
-    is_garden: bool
-
-
 class Mover(NamedTuple):
     """Something that goes straight along x at a steady speed (negative: towards -x)."""
 
@@ -106,13 +96,15 @@ class Mover(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The plan. x0, x1: where the street's carriageway begins and ends, metres."""
+    """The plan. x0, x1: where the street's carriageway begins and ends, metres. plots: where each
+    building or garden begins and ends, its side (+1 left, -1 right), seed, and whether it is a
+    garden."""
 
     parameters: StreetParameters
     x0: float
     x1: float
     zebra_x: float
-    plots: list[Plot]
+    plots: list[tuple[float, float, int, int, bool]]
     trees: np.ndarray  # [T, 2]
     lamps: np.ndarray  # [L, 2]
     signs: np.ndarray  # [S, 2]
@@ -157,7 +149,7 @@ def draw_layout(parameters: StreetParameters) -> Layout:
     )
 
 
-def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[Plot]:
+def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[tuple]:
     plots = []
     for side in (1, -1):
         x, garden = x0 - 2.0, True
@@ -166,7 +158,7 @@ def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[Plot]:
             end = x + (rng.uniform(4.5, 7.5) if garden else rng.uniform(7.5, 13.0))
             if x1 + 1.0 - end < 7.0:
                 end, garden = x1 + 1.0, False
-            plots.append(Plot(x, end, side, int(rng.integers(2**31)), garden))
+            plots.append((x, end, side, int(rng.integers(2**31)), garden))
             x = end
     return plots
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -50,20 +51,50 @@ class SplatPlan:
     sink: np.ndarray
     hidden: np.ndarray
 
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """Of the shapes' three axes, metres [P, 3]."""
+        return np.linalg.norm(self.shapes.axes, axis=2)
+
     def counts(self, coarseness: float) -> np.ndarray:
-        """Cells of the first layer along both axes, [P, 2]."""
-        along = np.maximum(self.spacing * coarseness, MIN_M)
-        return cell_counts(self.shapes, along, self.hidden)
+        """How many cells the first layer has along both axes, [P, 2].
+
+        Discs: rings and cells in the outermost. Tubes: around and along. Ellipsoids: in all, and 1.
+        """
+        along, (a, b, c) = np.maximum(self.spacing * coarseness, MIN_M), self.lengths.T
+        finer, coarser = np.minimum(along[:, 0], along[:, 1]), np.maximum(along[:, 0], along[:, 1])
+        counts = np.ceil(self.lengths[:, :2] / along - 1e-9)
+        panel, disc, tube, blob = (
+            self.shapes.kind == kind
+            for kind in (Kind.PARALLELOGRAM, Kind.DISC, Kind.CYLINDER, Kind.ELLIPSOID)
+        )
+        tuft = self.shapes.material == Material.LEAF
+        blob &= ~tuft
+        counts[disc, 1] = np.ceil(2 * np.pi * a[disc] / finer[disc])
+        counts[tube, 0] = np.maximum(MIN_ROUND, np.ceil(2 * np.pi * a[tube] / finer[tube]))
+        counts[tube, 1] = np.maximum(2, np.ceil(2 * c[tube] / coarser[tube]))
+        counts[blob, 0] = np.ceil(_area(self.lengths[blob]) / finer[blob] ** 2)
+        counts[blob, 0] = np.maximum(MIN_BLOB, counts[blob, 0])
+        counts[blob, 1], counts[tuft] = 1, 1
+        counts = np.maximum(counts, 1)
+        counts[self.hidden & panel & (np.maximum(a, b) < MIN_HIDDEN_M)] = 0
+        counts[self.hidden & tuft & (self.shapes.variation < HIDDEN_TUFTS_DROPPED)] = 0
+        counts[self.hidden & tube & (a < MIN_HIDDEN_M / 4)] = 0
+        return counts.astype(np.int64)
 
     def backing(self, counts: np.ndarray) -> np.ndarray:
         """Cells of the second layer, [P, 2]; none where there is no such layer."""
-        is_backed = self.shapes.backed & ~self.hidden & (counts.min(1) >= BACKED_FROM)
+        is_backed = self.shapes.backed & ~self.hidden & (counts >= BACKED_FROM).all(1)
         return np.where(is_backed[:, None], -(-counts // BACKING), 0)
 
     def total(self, coarseness: float) -> int:
-        counts = self.counts(coarseness)
-        first = total_cells(self.shapes, counts, self.hidden)
-        return first + int(self.backing(counts).prod(1).sum())
+        """How many cells that comes to, nearly (triangles and discs are estimated)."""
+        counts, kind = self.counts(coarseness), self.shapes.kind
+        graded, back = _graded(self.shapes, slice(None), counts, self.hidden), self.backing(counts)
+        u, v = (counts + graded[..., 0] + graded[..., 1]).T
+        each = u * (v + 2 * (kind == Kind.CYLINDER))
+        share = np.where((kind == Kind.TRIANGLE) | (kind == Kind.DISC), 0.5, 1.0)
+        return int((share * each).sum()) + int((back[:, 0] * back[:, 1]).sum())
 
 
 def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
@@ -210,42 +241,8 @@ class Cells(NamedTuple):
         return np.stack([self.local + i * a + j * b for i, j in around])
 
 
-def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """How many cells along both axes, [P, 2]; spacing [P, 2] in metres, hidden [P].
-
-    Discs: rings and cells in the outermost. Tubes: around and along. Ellipsoids: in all, and 1.
-    """
-    length = np.linalg.norm(shapes.axes, axis=2)
-    counts = np.ceil(length[:, :2] / spacing - 1e-9)
-    kind = shapes.kind
-    disc, tube, blob = (kind == k for k in (Kind.DISC, Kind.CYLINDER, Kind.ELLIPSOID))
-    round_length = 2 * np.pi * length[:, 0]
-    counts[disc, 1] = np.ceil(round_length / spacing.min(1))[disc]
-    counts[tube, 0] = np.maximum(MIN_ROUND, np.ceil(round_length / spacing.min(1)))[tube]
-    counts[tube, 1] = np.maximum(2, np.ceil(2 * length[:, 2] / spacing.max(1)))[tube]
-    tuft = shapes.material == Material.LEAF
-    counts[tuft] = 1
-    blob &= ~tuft
-    each = np.ceil(_area(length[blob]) / spacing[blob].min(1) ** 2)
-    counts[blob] = xyz(np.maximum(MIN_BLOB, each), 1, 0)[:, :2]
-    counts = np.maximum(counts, 1)
-    panel = shapes.kind == Kind.PARALLELOGRAM
-    counts[hidden & panel & (length[:, :2].max(1) < MIN_HIDDEN_M)] = 0
-    counts[hidden & tuft & (shapes.variation < HIDDEN_TUFTS_DROPPED)] = 0
-    counts[hidden & tube & (length[:, 0] < MIN_HIDDEN_M / 4)] = 0
-    return counts.astype(np.int64)
-
-
-def total_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> int:
-    """How many cells these counts come to, nearly (triangles and discs are estimated)."""
-    m = counts + _graded(shapes, slice(None), counts, hidden).sum(2)
-    m[:, 1] += 2 * (shapes.kind == Kind.CYLINDER)
-    share = np.where(np.isin(shapes.kind, (Kind.TRIANGLE, Kind.DISC)), 0.5, 1.0)
-    return int((share * m.prod(1)).sum())
-
-
 def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
-    """All cells of all shapes; counts [P, 2] and hidden [P] as in cell_counts."""
+    """All cells of all shapes; counts [P, 2] and hidden [P] as a plan has them."""
     parts = []
     for build, *kinds in (
         (_flat_cells, Kind.PARALLELOGRAM, Kind.TRIANGLE),

@@ -233,11 +233,10 @@ _UPRIGHT = ("-y", "+y", "+x", "-x")
 def build_buildings(layout: Layout) -> Iterator[Shapes]:
     """Both rows of houses, those that close the street's ends, and some behind."""
     middle = layout.parameters.path_length_m / 2
-    for plot in layout.plots:
-        width = plot.x1 - plot.x0
-        is_near = abs((plot.x0 + plot.x1) / 2 - middle) - middle < 32
-        built = _garden(width) if plot.is_garden else _house(plot.seed, width, is_near)
-        yield _beside(built, plot.side, plot.x0, plot.x1, FACADE_M)
+    for x0, x1, side, seed, is_garden in layout.plots:
+        is_near = abs((x0 + x1) / 2 - middle) - middle < 32
+        built = _garden(x1 - x0) if is_garden else _house(seed, x1 - x0, is_near)
+        yield _beside(built, side, x0, x1, FACADE_M)
     reach = CROSS_STREET_M + 4.6
     for number, (x, turn) in enumerate(((layout.x1 + reach, -1), (layout.x0 - reach, 1))):
         rng = stream(layout.parameters, 20, number)
@@ -471,14 +470,11 @@ def _patches(layout: Layout, taken: list[Rectangle]) -> tuple[list[Rectangle], l
         half = (rng.uniform(0.8, 2.6), rng.uniform(0.3, 0.6)) if kind == 0 else (0.3, 0.3)
         middle = (x + rng.uniform(0, 4), side * rng.uniform(0.9, 2.4))
         spot = (middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1])
-        if all(_are_disjoint(spot, other) for other in [*taken, *found[0], *found[1]]):
+        left, near, right, far = spot[0] - 0.1, spot[1] - 0.1, spot[2] + 0.1, spot[3] + 0.1
+        others = [*taken, *found[0], *found[1]]
+        if all(right < a[0] or a[2] < left or far < a[1] or a[3] < near for a in others):
             found[kind].append(spot)
     return found
-
-
-def _are_disjoint(a: Rectangle, b: Rectangle) -> bool:
-    gap = 0.1
-    return a[2] + gap < b[0] or b[2] + gap < a[0] or a[3] + gap < b[1] or b[3] + gap < a[1]
 
 
 def _carriageway(layout: Layout) -> Iterator[Shapes]:
@@ -937,24 +933,15 @@ class MovingBody:
     motion: Motion
 
 
-class ParkedCar(NamedTuple):
-    """A labelled box of the static scene."""
-
-    name: str
-    centre: tuple[float, float, float]
-    size_m: tuple[float, float, float]
-    yaw: float
-
-
 @dataclass(frozen=True, eq=False)
 class Street:
-    """Everything that is known of a street."""
+    """Everything that is known of a street. parked: name, centre, size and yaw of each car."""
 
     parameters: StreetParameters
     layout: Layout
     static: Body
     movers: tuple[MovingBody, ...]
-    parked: tuple[ParkedCar, ...]
+    parked: tuple[tuple, ...]
 
 
 @lru_cache(maxsize=2)
@@ -971,9 +958,9 @@ def build_street(parameters: StreetParameters) -> Street:
         yaw, ground = 0.0 if y < 0 else np.pi, float(road_z(PARKED_Y_M)) - SINK_M
         parts.append(car.moved((x, y, ground), yaw))
         centre = (float(x), float(y), ground + model.size_m[2] / 2)
-        parked.append(ParkedCar(f"parked-{number}", centre, model.size_m, yaw))
+        parked.append((f"parked-{number}", centre, model.size_m, yaw))
     shapes = join(parts)
-    footprints = [(*car.centre[:2], car.size_m[0] / 2, car.size_m[1] / 2) for car in parked]
+    footprints = [(*at[:2], size[0] / 2, size[1] / 2) for _, at, size, _ in parked]
     lighting = Lighting(
         to_sun=direction_to_sun(parameters.seed),
         eye_path=camera_path(parameters, ends),

@@ -500,8 +500,8 @@ class PointCloud:
 class _Reader:
     """One file being read forward, and the frames that were last passed by."""
 
-    def __init__(self, path: Path, state: tuple[int, ...]) -> None:
-        self.path, self.state = path, state
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._recent = SceneMemo(_KEPT_BYTES)
         self._all: set[int] | None = None  # frames of the file, known after a whole pass
         self._passed: set[int] = set()
@@ -531,11 +531,16 @@ class _Reader:
     def rewind(self) -> None:
         """Leave the file; the next reading starts at its beginning."""
         self._clouds.close()
-        self._clouds, self._passed = _clouds(self.path), set()
+        self._clouds, self._passed = _clouds(self._path), set()
 
 
 _lock = threading.Lock()
-_readers: list[_Reader] = []  # of the file last read from
+
+
+@lru_cache(maxsize=1)
+def _reader(path: Path, *_state: int) -> _Reader:
+    """Of the file last read from, as long as it stays as it is."""
+    return _Reader(path)
 
 
 def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
@@ -545,13 +550,8 @@ def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
         return None
     stat = path.stat()
     # A forked process shares its parent's place in an open file: it opens the file itself.
-    state = (stat.st_mtime_ns, stat.st_size, os.getpid())
     with _lock:
-        if not _readers or (_readers[0].path, _readers[0].state) != (path, state):
-            for reader in _readers:
-                reader.rewind()
-            _readers[:] = [_Reader(path, state)]
-        return _readers[0].read(frame)
+        return _reader(path, stat.st_mtime_ns, stat.st_size, os.getpid()).read(frame)
 
 
 def iterate_point_clouds(root: Path) -> Iterator[tuple[int, PointCloud]]:

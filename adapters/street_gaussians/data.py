@@ -470,18 +470,14 @@ def read_track_table(path: Path) -> TrackTable:
     )
 
 
-class Visibility(RootModel[dict[Number, dict[Number, frozenset[StrictInt]]]]):
+class _Visibility(RootModel[dict[Number, dict[Number, frozenset[StrictInt]]]]):
     """The cameras that see an object, by object and frame."""
 
 
-def read_visibility(path: Path) -> Visibility:
-    return validate(Visibility, read_json(path), path, "list of camera numbers by object and frame")
-
-
-def seen_rows(
-    table: TrackTable, visible: Visibility, visible_path: Path, cams: Sequence[int]
-) -> np.ndarray:
+def seen_rows(table: TrackTable, visible_path: Path, cams: Sequence[int]) -> np.ndarray:
     """Indices of the rows of tracked classes that one of the cameras sees, int64 [R]."""
+    content, kind = read_json(visible_path), "list of camera numbers by object and frame"
+    visible = validate(_Visibility, content, visible_path, kind)
     kept = []
     for row, label in enumerate(table.labels):
         if label in NOT_TRACKED:
@@ -506,37 +502,31 @@ def place_rows(
     rows: those that were seen. frames: consecutive. world_from_ego: float64 [F, 4, 4].
     """
     by_frame = [rows[table.frames[rows] == frame] for frame in frames]
-    placed = _table_of(by_frame)
-    if not placed.shape[1]:
-        return np.full((len(frames), 1), -1, np.int64)
-    is_moving = np.isin(table.ids[placed], _moving_ids(table, placed, world_from_ego))
-    moving = np.where((placed >= 0) & is_moving, placed, -1)
-    compact = _table_of([row[row >= 0] for row in moving])
-    if not compact.shape[1]:
-        return np.full((len(frames), 1), -1, np.int64)
+    moving = _moving_ids(table, by_frame, world_from_ego)
+    kept = [[row if table.ids[row] in moving else -1 for row in column] for column in by_frame]
+    compact = [[row for row in column if row >= 0] for column in kept]
     # Training compacts only where that leaves fewer columns.
-    return compact if compact.shape[1] < moving.shape[1] else moving
+    if max(map(len, compact)) < max(map(len, kept)):
+        kept = compact
+    placed = np.full((len(frames), max(1, *map(len, kept))), -1, np.int64)
+    for step, column in enumerate(kept):
+        placed[step, : len(column)] = column
+    return placed
 
 
-def _table_of(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows of unequal length as int64 [F, M], filled up with -1."""
-    table = np.full((len(rows), max(map(len, rows))), -1, np.int64)
-    for step, row in enumerate(rows):
-        table[step, : len(row)] = row
-    return table
-
-
-def _moving_ids(table: TrackTable, placed: np.ndarray, world_from_ego: np.ndarray) -> list[int]:
+def _moving_ids(
+    table: TrackTable, by_frame: Sequence[np.ndarray], world_from_ego: np.ndarray
+) -> set[int]:
     """The objects that move."""
-    steps, columns = np.nonzero(placed >= 0)  # by frame, then column
-    rows, poses = placed[steps, columns], world_from_ego[steps]
+    rows = np.concatenate(by_frame)
+    poses = np.repeat(world_from_ego, list(map(len, by_frame)), axis=0)
     world = np.einsum("nij,nj->ni", poses[:, :3, :3], table.centers_m[rows]) + poses[:, :3, 3]
-    moving = []
+    moving = set()
     for track_id in np.unique(table.ids[rows]):
         places = world[table.ids[rows] == track_id]
         travel = np.linalg.norm(places[-1] - places[0])
         if places.std(axis=0).max() > _SPREAD_M or travel > _TRAVEL_M:
-            moving.append(track_id)
+            moving.add(int(track_id))
     return moving
 
 
@@ -617,7 +607,7 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
 
     track_path, visible_path = track_files(root, use_tracker=config.use_tracker)
     table = read_track_table(track_path)
-    seen = seen_rows(table, read_visibility(visible_path), visible_path, cams)
+    seen = seen_rows(table, visible_path, cams)
     tracklets = tracklets_of(table, place_rows(table, seen, frames, world_from_ego))
     moments = [*times, *(image.timestamp_s for image in images)]
     drawn_s = min(moments), max(moments)

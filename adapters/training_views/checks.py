@@ -75,6 +75,19 @@ class CameraOffset:
     angle_deg: float
     is_sure: bool
 
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """A sentence where the shift is beyond what rolling shutters and pixels explain."""
+        shift_px = float(np.hypot(self.right_px, self.down_px))
+        if not self.is_sure or self.angle_deg < _MAX_SHIFT_DEG or shift_px < _MAX_SHIFT_PX:
+            return ()
+        return (
+            f"camera {self.camera}: its images lie {self.angle_deg:.2f} degrees beside the LiDAR "
+            f"({self.right_px:+.1f} px to the right, {self.down_px:+.1f} px down, of "
+            f"{self.width_px} columns); its rotation, focal length or timestamps are wrong, and "
+            f"what it shows will be blurred or doubled",
+        )
+
 
 class Returns(NamedTuple):
     """A sweep's returns with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
@@ -97,25 +110,21 @@ def measure_offset(
 ) -> CameraOffset | None:
     """The shift of one camera's images; None if fewer than 3000 returns (by frame) are seen.
     cameras: the views to compare, at any resolution."""
-    seen = [
-        project_returns(
-            returns[key.frame], views, key, camera,
-            reach=_reach_px(_compared(camera)), near_m=_NEAR_M,
-        )
-        for key, camera in cameras.items()
-        if key.frame in returns
-    ]  # fmt: skip
+    camera = _compared(next(iter(cameras.values())))
+    reach = min(max(round(math.radians(_REACH_DEG) * camera.fx), 4), 16)
+    seen = project_returns(returns, views, cameras, reach=reach, near_m=_NEAR_M)
     if sum(len(points.rows) for points in seen) < _MIN_POINTS:
         return None
-    camera = _compared(next(iter(cameras.values())))
-    reach = _reach_px(camera)
     score = shared_information(seen, reach)
     right, down = _peak(score)
-    halves = [_peak(shared_information(half, reach)) for half in (seen[::2], seen[1::2]) if half]
-    apart = max(math.hypot(right - h[0], down - h[1]) for h in halves)
+
+    def apart(some: Sequence[Points]) -> float:
+        other = _peak(shared_information(some, reach))
+        return math.hypot(right - other[0], down - other[1])
+
+    halves = [apart(half) for half in (seen[::2], seen[1::2]) if half]
     # Repeated shapes can look shifted to all frames together, but not to most of them one by one.
-    single = [_peak(shared_information([points], reach)) for points in seen]
-    near = [math.hypot(right - p[0], down - p[1]) < _ALONE_PX for p in single]
+    near = [apart([points]) < _ALONE_PX for points in seen]
     contrast = float(score.max() / max(float(np.median(score)), 1e-12) - 1)
     inside = max(abs(right), abs(down)) < reach - 0.5
     return CameraOffset(
@@ -127,22 +136,13 @@ def measure_offset(
         # At the border of the range the shift is at least as large as that.
         is_sure=contrast > _CONTRAST
         and len(halves) == 2
-        and (apart < _AGREE_PX or not inside)
+        and (max(halves) < _AGREE_PX or not inside)
         and 2 * sum(near) >= len(near),
     )
 
 
 def _compared(camera: Camera) -> Camera:
     return camera.scaled(min(1.0, _WIDTH / camera.width))
-
-
-def _reach_px(camera: Camera) -> int:
-    return min(max(round(math.radians(_REACH_DEG) * camera.fx), 4), 16)
-
-
-def _column(sweep: LidarSweep, names: Sequence[str]) -> np.ndarray | None:
-    found = [name for name in names if name in sweep.columns]
-    return np.asarray(sweep.columns[found[0]]) if found else None
 
 
 def read_intensities(scene: Scene, frames: Iterable[int]) -> dict[int, Returns]:
@@ -164,24 +164,33 @@ def read_intensities(scene: Scene, frames: Iterable[int]) -> dict[int, Returns]:
     return out
 
 
+def _column(sweep: LidarSweep, names: Sequence[str]) -> np.ndarray | None:
+    return next((np.asarray(sweep.columns[name]) for name in names if name in sweep.columns), None)
+
+
 def project_returns(
-    returns: Returns,
+    returns: Mapping[int, Returns],
     views: RecordedViews,
-    key: ViewKey,
-    camera: Camera,
+    cameras: Mapping[ViewKey, Camera],
     *,
     reach: int,
     near_m: float,
-) -> Points:
-    """The returns beyond near_m that `camera` sees, with the image of `key`. reach: pixels from the
-    image's border that are left out."""
-    camera = _compared(camera)
-    grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
-    grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    seen, index = project_points(returns.points, camera, near_m=near_m, margin_px=reach)
-    front = visible(seen, camera)
-    rows, columns = np.divmod(seen.pixels[front], camera.width)
-    return Points(columns, rows, returns.intensity[index[front]], grey)
+) -> list[Points]:
+    """The returns beyond near_m that each view's camera sees, with its image; views of frames
+    without returns are left out. reach: pixels from the image's border that are left out."""
+    out = []
+    for key, camera in cameras.items():
+        if key.frame not in returns:
+            continue
+        camera = _compared(camera)
+        grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
+        grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        points, intensity = returns[key.frame]
+        seen, index = project_points(points, camera, near_m=near_m, margin_px=reach)
+        front = visible(seen, camera)
+        rows, columns = np.divmod(seen.pixels[front], camera.width)
+        out.append(Points(columns, rows, intensity[index[front]], grey))
+    return out
 
 
 def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
@@ -316,17 +325,9 @@ def _fit(
     offset_s: float,
 ) -> float | None:
     """How much images and returns tell of each other if images were taken later by offset_s."""
-    seen = [
-        project_returns(
-            returns[key.frame],
-            views,
-            key,
-            camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s),
-            reach=0,
-            near_m=_TIMING_NEAR_M,
-        )
-        for key in keys
-    ]
+    taken = {key: scene.frame(key.frame).cameras[key.camera] for key in keys}
+    later = {key: camera_at(path, camera, offset_s) for key, camera in taken.items()}
+    seen = project_returns(returns, views, later, reach=0, near_m=_TIMING_NEAR_M)
     return float(shared_information(seen, 0)[0, 0]) if seen else None
 
 
@@ -349,15 +350,11 @@ class Checks:
     @property
     def facts(self) -> dict[str, Any]:
         """JSON-able, for reports: pixels of the image compared, to the right and down."""
-        late = self.time_offset_s
+        late, names = self.time_offset_s, ("right_px", "down_px", "angle_deg", "is_sure")
+        offsets = {o.camera: {name: getattr(o, name) for name in names} for o in self.offsets}
         return {
             "camera_time_offset_ms": None if late is None else 1e3 * late,
-            "calibration_offsets": {
-                o.camera: {
-                    n: getattr(o, n) for n in ("right_px", "down_px", "angle_deg", "is_sure")
-                }
-                for o in self.offsets
-            },
+            "calibration_offsets": offsets,
         }
 
 
@@ -388,20 +385,8 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
         offset = measure_offset(returns, views, cameras)
         if offset is not None:
             offsets.append(offset)
-            problems += _offset_problem(offset)
+            problems += offset.problems
     return Checks(tuple(problems), late, tuple(offsets))
-
-
-def _offset_problem(offset: CameraOffset) -> list[str]:
-    shift_px = float(np.hypot(offset.right_px, offset.down_px))
-    if not offset.is_sure or offset.angle_deg < _MAX_SHIFT_DEG or shift_px < _MAX_SHIFT_PX:
-        return []
-    return [
-        f"camera {offset.camera}: its images lie {offset.angle_deg:.2f} degrees beside the LiDAR "
-        f"({offset.right_px:+.1f} px to the right, {offset.down_px:+.1f} px down, of "
-        f"{offset.width_px} columns); its rotation, focal length or timestamps are wrong, and "
-        f"what it shows will be blurred or doubled"
-    ]
 
 
 def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:

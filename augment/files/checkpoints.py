@@ -268,29 +268,30 @@ def tensor(
     where: str,
     *,
     dtype: torch.dtype | None = torch.float32,
+    error: type[ClimateGSError] = AdapterError,
 ) -> Tensor:
-    """A tensor of a checkpoint, checked. shape: None stands for any length. dtype: None for any.
-    Raises AdapterError: missing, no tensor, of another shape or type, or without all its numbers: a
-    small file can announce a tensor of any size.
+    """A tensor of a file, checked. shape: None stands for any length. dtype: None for any. Raises
+    error: missing, no tensor, of another shape or type, or without all its numbers: a small file
+    can announce a tensor of any size.
     """
     found = content.get(name)
     if not isinstance(found, Tensor):
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
-        raise AdapterError(f"{where} lacks the tensor {name!r}; it holds {keys}")
+        raise error(f"{where} lacks the tensor {name!r}; it holds {keys}")
     if found.layout != torch.strided or found.is_nested or found.is_meta:
-        raise AdapterError(f"{where}: {name} must be plain numbers; got a tensor of another kind")
+        raise error(f"{where}: {name} must be plain numbers; got a tensor of another kind")
     fits = len(found.shape) == len(shape) and all(
         want is None or have == want for have, want in zip(found.shape, shape, strict=True)
     )
     if not fits or (dtype is not None and found.dtype != dtype):
         expected = ", ".join("any" if want is None else str(want) for want in shape)
-        kind = "" if dtype is None else f"{dtype} ".replace("torch.", "")
-        raise AdapterError(
-            f"{where}: {name} must be {kind}[{expected}]; got "
-            f"{str(found.dtype).replace('torch.', '')} {list(found.shape)}"
+        kind = "" if dtype is None else f"{str(dtype)[6:]} "
+        raise error(
+            f"{where}: {name} must be {kind}[{expected}]; got {str(found.dtype)[6:]} "
+            f"{list(found.shape)}"
         )
     if found.numel() * found.element_size() > found.untyped_storage().nbytes():
-        raise AdapterError(
+        raise error(
             f"{where}: {name} says it is {list(found.shape)} but the file does not hold as many "
             f"numbers; obtain the file again"
         )

@@ -40,6 +40,7 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
+from augment.files.checkpoints import tensor
 from augment.jobs.atomic import replaced_file, replaced_folder
 from augment.scene import (
     SH_COUNTS,
@@ -72,16 +73,14 @@ MAX_WAVES = 1000  # terms; what is summed for every image must not take for ever
 _SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _HALVED = ("quats", "opacities", "sh", "waves")
-# Of each row; None for what only an upper limit is known of.
-_ROWS = {
+_ROWS = {  # None: of any length
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3),
-    "waves": (None, 3),
+    "waves": (None, 3), "rgb": (), "image": (None, 3), "faces": (None, None, 3),
 }  # fmt: skip
 _FLOAT16_END = 65520  # rounds to infinity
 
 
-@dataclass(frozen=True, eq=False)
-class SavedPart:
+class SavedPart(NamedTuple):
     """Gaussians, and the coefficients [n, F - 1, 3] of their colour waves where they have some."""
 
     gaussians: Gaussians
@@ -102,12 +101,12 @@ def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
                     f"scene {scene.name!r}: {part} has colour waves of "
                     f"{colours.coefficients.shape[1]} terms; saved scenes hold {MAX_WAVES}"
                 )
-        for name, tensor in tensors.items():
+        for name, values in tensors.items():
             where = f"scene {scene.name!r}: {part}.{name}"
-            if tensor.dtype != torch.float32:
-                raise SceneError(f"{where}: saved scenes hold float32; got {tensor.dtype}")
+            if values.dtype != torch.float32:
+                raise SceneError(f"{where}: saved scenes hold float32; got {values.dtype}")
             is_halved = precision == "float16" and name in _HALVED
-            arrays[f"{part}.{name}"] = _array(_half(tensor, where) if is_halved else tensor)
+            arrays[f"{part}.{name}"] = _array(_half(values, where) if is_halved else values)
         if gaussians.semantic is not None:
             arrays[f"{part}.semantic"] = _array(gaussians.semantic)
     return arrays
@@ -150,19 +149,10 @@ def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where:
     name = _SKY_ARRAYS[kind]
     if list(tensors) != [name]:
         raise SceneError(f"{where}: a {kind} sky is one array {name!r}; got {sorted(tensors)[:5]}")
-    values = tensors[name]
-    shape = tuple(values.shape)
-    fits, expected = {
-        "rgb": (shape == (3,), "[3]"),
-        "image": (len(shape) == 3 and shape[2] == 3, "[H, W, 3]"),
-        "faces": (len(shape) == 4 and shape == (6, shape[1], shape[1], 3), "[6, R, R, 3]"),
-    }[name]
-    is_type = values.dtype == (torch.float16 if precision == "float16" else torch.float32)
-    if not fits or not is_type or values.numel() == 0:
-        raise SceneError(
-            f"{where}: {name} must be {precision} {expected}; got {values.dtype} {list(shape)}"
-        )
-    values = values.float()
+    count = {"rgb": 3, "image": None, "faces": 6}[name]
+    values = _take_array(tensors, name, name, count, precision, where)
+    if values.numel() == 0 or (name == "faces" and values.shape[1] != values.shape[2]):
+        raise SceneError(f"{where}: {name} must not be empty, and faces square; got {list(values.shape)}")
     if not np.isfinite(_range(values)).all():
         raise SceneError(f"{where}: {name} holds NaN or infinite values")
     return sky_class(values)
@@ -172,79 +162,61 @@ def _part_name(number: int) -> str:
     return "background" if number == 0 else f"actors.{number - 1}"
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy())
+def _array(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.detach().cpu().numpy())
 
 
-def _half(tensor: Tensor, where: str) -> Tensor:
-    low, high = _range(tensor)
+def _half(values: Tensor, where: str) -> Tensor:
+    low, high = _range(values)
     if not max(-low, high) < _FLOAT16_END:
         raise SceneError(
             f"{where}: float16 holds numbers up to 65504; got {low} to {high}. Write it at full "
             f"precision"
         )
-    return tensor.half()
+    return values.half()
 
 
 def _take_part(
-    tensors: dict[str, Tensor],
-    part: str,
-    count: int,
-    precision: Precision,
-    has_waves: bool,
+    tensors: dict[str, Tensor], part: str, count: int, precision: Precision, has_waves: bool,
     where: str,
-) -> SavedPart:
-    names = (*_ARRAYS, "waves") if has_waves else _ARRAYS
-    missing = [f"{part}.{name}" for name in names if f"{part}.{name}" not in tensors]
-    if missing:
-        raise SceneError(f"{where} lacks {', '.join(missing)}")
-    own = {name: tensors.pop(f"{part}.{name}") for name in names}
-    semantic = tensors.pop(f"{part}.semantic", None)
-    for name, tensor in own.items():
-        is_halved = precision == "float16" and name in _HALVED
-        _check_array(tensor, name, count, is_halved=is_halved, where=f"{where}: {part}.{name}")
-        if is_halved:
-            own[name] = tensor.float()
+) -> SavedPart:  # fmt: skip
+    own = {
+        name: _take_array(tensors, f"{part}.{name}", name, count, precision, where)
+        for name in (*_ARRAYS, *(["waves"] if has_waves else []))
+    }
+    if own["sh"].shape[1] not in SH_COUNTS:
+        shape = list(own["sh"].shape)
+        raise SceneError(f"{where}: {part}.sh must be [N, K, 3] with K in {SH_COUNTS}; got {shape}")
+    waves = own.pop("waves", None)
+    if waves is not None and waves.shape[1] > MAX_WAVES:
+        raise SceneError(
+            f"{where}: {part}.waves must have at most {MAX_WAVES} terms; got {waves.shape[1]}"
+        )
     if precision == "float16":
         own["quats"] = torch.nn.functional.normalize(own["quats"], dim=1)
-    if semantic is not None:
-        _check_semantic(semantic, count, f"{where}: {part}.semantic")
-    waves = own.pop("waves", None)
+    semantic, name = None, f"{part}.semantic"
+    if name in tensors:
+        semantic = tensor(tensors, name, (count,), where, dtype=torch.int16, error=SceneError)
+        del tensors[name]
+        low, high = _range(semantic)
+        if low < min(SemanticClass) or high > max(SemanticClass):
+            raise SceneError(
+                f"{where}: {name} must hold classes from {min(SemanticClass):d} to "
+                f"{max(SemanticClass):d}; got {low:.0f} to {high:.0f}"
+            )
     return SavedPart(Gaussians(**own, semantic=semantic), waves)
 
 
-def _check_array(tensor: Tensor, name: str, count: int, *, is_halved: bool, where: str) -> None:
-    shape, rows = tuple(tensor.shape), _ROWS[name]
-    expected = torch.float16 if is_halved else torch.float32
-    if tensor.dtype != expected:
-        raise SceneError(f"{where} must be {str(expected)[6:]}; got {tensor.dtype}")
-    if not shape or shape[0] != count:
-        raise SceneError(
-            f"{where} must have {count} rows, as the document says; got {list(shape)}: they "
-            f"do not belong together"
-        )
-    is_shape = len(shape) == 1 + len(rows) and all(
-        want in (None, have) for have, want in zip(shape[1:], rows, strict=True)
-    )
-    limits = {"sh": SH_COUNTS, "waves": range(MAX_WAVES + 1)}
-    if not is_shape or (name in limits and shape[1] not in limits[name]):
-        sides = ", ".join("K" if want is None else str(want) for want in (count, *rows))
-        of_k = {"sh": f" with K in {SH_COUNTS}", "waves": f", at most {MAX_WAVES} terms"}
-        raise SceneError(f"{where} must be [{sides}]{of_k.get(name, '')}; got {list(shape)}")
-
-
-def _check_semantic(semantic: Tensor, count: int, where: str) -> None:
-    if semantic.dtype != torch.int16 or tuple(semantic.shape) != (count,):
-        raise SceneError(
-            f"{where} must be int16 [{count}]; got {semantic.dtype} {list(semantic.shape)}"
-        )
-    classes = [int(value) for value in SemanticClass]
-    low, high = _range(semantic) if semantic.numel() else (0, 0)
-    if low < min(classes) or high > max(classes):
-        raise SceneError(
-            f"{where} must hold classes from {min(classes)} to {max(classes)}; got "
-            f"{low:.0f} to {high:.0f}"
-        )
+def _take_array(
+    tensors: dict[str, Tensor], name: str, kind: str, count: int | None, precision: Precision,
+    where: str,
+) -> Tensor:  # fmt: skip
+    """An array of `count` rows of a kind in _ROWS, checked and taken out of the file's."""
+    is_halved = precision == "float16" and (kind in _HALVED or kind in _SKY_ARRAYS.values())
+    dtype = torch.float16 if is_halved else torch.float32
+    found = tensor(tensors, name, (count, *_ROWS[kind]), where, dtype=dtype, error=SceneError)
+    del tensors[name]
+    return found.float() if is_halved else found
 
 
 def _drawable(part: SavedPart, where: str) -> tuple[SavedPart, tuple[str, ...]]:
@@ -592,26 +564,23 @@ def scene_of(
         repeated = len(document.image_color_maps) - len(image_color_maps)
         if repeated:
             raise ValueError(f"{repeated} images' colour maps are given twice")
+        same = ("name", "ground_z_m", "has_metric_scale", "has_known_gravity", "recorded_source",
+                "made_by")  # fmt: skip
         return Scene(
-            name=document.name,
             source=source,
             background=parts[0].gaussians,
             actors=actors,
             sky=sky,
             frames=frames,
             world_origin_m=np.array(document.world_origin_m, np.float64),
-            ground_z_m=document.ground_z_m,
-            has_metric_scale=document.has_metric_scale,
             ground=None if document.ground is None else Ground(**document.ground.model_dump()),
-            has_known_gravity=document.has_known_gravity,
             problems=tuple(document.problems),
             color_maps={
                 name: torch.tensor(rows, dtype=torch.float32)
                 for name, rows in document.color_maps.items()
             },
             image_color_maps=image_color_maps,
-            recorded_source=document.recorded_source,
-            made_by=document.made_by,
+            **{name: getattr(document, name) for name in same},
         )
     except ValueError as error:
         raise SceneError(f"{where}: {error}") from error

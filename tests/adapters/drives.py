@@ -5,7 +5,9 @@ The car stands or drives along +x; cameras look along +x unless turned. World z 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from augment.scene import Actor, Gaussians, Scene
 from augment.sky import ConstantSky
 
 FRAME_NS = 100_000_000
+WHOLE = r"(?s)\A.*\Z"  # a pattern for all of a file
 AHEAD = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera_from_world of one along +x
 LEFT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
@@ -119,3 +122,20 @@ def flat_splats(means: np.ndarray, scale_m: float) -> Gaussians:
         torch.full((count,), 0.95),
         torch.zeros(count, 1, 3),
     )
+
+
+@contextmanager
+def changed(path: Path, pattern: str | None, text: str = "") -> Iterator[None]:
+    """A file with what matches the pattern replaced by a text, or without the file where there is
+    no pattern; as it was afterwards. An empty pattern changes nothing."""
+    before = path.read_bytes()
+    if pattern is None:
+        path.unlink()
+    elif pattern:
+        after, count = re.subn(pattern, text, before.decode(), flags=re.MULTILINE)
+        assert count, (path, pattern)
+        path.write_text(after)
+    try:
+        yield
+    finally:
+        path.write_bytes(before)

@@ -26,6 +26,7 @@ from adapters.camera_files.paths import (
     solid_points,
     with_camera_path,
 )
+from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.world import WorldChange
 from augment.errors import AdapterError
 from augment.files.ply import read_splats, write_ply
@@ -424,24 +425,12 @@ def test_paths_follow_the_recentring_and_the_clock(tmp_path: Path, scene: Scene)
 def test_labels_do_not_follow(tmp_path: Path) -> None:
     scene = Scene(
         name="s", source="procedural:street", background=street(), actors=(),
-        sky=ConstantSky(torch.zeros(3)), frames=(), labels=object(),
+        sky=ConstantSky(torch.zeros(3)), frames=(), labels=StreetGaussiansLabels(tmp_path),
     )  # fmt: skip
     changed = with_camera_path(scene, save_path(tmp_path / "a.json", [LEVEL]))
     assert changed.labels is None
     assert "boxes and LiDAR are left out" in changed.problems[0]
     assert changed.source == f"procedural:street?camera_path={tmp_path}/a.json"
-
-
-def test_other_formats_serve_as_paths(tmp_path: Path, scene: Scene) -> None:
-    pose = np.diag([1.0, -1, -1, 1])  # OpenGL axes: this camera looks along world +z
-    frame = {"file_path": "0001.png", "transform_matrix": pose.tolist()}
-    nerfstudio = {"w": 9, "h": 9, "fl_x": 9, "frames": [frame]}
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(nerfstudio))
-    (got,) = frames_from_path_file(path, scene)
-    np.testing.assert_array_equal(got.cameras["camera"].world_from_camera, np.eye(4))
-    with pytest.raises(AdapterError, match="no such file"):
-        frames_from_path_file(tmp_path / "absent.json", scene)
 
 
 def along_and_across(positions: np.ndarray, heading_deg: float) -> tuple[np.ndarray, np.ndarray]:

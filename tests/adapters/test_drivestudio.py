@@ -23,7 +23,6 @@ from adapters.drivestudio.adapter import (
     read_sky,
     turned_faces,
 )
-from adapters.drivestudio.drive import CONVENTIONS
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.plan import make_plan
@@ -715,11 +714,3 @@ def test_labels_need_no_readable_checkpoint(numbers):
     (numbers.folder / "checkpoint_final.pth").write_bytes(b"")
     labels = drivestudio_labels(str(numbers.folder), {"frames": "2:3"})
     assert labels.boxes(1).track_ids == ("walker", "car-b", "car-a")
-
-
-def test_axes_of_datasets_are_rotations():
-    for c in CONVENTIONS.values():
-        for axes in (
-            c.camera_from_opencv, c.scene_from_model, c.pose_from_ego, c.object_from_actor,
-        ):  # fmt: skip
-            assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from adapters.lidar_scene.image_views import Body, View, observe_views
+from adapters.lidar_scene.image_views import Body, Seen, View, observe_views
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import Surfels
@@ -59,46 +60,43 @@ def gatherer() -> SkyGatherer:
     return SkyGatherer(32, math.radians(15))
 
 
+def observed(*bodies: Body, views: list[View], sky: SkyGatherer | None = None) -> list[Seen]:
+    seen, problems = observe_views(bodies, views, sky or gatherer(), image_scale=1.0)
+    assert problems == ()
+    return list(seen)
+
+
+def assert_coloured(colours: np.ndarray, colour, atol: float = 0.02) -> None:
+    expected = np.broadcast_to(np.divide(colour, 255), np.shape(colours))
+    np.testing.assert_allclose(colours, expected, atol=atol)
+
+
 def test_surfels_take_the_colour_of_their_pixels(tmp_path):
     image = solid(RED)
     image[:, WIDTH // 2 :] = GREEN  # the right half: negative y
     surfels = wall(5.0, 2.0)
-    (seen,), problems = observe_views(
-        [Body(surfels)], [view(tmp_path / "a.png", image, camera())], gatherer(), image_scale=1.0
-    )
-    assert problems == () and seen.seen.all()
-    left, right = surfels.centres[:, 1] > 0.5, surfels.centres[:, 1] < -0.5
-    np.testing.assert_allclose(
-        seen.colours[left], np.tile(np.divide(RED, 255), (left.sum(), 1)), atol=0.02
-    )
-    np.testing.assert_allclose(
-        seen.colours[right], np.tile(np.divide(GREEN, 255), (right.sum(), 1)), atol=0.02
-    )
+    (seen,) = observed(Body(surfels), views=[view(tmp_path / "a.png", image, camera())])
+    assert seen.seen.all()
+    assert_coloured(seen.colours[surfels.centres[:, 1] > 0.5], RED)
+    assert_coloured(seen.colours[surfels.centres[:, 1] < -0.5], GREEN)
 
 
-def test_what_is_behind_a_surface_does_not_take_its_colour(tmp_path):
-    near, far = wall(4.0, 0.8), wall(8.0, 3.0)
+def test_what_is_behind_a_surface_or_the_camera_or_aside_is_unseen(tmp_path):
+    near, far, behind, aside = wall(4.0, 0.8), wall(8.0, 3.0), wall(-5.0, 1.0), wall(5.0, 1.0)
+    aside = dataclasses.replace(aside, centres=aside.centres + np.float32([0, 30, 0]))
     views = [view(tmp_path / "a.png", solid(RED), camera())]
-    (front, back), _ = observe_views([Body(near), Body(far)], views, gatherer(), image_scale=1.0)
-    assert front.seen.all()
+    front, back, *unseen = observed(*map(Body, (near, far, behind, aside)), views=views)
+    assert front.seen.all() and not any(seen.seen.any() for seen in unseen)
     hidden = np.abs(far.centres[:, 1:]).max(axis=1) < 1.3  # 0.8 m at 4 m hides 1.6 m at 8 m
     free = np.abs(far.centres[:, 1:]).max(axis=1) > 2.0
     assert not back.seen[hidden].any() and back.seen[free].all()
 
 
-def test_what_lies_outside_the_image_or_behind_it_is_unseen(tmp_path):
-    behind, aside = wall(-5.0, 1.0), wall(5.0, 1.0)
-    aside = Surfels(aside.centres + np.float32([0, 30, 0]), *list(vars(aside).values())[1:])
-    views = [view(tmp_path / "a.png", solid(RED), camera())]
-    seen, _ = observe_views([Body(behind), Body(aside)], views, gatherer(), image_scale=1.0)
-    assert not seen[0].seen.any() and not seen[1].seen.any()
-
-
 def test_the_median_leaves_one_odd_image_out(tmp_path):
     views = [view(tmp_path / f"{i}.png", solid(RED), camera()) for i in range(4)]
     views.append(view(tmp_path / "odd.png", solid(GREEN), camera()))
-    (seen,), _ = observe_views([Body(wall(5.0, 1.0))], views, gatherer(), image_scale=1.0)
-    np.testing.assert_allclose(seen.colours, np.tile(np.divide(RED, 255), (121, 1)), atol=0.01)
+    (seen,) = observed(Body(wall(5.0, 1.0)), views=views)
+    assert_coloured(seen.colours, RED, atol=0.01)
 
 
 def test_the_nearer_camera_counts_most(tmp_path):
@@ -106,10 +104,9 @@ def test_the_nearer_camera_counts_most(tmp_path):
         view(tmp_path / "far.png", solid(GREEN), camera("far", at=(-15, 0, 0))),
         view(tmp_path / "near.png", solid(RED), camera("near")),
     ]
-    (seen,), _ = observe_views([Body(wall(5.0, 0.4))], views, gatherer(), image_scale=1.0)
+    (seen,) = observed(Body(wall(5.0, 0.4)), views=views)
     # Scores go with 1/z, weights with their square: 16 to 1.
-    expected = (16 * np.divide(RED, 255) + np.divide(GREEN, 255)) / 17
-    np.testing.assert_allclose(seen.colours.mean(0), expected, atol=0.02)
+    assert_coloured(seen.colours.mean(0), (16 * np.array(RED) + GREEN) / 17)
 
 
 def moving_box() -> tuple:
@@ -125,43 +122,33 @@ def moving_box() -> tuple:
 
 
 def test_a_moving_box_hides_the_world_even_where_lidar_saw_through_it(tmp_path):
-    (track,) = moving_box()
-    empty = wall(0.0, -1.0)
-    world = wall(8.0, 0.8)
+    bodies = Body(wall(8.0, 0.8)), Body(wall(0.0, -1.0), *moving_box())
     views = [view(tmp_path / "a.png", solid(RED), camera(time_ns=0))]
-    (seen, _), _ = observe_views(
-        [Body(world), Body(empty, track)], views, gatherer(), image_scale=1.0
-    )
+    seen, _ = observed(*bodies, views=views)
     assert not seen.seen.any()
     views.append(view(tmp_path / "b.png", solid(GREEN), camera(time_ns=10**8)))
-    (seen, _), _ = observe_views(
-        [Body(world), Body(empty, track)], views, gatherer(), image_scale=1.0
-    )
+    seen, _ = observed(*bodies, views=views)
     assert seen.seen.all()
-    np.testing.assert_allclose(seen.colours.mean(0), np.divide(GREEN, 255), atol=0.01)
+    assert_coloured(seen.colours.mean(0), GREEN, atol=0.01)
 
 
 def test_actors_are_coloured_where_they_are_at_the_cameras_time(tmp_path):
-    (track,) = moving_box()
     own = wall(-0.2, 0.6)  # its rear, in its own frame
+    body = Body(own, *moving_box())
     image = solid(BLUE)
     image[:, WIDTH // 2 - 8 : WIDTH // 2 + 8] = RED
-    views = [view(tmp_path / "a.png", image, camera(time_ns=0))]
-    (seen,), _ = observe_views([Body(own, track)], views, gatherer(), image_scale=1.0)
-    middle = np.abs(own.centres[:, 1]) < 0.5
-    np.testing.assert_allclose(seen.colours[middle].mean(0), np.divide(RED, 255), atol=0.02)
-    gone = [view(tmp_path / "b.png", image, camera(time_ns=10**9))]
-    (seen,), _ = observe_views([Body(own, track)], gone, gatherer(), image_scale=1.0)
+    (seen,) = observed(body, views=[view(tmp_path / "a.png", image, camera(time_ns=0))])
+    assert_coloured(seen.colours[np.abs(own.centres[:, 1]) < 0.5].mean(0), RED)
+    (seen,) = observed(body, views=[view(tmp_path / "b.png", image, camera(time_ns=10**9))])
     assert not seen.seen.any()
 
 
 def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
     surfels = wall(5.0, 2.0)
-    one = view(tmp_path / "a.png", solid(RED), camera(), used_rows=0.5)
-    (seen,), _ = observe_views([Body(surfels)], [one], gatherer(), image_scale=1.0)
-    below = surfels.centres[:, 2] < -0.2
-    above = surfels.centres[:, 2] > 0.2
-    assert not seen.seen[below].any() and seen.seen[above].all()
+    views = [view(tmp_path / "a.png", solid(RED), camera(), used_rows=0.5)]
+    (seen,) = observed(Body(surfels), views=views)
+    heights = surfels.centres[:, 2]
+    assert not seen.seen[heights < -0.2].any() and seen.seen[heights > 0.2].all()
 
 
 def test_images_that_cannot_be_used_are_problems(tmp_path):
@@ -178,19 +165,14 @@ def test_what_nothing_covers_is_sky(tmp_path):
     image = solid(BLUE)
     image[HEIGHT // 2 :] = GREEN
     floor = wall(6.0, 6.0, spacing=0.5)
-    low = Surfels(floor.centres - np.float32([0, 0, 6.5]), *list(vars(floor).values())[1:])
+    low = dataclasses.replace(floor, centres=floor.centres - np.float32([0, 0, 6.5]))
     sky = gatherer()
-    observe_views([Body(low)], [view(tmp_path / "a.png", image, camera())], sky, image_scale=1.0)
+    observed(Body(low), views=[view(tmp_path / "a.png", image, camera())], sky=sky)
     faces = sky.finish()
-    up_ahead = torch.tensor([[1.0, 0.0, 0.3], [1.0, 0.5, 0.4]])
-    np.testing.assert_allclose(
-        faces.sample(up_ahead), np.tile(np.divide(BLUE, 255), (2, 1)), atol=0.02
-    )
+    assert_coloured(faces.sample(torch.tensor([[1.0, 0.0, 0.3], [1.0, 0.5, 0.4]])), BLUE)
     # No image shows these: filled from the sky, not from the ground.
     unseen = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.2]])
-    np.testing.assert_allclose(
-        faces.sample(unseen), np.tile(np.divide(BLUE, 255), (2, 1)), atol=0.05
-    )
+    assert_coloured(faces.sample(unseen), BLUE, atol=0.05)
 
 
 def test_above_a_wall_that_leaves_the_lidars_view_another_image_is_believed(tmp_path):
@@ -200,6 +182,5 @@ def test_above_a_wall_that_leaves_the_lidars_view_another_image_is_believed(tmp_
     direction = torch.tensor([[1.0, 0.0, 0.55]])
     for views, colour in (([walled], RED), ([walled, clear], BLUE), ([walled] * 5 + [clear], BLUE)):
         sky = gatherer()
-        observe_views([Body(tall)], views, sky, image_scale=1.0)
-        got = sky.finish().sample(direction)[0]
-        np.testing.assert_allclose(got, np.divide(colour, 255), atol=0.08)
+        observed(Body(tall), views=views, sky=sky)
+        assert_coloured(sky.finish().sample(direction), colour, atol=0.08)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import nuscenes_files
@@ -13,6 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from drives import camera as drives_camera
+from drives import one_splat
 from drivestudio_files import write_run
 
 from adapters.drivestudio.adapter import drivestudio_labels
@@ -45,7 +47,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, KnowsLidarOrigins, LidarSweep
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Scene, Track
 from augment.semantics import SemanticClass as Class
 from augment.sky import ConstantSky
 
@@ -68,21 +70,23 @@ def plane(normal, spacing=(0.1, 0.1), half=1.0, centre=(0, 0, 0)) -> np.ndarray:
     return (grid.reshape(-1, 3) + centre).astype(np.float32)
 
 
+def edges_of(points, metres: float) -> np.ndarray:
+    return np.full(len(points), metres, np.float32)
+
+
 def test_a_voxel_keeps_its_mean_and_commonest_class():
-    points = np.array([[0.01, 0.01, 0.01], [0.03, 0.01, 0.01], [0.02, 0.04, 0.04], [0.3, 0, 0.01]])
-    classes = np.array([Class.ROAD, Class.POLE, Class.ROAD, Class.UNKNOWN], np.int16)
-    thin, edges = thin_points(PointSet(points.astype(np.float32), classes), ORIGIN, voxel_m=0.05)
+    points = np.float32(
+        [[0.01, 0.01, 0.01], [0.03, 0.01, 0.01], [0.02, 0.04, 0.04], [0.3, 0, 0.01]] + 5 * [[9] * 3]
+    )
+    # Any number of unknown is outvoted by a known class.
+    classes = [Class.ROAD, Class.POLE, Class.ROAD, Class.UNKNOWN, Class.SIGN] + 4 * [Class.UNKNOWN]
+    some = PointSet(points, np.array(classes, np.int16))
+    thin, edges = thin_points(some, np.float32([[0, 0, 0], [9, 9, 9]]), voxel_m=0.05)
     order = np.argsort(thin.points[:, 0])
-    np.testing.assert_allclose(thin.points[order], [[0.02, 0.02, 0.02], [0.3, 0, 0.01]], atol=1e-6)
-    assert thin.semantic[order].tolist() == [Class.ROAD, Class.UNKNOWN]
+    expected = [[0.02, 0.02, 0.02], [0.3, 0, 0.01], [9, 9, 9]]
+    np.testing.assert_allclose(thin.points[order], expected, atol=1e-6)
+    assert thin.semantic[order].tolist() == [Class.ROAD, Class.UNKNOWN, Class.SIGN]
     np.testing.assert_allclose(edges, 0.05)
-
-
-def test_a_known_class_outvotes_any_number_of_unknown():
-    points = point_set(np.full((5, 3), 0.01), Class.UNKNOWN)
-    points.semantic[2] = Class.SIGN
-    thin, _ = thin_points(points, ORIGIN, voxel_m=0.1)
-    assert thin.semantic.tolist() == [Class.SIGN]
 
 
 def test_voxels_grow_with_distance_from_the_path():
@@ -96,7 +100,7 @@ def test_voxels_grow_with_distance_from_the_path():
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (1, 2, 3)])
 def test_normals_and_spacing_of_a_plane(normal):
     points = plane(normal, spacing=(0.1, 0.1))
-    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32))
+    surfels = surfels_from_points(points, edges_of(points, 0.1))
     expected = np.asarray(normal) / np.linalg.norm(normal)
     np.testing.assert_allclose(np.abs(surfels.normals @ expected), 1, atol=1e-5)
     np.testing.assert_allclose((surfels.normals * surfels.major).sum(1), 0, atol=1e-5)
@@ -109,7 +113,7 @@ def test_normals_and_spacing_of_a_plane(normal):
 def test_rings_on_the_ground_are_stretched_across():
     points = plane((0, 0, 1), spacing=(0.05, 0.18))  # dense along a ring, sparse across
     classes = np.full(len(points), Class.ROAD, np.int16)
-    surfels = surfels_from_points(points, np.full(len(points), 0.05, np.float32), semantic=classes)
+    surfels = surfels_from_points(points, edges_of(points, 0.05), semantic=classes)
     inner = np.abs(points).max(axis=1) < 0.6
     along = np.abs(surfels.major[inner] @ (points[1] - points[0])) / 0.18 < 0.5
     across = np.where(along, surfels.spacing[inner, 1], surfels.spacing[inner, 0])
@@ -121,37 +125,32 @@ def test_two_wires_are_not_a_sheet():
     x = np.arange(-2, 2, 0.08)
     wires = [np.stack([x, np.full_like(x, y), np.full_like(x, 9.0)], 1) for y in (0.0, 0.3)]
     points = np.concatenate(wires).astype(np.float32)
-    surfels = surfels_from_points(points, np.full(len(points), 0.08, np.float32))
+    surfels = surfels_from_points(points, edges_of(points, 0.08))
     assert surfels.spacing.max() < 0.2
-    assert len(bridge_gaps(point_set(points), np.full(len(points), 0.08, np.float32), surfels)) == 0
+    assert len(bridge_gaps(point_set(points), edges_of(points, 0.08), surfels)) == 0
 
 
 def test_a_lone_ring_faces_as_its_class_does():
     x = np.arange(-1, 1, 0.05)
     ring = np.stack([x, 0 * x, 0 * x], 1).astype(np.float32)
-    edge = np.full(len(ring), 0.05, np.float32)
     for semantic, axis in ((Class.ROAD, 2), (Class.BUILDING, 1)):
         classes = np.full(len(ring), semantic, np.int16)
-        surfels = surfels_from_points(ring, edge, semantic=classes)
+        surfels = surfels_from_points(ring, edges_of(ring, 0.05), semantic=classes)
         np.testing.assert_allclose(np.abs(surfels.normals[:, axis]), 1, atol=1e-4)
 
 
-def test_a_point_far_from_all_others_is_isolated():
+def test_points_far_from_all_others_and_too_few_are_isolated():
     points = np.concatenate([plane((0, 0, 1)), np.float32([[0, 0, 5]])])
-    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32))
+    surfels = surfels_from_points(points, edges_of(points, 0.1))
     assert surfels.isolated.tolist() == [False] * (len(points) - 1) + [True]
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_too_few_points_are_isolated(count):
-    points = np.arange(3 * count, dtype=np.float32).reshape(-1, 3)
-    surfels = surfels_from_points(points, np.ones(count, np.float32))
-    assert len(surfels) == count and surfels.isolated.all()
+    for count in (0, 3):
+        few = surfels_from_points(points[:count], edges_of(points[:count], 1.0))
+        assert len(few) == count and few.isolated.all()
 
 
 def test_gaussians_are_flat_along_the_normal():
     points = plane((0, 0.6, 0.8))
-    edge = np.full(len(points), 0.1, np.float32)
+    edge = edges_of(points, 0.1)
     surfels = surfels_from_points(points, edge)
     colours = np.tile(np.float32([0.2, 0.5, 0.9]), (len(points), 1))
     g = gaussians_from_surfels(surfels, colours, np.full(len(points), Class.BUILDING, np.int16))
@@ -178,30 +177,22 @@ def test_unseen_points_borrow_the_nearest_colour_within_reach():
     assert not known.any()
 
 
-def bridges(points: np.ndarray, semantic: Class, edge: float) -> np.ndarray:
-    edges = np.full(len(points), edge, np.float32)
-    some = point_set(points, semantic)
-    return bridge_gaps(
-        some, edges, surfels_from_points(points, edges, semantic=some.semantic)
-    ).points
+def bridges(points: np.ndarray, edge: float) -> np.ndarray:
+    some, edges = point_set(points, Class.VEHICLE), edges_of(points, edge)
+    surfels = surfels_from_points(points, edges, semantic=some.semantic)
+    return bridge_gaps(some, edges, surfels).points
 
 
-def test_rings_on_one_surface_are_bridged():
+def test_rings_on_one_surface_are_bridged_as_far_as_their_class_allows():
     points = plane((0, 1, 0), spacing=(0.05, 0.3))
-    new = bridges(points, Class.VEHICLE, 0.05)
+    new = bridges(points, 0.05)
     assert len(new) > 4 * len(points) / 2
     assert np.abs(new[:, 1]).max() < 1e-5  # on the plane
     distance = np.abs(new[:, None] - points[None]).max(2).min(1)
     assert distance.max() < 0.16  # within the gaps, none further
-
-
-def test_gaps_wider_than_their_class_allows_stay_open():
-    assert len(bridges(plane((0, 1, 0), spacing=(0.05, 0.6)), Class.VEHICLE, 0.05)) == 0
-
-
-def test_a_step_is_not_bridged():
-    low, high = plane((0, 0, 1)), plane((0, 0, 1), centre=(0, 0, 0.3))
-    new = bridges(np.concatenate([low, high]), Class.VEHICLE, 0.1)
+    assert len(bridges(plane((0, 1, 0), spacing=(0.05, 0.6)), 0.05)) == 0
+    step = np.concatenate([plane((0, 0, 1)), plane((0, 0, 1), centre=(0, 0, 0.3))])
+    new = bridges(step, 0.1)
     assert not ((new[:, 2] > 0.05) & (new[:, 2] < 0.25)).any()
 
 
@@ -211,7 +202,7 @@ def test_walls_are_filled_between_rings_and_no_further():
     rows = [np.stack([x, np.full_like(x, 10), np.full_like(x, z)], 1) for z in heights]
     points = np.concatenate(rows).astype(np.float32)
     some = point_set(points, Class.BUILDING)
-    edges = np.full(len(points), 0.1, np.float32)
+    edges = edges_of(points, 0.1)
     surfels = surfels_from_points(points, edges, semantic=some.semantic)
     new = fill_walls(some, edges, surfels)
     np.testing.assert_allclose(new.points[:, 1], 10, atol=1e-5)
@@ -247,10 +238,7 @@ def test_ground_does_not_grow_outwards_nor_over_wide_holes():
     new = fill_ground(wide, np.zeros((1, 3)), voxel_m=0.2)
     assert len(new) == 0 or np.hypot(new.points[:, 0], new.points[:, 1]).min() > 1.0
     assert len(new) == 0 or np.abs(new.points[:, :2]).max() < 12.3
-
-
-def test_without_ground_nothing_is_filled():
-    some = point_set(plane((0, 1, 0)), Class.BUILDING)
+    some = point_set(plane((0, 1, 0)), Class.BUILDING)  # no ground at all
     assert len(fill_ground(some, np.zeros((1, 3)), voxel_m=0.1)) == 0
 
 
@@ -258,13 +246,10 @@ def test_without_classes_low_points_are_ground():
     ground = sloping_ground(0.0).points
     car = plane((0, 0, 1), half=1.0, centre=(3.0, 3.0, 1.5))
     wall = plane((0, 1, 0), half=2.0, centre=(0, 11.0, 3.6))
-    points = point_set(np.concatenate([ground, car, wall]), Class.UNKNOWN)
-    found = ground_points(points)
-    assert found[: len(ground)].mean() > 0.9
-    assert not found[len(ground) :].any()
+    found = ground_points(point_set(np.concatenate([ground, car, wall]), Class.UNKNOWN))
+    assert found[: len(ground)].mean() > 0.9 and not found[len(ground) :].any()
 
 
-FORWARD = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # the camera looks along +x
 WORLD_ORIGIN = np.array([5000.0, -3000.0, 0.0])
 SECOND = 1_000_000_000
 
@@ -284,10 +269,8 @@ class OneSweep:
 
 
 def camera(time_s: float = 10.0) -> Camera:
-    pose = np.eye(4)
-    pose[:3, :3] = FORWARD
-    time = round(time_s * SECOND)
-    return Camera("front", 40, 30, 20.0, 20.0, 20.0, 15.0, torch.from_numpy(pose), time)
+    looking = drives_camera(size=(40, 30), focal_px=20.0, position=(0, 0, 0))
+    return dataclasses.replace(looking, timestamp_ns=round(time_s * SECOND))
 
 
 def scene(points, times_s, *, actors=(), **extra) -> Scene:
@@ -298,15 +281,11 @@ def scene(points, times_s, *, actors=(), **extra) -> Scene:
 
 
 def made(columns, actors=()) -> Scene:
-    one = Gaussians(
-        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1),
-        torch.zeros(1, 1, 3),
-    )  # fmt: skip
-    sky = ConstantSky(torch.ones(3))
     frame = Frame(0, 10 * SECOND, torch.eye(4, dtype=torch.float64), {}, {})
     return Scene(
-        "s", "test:", one, actors, sky, (frame,), OneSweep(columns), world_origin_m=WORLD_ORIGIN
-    )
+        "s", "test:", one_splat(), actors, ConstantSky(torch.ones(3)), (frame,), OneSweep(columns),
+        world_origin_m=WORLD_ORIGIN,
+    )  # fmt: skip
 
 
 def driving_actor(speed_mps: float) -> Actor:
@@ -314,11 +293,7 @@ def driving_actor(speed_mps: float) -> Actor:
     times = torch.tensor([9 * SECOND, 10 * SECOND, 11 * SECOND])
     poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     poses[:, 0, 3] = torch.tensor([10 - speed_mps, 10.0, 10 + speed_mps])
-    g = Gaussians(
-        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1),
-        torch.zeros(1, 1, 3),
-    )  # fmt: skip
-    return Actor("a", "Car", g, Track(times, poses), (4.0, 2.0, 1.5))
+    return Actor("a", "Car", one_splat(), Track(times, poses), (4.0, 2.0, 1.5))
 
 
 def seen(one: Scene, time_s: float = 10.0) -> DepthPixels:
@@ -368,7 +343,7 @@ PANDASET = Path(__file__).resolve().parents[3] / "shared" / "data" / "pandaset_m
 def test_street_origins_give_back_the_beams() -> None:
     parameters = StreetParameters(frames=2, lidar_columns=16, lidar_rings=8)
     labels = StreetLabels(parameters)
-    origins, directions, times = lidar_rays(SimpleNamespace(parameters=parameters), 1)
+    origins, directions, times = lidar_rays(parameters, 1)
     count = directions.shape[1]
     points = (origins[:, None] + 7.0 * directions).reshape(-1, 3)
     columns = {name: points[:, axis] for axis, name in enumerate("xyz")}

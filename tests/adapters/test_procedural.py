@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from shown import assert_same_bits
 
 from adapters.base import open_scene
 from adapters.procedural import StreetTruth, TrueView, open_procedural, open_truth
@@ -45,8 +46,9 @@ from adapters.street.layout import (
     pavement_z,
     road_z,
 )
+from adapters.street.light import build_sky
 from adapters.street.raycast import build_tree
-from adapters.street.splats import Cells, cell_counts, make_cells, total_cells
+from adapters.street.splats import Cells, SplatPlan, make_cells
 from adapters.street.world import build_street
 from augment.errors import AdapterError, SceneError
 from augment.render.rasterize import rasterize
@@ -54,8 +56,6 @@ from augment.scene import Scene
 from augment.semantics import SemanticClass
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
-SMALL = {"gaussians": "60000", "frames": "2", "width": "64", "height": "36"}
-SMALL |= {"parked": "1", "moving": "1", "pedestrians": "1"}  # one of each kind
 
 
 @pytest.fixture(scope="module")
@@ -68,20 +68,17 @@ def truth() -> StreetTruth:
     return open_truth(QUERY)
 
 
-@pytest.mark.parametrize(
-    ("query", "message"),
-    [
+def test_invalid_queries_say_what_is_wrong():
+    for query, message in (
         ({"sede": "3"}, "unknown option 'sede'; .* seed: .*; frames: "),
         ({"seed": "three"}, "seed: Input should be a valid integer.*got three"),
         ({"seed": "-1"}, "seed: Input should be greater than or equal to 0"),
         ({"frames": "301"}, "frames: Input should be less than or equal to 300 .got 301"),
         ({"frames": "2.5"}, "frames: Input should be a valid integer"),
         ({"speed_mps": "nan"}, "speed_mps: Input should be"),
-    ],
-)
-def test_invalid_queries_say_what_is_wrong(query, message):
-    with pytest.raises(AdapterError, match=message):
-        open_procedural(query)
+    ):
+        with pytest.raises(AdapterError, match=message):
+            open_procedural(query)
 
 
 def test_canonical_uri_opens_the_same_parameters():
@@ -92,17 +89,13 @@ def test_canonical_uri_opens_the_same_parameters():
     assert parse_parameters(dict(pair.split("=") for pair in text.split("&"))) == parameters
 
 
-def test_same_query_gives_the_same_bits_and_another_seed_does_not():
+def test_same_query_gives_the_same_bits_and_another_seed_does_not(scene):
     state = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first = open_procedural({**SMALL, "seed": "8"})
     build_street.cache_clear()
-    again = open_scene(first.source)
-    for a, b in zip(_all_gaussians(first), _all_gaussians(again), strict=True):
-        for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
-            assert torch.equal(getattr(a, name), getattr(b, name)), name
-    assert torch.equal(first.sky.faces, again.sky.faces)
-    other = StreetParameters(seed=9)
-    assert not np.array_equal(draw_layout(other).trees, draw_layout(StreetParameters(seed=8)).trees)
+    build_sky.cache_clear()
+    assert_same_bits(scene, open_scene(scene.source))
+    other, own = (draw_layout(StreetParameters(seed=seed)) for seed in (9, 8))
+    assert not np.array_equal(other.trees, own.trees)
     assert torch.equal(state[0], torch.random.get_rng_state())
     assert np.array_equal(state[1], np.random.get_state()[1])  # noqa: NPY002
 
@@ -110,9 +103,9 @@ def test_same_query_gives_the_same_bits_and_another_seed_does_not():
 def test_scene_is_complete_and_finite(scene):
     assert scene.name == "street-seed3"
     assert scene.source == "procedural:street?seed=3&width=480&height=270"
-    total = sum(len(g) for g in _all_gaussians(scene))
-    assert 150_000 <= total <= 300_000
-    for gaussians in _all_gaussians(scene):
+    every = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    assert 280_000 <= sum(len(gaussians) for gaussians in every) <= 300_000
+    for gaussians in every:
         for name in ("means", "quats", "scales", "opacities", "sh"):
             assert torch.isfinite(getattr(gaussians, name)).all(), name
         assert gaussians.scales.min() > 0
@@ -251,10 +244,6 @@ def test_truth_sees_moving_things_where_they_are(truth):
         assert hits.normal[0, 2] > 0.5
 
 
-def _all_gaussians(scene: Scene) -> list:
-    return [scene.background, *(actor.gaussians for actor in scene.actors)]
-
-
 def _smooth_pixels(view: TrueView) -> np.ndarray:
     """Pixels whose 5x5 neighbourhood is one surface: one class and instance, colour within 8/255,
     and inverse depth (linear on a plane) without a bend or a step.
@@ -290,9 +279,16 @@ def _some_shapes(rng: np.random.Generator, copies: int) -> Shapes:
     return join(parts)
 
 
-def _edges(shapes: Shapes, cells: Cells) -> np.ndarray:
-    """Sides of cells in metres, [N, 2, 3]."""
-    return cells.sides @ shapes.axes[cells.shape]
+def _plan(shapes: Shapes, *spacing: float, hidden: bool = False) -> SplatPlan:
+    """Splats this far apart along both axes of all shapes."""
+    spacings, seen = np.full((len(shapes), 2), spacing), np.full(len(shapes), hidden)
+    return SplatPlan(None, shapes, spacings, None, seen)
+
+
+def _cells(plan: SplatPlan) -> tuple[Cells, np.ndarray]:
+    """Cells, and their sides in metres [N, 2, 3]."""
+    cells = make_cells(plan.shapes, plan.counts(1.0), plan.hidden)
+    return cells, cells.sides @ plan.shapes.axes[cells.shape]
 
 
 def _brute_force(shapes: Shapes, origin: np.ndarray, direction: np.ndarray) -> float:
@@ -346,11 +342,10 @@ def test_ray_casting_matches_brute_force():
 
 def test_normals_are_unit_and_at_right_angles_to_the_cells():
     shapes = _some_shapes(np.random.default_rng(1), 1)
-    counts = cell_counts(shapes, np.full((len(shapes), 2), 0.05), np.zeros(len(shapes), bool))
-    cells = make_cells(shapes, counts, np.zeros(len(shapes), bool))
+    cells, edges = _cells(_plan(shapes, 0.05))
     normals = shapes.normals(cells.shape, cells.local)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
-    assert np.abs(np.einsum("nak,nk->na", _edges(shapes, cells), normals)).max() < 1e-9
+    assert np.abs(np.einsum("nak,nk->na", edges, normals)).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -366,34 +361,30 @@ def test_normals_are_unit_and_at_right_angles_to_the_cells():
     ],
 )
 def test_cells_cover_each_surface_once(shape, area, tolerance):
-    none = np.zeros(1, bool)
-    counts = cell_counts(shape, np.full((1, 2), 0.04), none)
-    cells = make_cells(shape, counts, none)
-    a, b = _edges(shape, cells).transpose(1, 0, 2)
-    covered = np.linalg.norm(np.cross(a, b), axis=1).sum()
+    _, edges = _cells(_plan(shape, 0.04))
+    covered = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
     assert covered == pytest.approx(area, rel=max(tolerance, 1e-9))
 
 
 def test_lattices_narrow_towards_crisp_edges_only():
     shape = parallelograms((0, 0, 0), (1, 0, 0), (0, 1, 0), LOOK, edges=U0)
-    none = np.zeros(1, bool)
-    cells = make_cells(shape, np.array([[10, 1]]), none)
+    plan = _plan(shape, 0.1, 1.0)
+    cells, _ = _cells(plan)
     order = np.argsort(cells.local[:, 0])
     width = cells.sides[order, 0, 0]
     borders = np.concatenate([[0], np.cumsum(width)])
     assert width[0] < width[1] < width[2] < width[3] == pytest.approx(0.1)
     assert width[-1] == pytest.approx(0.1) and borders[-1] == pytest.approx(1)
     assert np.allclose(cells.local[order, 0], (borders[1:] + borders[:-1]) / 2)
-    assert total_cells(shape, np.array([[10, 1]]), none) == len(width)
+    assert plan.total(1.0) == len(width)
 
 
 def test_hidden_panels_keep_their_cells_clear_of_crisp_edges():
     shape = parallelograms((0, 0, 0), (3, 0, 0), (0, 3, 0), LOOK, edges=ALL_EDGES)
-    hidden = np.ones(1, bool)
-    cells = make_cells(shape, cell_counts(shape, np.full((1, 2), 0.5), hidden), hidden)
+    cells, _ = _cells(_plan(shape, 0.5, hidden=True))
     assert cells.local[:, :2].min() > 0.1 and cells.local[:, :2].max() < 0.9
     small = parallelograms((0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), LOOK)
-    assert cell_counts(small, np.full((1, 2), 0.5), hidden).sum() == 0
+    assert _plan(small, 0.5, hidden=True).counts(1.0).sum() == 0
 
 
 def test_cutting_leaves_exactly_what_lies_outside_the_holes():
@@ -443,13 +434,12 @@ def test_cameras_fire_as_the_beam_passes():
 
 
 def test_motion_agrees_with_its_track():
-    street = build_street(StreetParameters(seed=1, frames=3, moving=2, pedestrians=1))
-    for mover in street.movers:
-        track = mover.motion.track
-        times = START_NS + np.array([-350_000_000, -90_000_000, 0, 37_000_001, 1_000_000_000])
-        centres, present = mover.motion.at(times)
-        for time, centre, there in zip(times, centres, present, strict=True):
-            pose = track.pose_at(int(time))
+    layout = draw_layout(StreetParameters(seed=1, frames=3, moving=2, pedestrians=1))
+    times = START_NS + np.array([-350_000_000, -90_000_000, 0, 37_000_001, 1_000_000_000])
+    for mover in layout.movers:
+        motion = motion_of(mover, layout, 1.5, 0.0)
+        for time, centre, there in zip(times, *motion.at(times), strict=True):
+            pose = motion.track.pose_at(int(time))
             assert (pose is not None) == there
             if pose is not None:
                 # Both interpolate linearly; they differ by the rounding of times in seconds.
@@ -457,10 +447,7 @@ def test_motion_agrees_with_its_track():
 
 
 def test_motion_ends_where_the_street_does():
-    parameters = StreetParameters(seed=1, frames=300, moving=2, pedestrians=0)
-    street = build_street(parameters)
-    oncoming = street.movers[1]
-    assert len(oncoming.motion.times_ns) < 302
-    assert oncoming.motion.centres[:, 0].min() > street.layout.x0
-    again = motion_of(street.layout.movers[1], street.layout, oncoming.size_m[2], 0.0)
-    assert np.array_equal(again.times_ns, oncoming.motion.times_ns)
+    layout = draw_layout(StreetParameters(seed=1, frames=300, moving=2, pedestrians=0))
+    oncoming = motion_of(layout.movers[1], layout, 1.5, 0.0)
+    assert len(oncoming.times_ns) < 302
+    assert oncoming.centres[:, 0].min() > layout.x0

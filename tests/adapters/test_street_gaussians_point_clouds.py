@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import pickle
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
@@ -47,14 +47,6 @@ def test_frames_come_back_in_whatever_order_they_are_asked_for(tmp_path):
     assert all((found[n].points == points[n]).all() for n in points)
 
 
-def test_frames_that_are_no_longer_kept_are_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("adapters.street_gaussians.adapter._KEPT_BYTES", 0)
-    points, projections = clouds()
-    write_point_clouds(tmp_path, points, projections)
-    for frame in (3, 1, 1, 4, 0):
-        np.testing.assert_array_equal(read_point_cloud(tmp_path, frame).points, points[frame])
-
-
 def test_a_file_that_changed_is_opened_anew(tmp_path):
     points, projections = clouds()
     write_point_clouds(tmp_path, points, projections)
@@ -77,18 +69,11 @@ def test_a_file_without_projections_or_no_file(tmp_path):
 def test_threads_share_a_file(tmp_path):
     points, projections = clouds(frames=12)
     write_point_clouds(tmp_path, points, projections)
-    wrong = []
-
-    def check(frame: int) -> None:
-        if not np.array_equal(read_point_cloud(tmp_path, frame).points, points[frame]):
-            wrong.append(frame)
-
-    threads = [threading.Thread(target=check, args=(n % 12,)) for n in (5, 0, 11, 3, 7, 3, 1, 0)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
+    frames = (5, 0, 11, 3, 7, 3, 1, 0)
+    with ThreadPoolExecutor(8) as pool:
+        found = pool.map(lambda frame: read_point_cloud(tmp_path, frame).points, frames)
+    for frame, read in zip(frames, found, strict=True):
+        np.testing.assert_array_equal(read, points[frame])
 
 
 def _sum_of(folder, frame, queue):
@@ -112,29 +97,20 @@ def test_a_forked_process_opens_the_file_itself(tmp_path):
     assert found == {n: float(points[n].sum()) for n in (2, 4)}
 
 
-@pytest.mark.parametrize(
-    ("protocol", "dtype"), [(3, "<f8"), (4, ">f4"), (3, "i2"), (4, "u1"), (4, "bool")]
-)
-def test_arrays_of_any_protocol_and_type(protocol, dtype):
-    value = {n: RNG.integers(0, 2, (n + 1, 3)).astype(dtype) for n in range(4)}
-    found = streamed(value, protocol)
-    for number, array in value.items():
-        np.testing.assert_array_equal(found[number], array)
-        assert found[number].dtype == array.dtype.newbyteorder("=")
-
-
-def test_numbers_of_numpy_columns_in_fortrans_order_and_the_old_name_of_numpy():
+def test_arrays_of_any_protocol_type_and_number():
+    for protocol, dtype in ((3, "<f8"), (4, ">f4"), (3, "i2"), (4, "u1"), (4, "bool")):
+        value = {n: RNG.integers(0, 2, (n + 1, 3)).astype(dtype) for n in range(4)}
+        found = streamed(value, protocol)
+        for number, array in value.items():
+            np.testing.assert_array_equal(found[number], array)
+            assert found[number].dtype == array.dtype.newbyteorder("=")
+    # Numbers of numpy, columns in Fortran's order, the old name of numpy, and more than a batch.
     value = {np.int64(3): np.asfortranarray(RNG.normal(size=(50, 3))), np.int32(5): np.ones((2, 3))}
     data = pickle.dumps(value, protocol=3).replace(b"numpy._core", b"numpy.core")
     found = dict(stream_arrays(io.BytesIO(data)))
     assert list(found) == [3, 5]
     np.testing.assert_array_equal(found[3], value[np.int64(3)])
-
-
-def test_more_frames_than_a_pickle_puts_into_one_batch():
-    value = {n: np.full((2, 3), n, np.float32) for n in range(1001)}
-    found = streamed(value)
-    assert len(found) == 1001 and found[1000][0, 0] == 1000
+    assert len(streamed({n: np.full((2, 3), n, np.float32) for n in range(1001)})) == 1001
 
 
 def test_one_array_at_a_time_is_held(tmp_path):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
-import types
 from pathlib import Path
 
 import cv2
@@ -226,6 +224,7 @@ def test_where_boxes_overlap_the_one_that_encloses_the_surface_has_it_then_the_s
     assert not (image == 4)[left].any() and not (image == 3)[left].mean() > 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("surface", ["solid", pytest.param("scene", marks=pytest.mark.long)])
 def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
     """Of 0.3 m, which raises the surface out of the box; seen from above. `scene` looks through."""
@@ -317,31 +316,6 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
     assert many.of(("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
                    ).tolist() == [1, 2, MAX_INSTANCE, 0, 0, 0]  # fmt: skip
     assert "instance images number 65535 of them" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("kind", "stored"),
-    [
-        ("box_smog", [["a", "b"], [0.1 + 0.2, np.nan], [7, -1]]),
-        ("box_snow", [["a", "b", "c"], [7, 0, -1], [3, 0, 0]]),
-        ("box_water", [["a", "b", "c"], [0.1 + 0.2, np.nan, 1.0], [7, 0, -1], [3, 0, 0]]),
-        ("box_2d", None),
-    ],
-)
-def test_numbers_survive_progress_log_and_file_to_the_bit(kind, stored, tmp_path: Path) -> None:
-    table = box_tables()[kind]
-    if stored is None:
-        stored = table.to_json(measure(street(), street().frames[0].cameras["ahead"])[0])
-    numbers = table.from_json(json.loads(json.dumps(stored)))
-    (tmp_path / "table").write_bytes(table.to_bytes({(2, "x"): numbers}))
-    again = table.read(tmp_path / "table")[2, "x"]
-    assert again.track_ids == numbers.track_ids and again.columns.keys() == numbers.columns.keys()
-    for name in numbers.columns:
-        np.testing.assert_array_equal(again[name], numbers[name])
-    if fractions := [
-        name for name in ("snow_fraction", "hidden_fraction") if name in again.columns
-    ]:
-        np.testing.assert_array_equal(again[fractions[0]], [3 / 7, np.nan, 0.0])
 
 
 def test_targets_of_what_is_seen(whole: Path) -> None:
@@ -590,31 +564,3 @@ def test_a_target_of_plain_tensors(without_torchvision) -> None:
     assert target["track_ids"] == ["1"]
     with pytest.raises(ValueError, match="the sample has no image"):
         torchvision_sample(sample | {"image": None})
-
-
-Image, Mask = (type(name, (torch.Tensor,), {}) for name in ("Image", "Mask"))
-
-
-class BoundingBoxes(torch.Tensor):
-    format: str
-    canvas_size: tuple[int, int]
-
-    def __new__(cls, data, *, format, canvas_size):
-        boxes = data.as_subclass(cls)
-        boxes.format, boxes.canvas_size = format, canvas_size
-        return boxes
-
-
-def test_a_target_of_tv_tensors(monkeypatch) -> None:
-    """With stand-ins for torchvision's types, made as its own are."""
-    module = types.ModuleType("torchvision")
-    kinds = types.SimpleNamespace(Image=Image, Mask=Mask, BoundingBoxes=BoundingBoxes)
-    monkeypatch.setattr(module, "tv_tensors", kinds, raising=False)
-    monkeypatch.setitem(sys.modules, "torchvision", module)
-    semantic = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
-    sample = a_sample(TWO, depth=depth_of_two(), semantic=semantic)
-    image, target = torchvision_sample(sample, masks=True)
-    assert type(image) is Image and type(target["boxes"]) is BoundingBoxes
-    assert (target["boxes"].format, target["boxes"].canvas_size) == ("XYXY", (HEIGHT, WIDTH))
-    assert {type(target[key]) for key in ("masks", "depth", "semantic")} == {Mask}
-    assert type(target["labels"]) is torch.Tensor and len(target["boxes"]) == 2

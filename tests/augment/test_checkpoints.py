@@ -153,13 +153,10 @@ def hostile(path: Path, *, offset=0, size=(4,), stride=(1,), count=4, key="0", t
     def tuple_of(*items: bytes) -> bytes:
         return b"(" + b"".join(items) + b"t"
 
-    flat = tuple_of(
-        text("storage"), b"ctorch\nFloatStorage\n", text(key), text("cpu"), number(count)
-    )
+    kind, end = b"ctorch\nFloatStorage\n", b"ccollections\nOrderedDict\n)R"
+    flat = tuple_of(text("storage"), kind, text(key), text("cpu"), number(count))
     shape = [tuple_of(*map(number, sides)) for sides in (size, stride)]
-    tensor = tuple_of(
-        flat + b"Q", number(offset), *shape, b"\x89", b"ccollections\nOrderedDict\n)R"
-    )
+    tensor = tuple_of(flat + b"Q", number(offset), *shape, b"\x89", end)
     pickled = b"}" + text("x") + b"ctorch._utils\n_rebuild_tensor_v2\n" + tensor + b"R" + tail
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a/data.pkl", b"\x80\x02" + pickled + b"s.")
@@ -171,22 +168,12 @@ def test_tensors_stay_inside_the_numbers_of_the_file(tmp_path):
     path = tmp_path / "a.pth"
     assert load_checkpoint(hostile(path))["x"].tolist() == [0, 0, 0, 0]
     for case in (
-        {"offset": 1},
-        {"offset": -1},
-        {"offset": 1 << 40, "size": (1,)},
-        {"size": (5,)},
-        {"size": (-1,)},
-        {"size": (2,), "stride": (-1,)},
-        {"size": (2,), "stride": (4,)},
-        {"size": (1 << 47, 1 << 47), "stride": (0, 0)},
-        {"size": (2, 2), "stride": (1,)},
-        {"count": 5},
-        {"count": 1 << 39},
-        {"count": -4},
-        {"key": "1"},
-        {"key": "../0"},
+        {"offset": 1}, {"offset": -1}, {"offset": 1 << 40, "size": (1,)}, {"size": (5,)},
+        {"size": (-1,)}, {"size": (2,), "stride": (-1,)}, {"size": (2,), "stride": (4,)},
+        {"size": (1 << 47, 1 << 47), "stride": (0, 0)}, {"size": (2, 2), "stride": (1,)},
+        {"count": 5}, {"count": 1 << 39}, {"count": -4}, {"key": "1"}, {"key": "../0"},
         {"tail": b"(tb"},  # a state, which torch's own reader would set the tensor to
-    ):
+    ):  # fmt: skip
         with pytest.raises(AdapterError, match=r"a\.pth was not read, and nothing in it was run"):
             load_checkpoint(hostile(path, **case))
 

@@ -44,7 +44,6 @@ from tests.augment.hard_scenes import (
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.scenes import (
     GOLDEN,
-    GOLDEN_MODES,
     camera_ahead,
     golden_view,
     one_gaussian,
@@ -205,17 +204,11 @@ def test_bits_do_not_depend_on_the_buffers_asked_for():
         assert all(getattr(alone, name) is None for name in ALL - {buffer})
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"),
-    [
-        pytest.param("opaque", "a99_aa", marks=LONG),
-        *(
-            pytest.param(name, mode, marks=pytest.mark.gpu)
-            for name, mode in itertools.product(GOLDEN, GOLDEN_MODES)
-        ),
-    ],
-)
+@LONG
+@pytest.mark.parametrize(("name", "mode"), GOLDEN)
 def test_stored_renders(shared_dir, name, mode):
+    if gpu.is_interpreted() and (name, mode) != ("opaque", "a99_aa"):
+        pytest.skip("interpreted kernels take minutes")
     parts, camera, settings, arrays = golden_view(shared_dir, name, mode)
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
     assert_stored_render(render(parts, camera, buffers, settings), arrays)

@@ -427,17 +427,6 @@ def test_boxes_and_points_in_other_frames(folder: Path, frame) -> None:
     assert ego.dtype == torch.float64 and ego[0, 3] == world["camera"]["world_from_ego"][0, 3]
 
 
-def test_visibility_of_boxes(folder: Path) -> None:
-    clear = WeatherDataset(folder, variants=["clear-000"], frames=[3])[0]["boxes"]
-    assert clear["transmittance"] is None and clear["visibility"].tolist() == [1, 1, 1]
-    foggy = WeatherDataset(folder, variants=["fog-000"], frames=[3])[0]["boxes"]
-    assert torch.equal(foggy["visibility"], foggy["transmittance"])
-    assert 0 < foggy["visibility"].max() < 1
-    wet = WeatherDataset(folder, variants=["clear-009"], frames=[2])[0]["boxes"]
-    left = 1 - wet["hidden_fraction"].nan_to_num(0.0)
-    np.testing.assert_allclose(wet["visibility"], left)
-
-
 def test_only_what_is_asked_for_is_read(remote: MemoryStore) -> None:
     whole = dict(remote.files)
     folders = {"boxes": "labels", "image": "images"}

@@ -240,25 +240,6 @@ def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
         MixedDataset(clean, weathered, 1.5)
 
 
-def test_workers_that_live_on_see_a_new_epoch(written: Path) -> None:
-    whole = WeatherDataset(written, load=())
-    mixed = MixedDataset(clean_frames(whole), whole.select(~clean_rows(whole)), 0.5)
-    loader = DataLoader(
-        mixed, batch_size=6, num_workers=1, collate_fn=collate_frames, persistent_workers=True,
-        multiprocessing_context="fork",
-    )  # fmt: skip
-    found = []
-    for epoch in (0, 1):
-        mixed.set_epoch(epoch)
-        found.append([name for batch in loader for name in batch["variant"]])
-        assert found[-1] == [mixed[k]["variant"] for k in range(len(mixed))]
-    assert found[0] != found[1]
-
-
-def clean_rows(dataset: WeatherDataset) -> np.ndarray:
-    return np.array([name == "clear-000" for name in dataset.table["variant"].to_pylist()])
-
-
 @pytest.mark.parametrize("uneven", ["exact", "pad", "drop"])
 def test_every_sample_once_over_all_ranks(uneven) -> None:
     for count, ranks in ((0, 1), (0, 3), (1, 5), (7, 2), (7, 3), (24, 1), (24, 3), (24, 5)):

@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import types
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -49,14 +48,6 @@ def serial(out: Path, *scenes: list[str]) -> dict[str, str]:
     """Digests of what one process renders."""
     run_generate(make_job(out, *scenes), progress=False)
     return outputs(out)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("cluster")
-def test_an_actor_gives_the_serial_bytes(tmp_path):
-    scenes = ["fake:a?frames=1"]
-    run_generate(make_job(tmp_path / "out", scenes, executor="ray", workers=1), progress=False)
-    assert outputs(tmp_path / "out") == serial(tmp_path / "serial", scenes)
 
 
 def dying_once(
@@ -107,29 +98,6 @@ def test_interrupt_lets_actors_finish_their_images(tmp_path):
     result = run_generate(make_job(tmp_path / "out"), progress=False)
     assert result.written < 28, "what was finished is not rendered again"
     assert outputs(tmp_path / "out") == serial(tmp_path / "serial")
-
-
-def noting_gpus(
-    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str, notes: Path
-) -> FakeView:
-    names = ("CUDA_VISIBLE_DEVICES", "NUMBA_NUM_THREADS")
-    notes.write_text(" ".join([backend, *(os.environ.get(name, "-") for name in names)]))
-    return fake_render(scene, camera, recipe, backend=backend)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("cluster")
-def test_an_actor_that_draws_on_a_gpu_has_it_and_its_cpus(tmp_path):
-    notes = tmp_path / "notes"
-    job = make_job(
-        tmp_path / "out",
-        ["fake:a?frames=1"],
-        executor="ray",
-        renderer=partial(noting_gpus, notes=notes),
-    )
-    job = replace(job, setup=replace(job.setup, backend="cuda"))
-    assert run_generate(job, progress=False).failed == 0
-    assert notes.read_text() == f"cuda 0 {CPUS}"
 
 
 @pytest.mark.long

@@ -17,10 +17,7 @@ from batch_scenes import (
     THICKNESS_M,
     FakeLabels,
     FakeView,
-    bed_render,
     fake_render,
-    make_bed,
-    make_camera,
     make_frame,
     make_maps,
     make_recipe,
@@ -31,15 +28,13 @@ from batch_scenes import (
 )
 
 from augment.boxes import PlacedBoxes
-from augment.cameras import Camera, Frame
+from augment.cameras import Camera
 from augment.dataset import WeatherDataset
 from augment.effects.flood.effect import hidden_pixels, submerged_fraction
 from augment.effects.smog import box_transmittance
-from augment.effects.snow import support as beds
-from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.snow import snow_pixels
 from augment.effects.style import style as scene_maps
-from augment.errors import OutputError, SceneError, StyleError
+from augment.errors import OutputError, StyleError
 from augment.jobs.files import box_tables, visibility
 from augment.jobs.manifest import later_columns, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
@@ -338,79 +333,12 @@ def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
         assert ((left >= 0) & (left <= 1) & (left <= numbers["transmittance"])).all()
 
 
-# ---- Where snow can lie: found once a job, used again by later jobs ------------------------------
-
-
-class Placements(list):
-    """Stands in for finding a bed: lists the cameras of every call. fails: what it raises."""
-
-    fails: Exception | None = None
-
-    def __call__(self, scene, cameras, settings, *, backend="auto", progress=False):
-        if self.fails is not None:
-            raise self.fails
-        self.append(list(cameras))
-        return make_bed(len(self[-1]) + settings.cell_m)
-
-
-@pytest.fixture
-def placements(monkeypatch: pytest.MonkeyPatch) -> Placements:
-    found = Placements()
-    monkeypatch.setattr(beds, "place_snow_support", found)
-    return found
-
-
-def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
-    return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
-
-
-def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> None:
-    run(RenderJob("fake:street", [snowy(0.1)], tmp_path))
-    placements.fails = AssertionError("searched again")
-    result = run(RenderJob("fake:street", [snowy(0.3, 1)], tmp_path), bed_render)
-    assert (result.written, result.failures) == (8, ())
-
-
-def test_where_there_can_be_no_snow_nothing_is_written_or_replaced(
-    placements, tmp_path: Path
-) -> None:
-    run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
-    before = tree_digest(tmp_path)
-    placements.fails = SceneError("scene 'street' does not know its metres")
-    for overwrite, variant in ((False, 1), (True, 0)):
-        job = RenderJob("fake:street", [snowy(0.1, variant)], tmp_path, overwrite=overwrite)
-        with pytest.raises(SceneError, match="does not know its metres"):
-            run(job)
-        assert tree_digest(tmp_path) == before
-
-
-def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
-    """And the caller's scene goes on with its own cameras' bed."""
-    scene = open_fake("fake:street")
-    recorded = make_frame(1)
-    cameras = {"front": make_camera("front", recorded.timestamp_ns, 0.5)}
-    path = [Frame(1, recorded.timestamp_ns, recorded.world_from_ego, cameras)]
-    settings, found = PlacementSettings(), []
-
-    def render(scene, camera, recipe, *, backend):
-        found.append(beds.support_of(scene, settings))
-        return fake_render(scene, camera, recipe, backend=backend)
-
-    load = {"scene_loader": lambda _uri: scene}
-    run(RenderJob("fake:street", [snowy()], tmp_path / "path", camera_path=path), render, **load)
-    run(RenderJob("fake:street", [snowy()], tmp_path / "own", frames=[0]), render, **load)
-    assert [len(cameras) for cameras in placements] == [1, 8]
-    assert [bed.ground.centers_m[0, 0].item() for bed in found] == pytest.approx([1.05, 8.05, 8.05])
-    # A path's job after it neither takes the scene's bed nor leaves its own.
-    run(RenderJob("fake:street", [snowy()], tmp_path / "path2", camera_path=path), render, **load)
-    assert found[-1].ground.centers_m[0, 0].item() == pytest.approx(1.05)
-    assert beds.support_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
-
-
 @pytest.mark.long
 def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
-    """Real beds and real pictures: whole, by two workers, and in parts that search anew."""
-    recipe, uri = snowy(0.15, cell_m=0.2), "fake:street?frames=2"
+    """Real beds and real pictures: whole, by two workers, and in parts that search anew. Another
+    depth finds the bed in its file.
+    """
+    recipe, uri = make_recipe(snow=Snow(depth_m=0.15, cell_m=0.2)), "fake:street?frames=2"
     whole, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
     result = run(RenderJob(uri, [recipe], whole), None)
     assert (result.written, result.failures) == (4, ())
@@ -424,6 +352,11 @@ def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path)
         assert (out / "manifest.parquet").read_bytes() == (whole / "manifest.parquet").read_bytes()
     masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in whole.rglob("snow/*/*.png")]
     assert len(masks) == 4 and max(mask.mean() for mask in masks) > 0
+    (bed,) = (whole / ".climategs").glob("snow-*")
+    before = bed.stat().st_mtime_ns
+    deeper = make_recipe(variant=1, snow=Snow(depth_m=0.3, cell_m=0.2))
+    assert run(RenderJob(uri, [deeper], whole), None).failures == ()
+    assert [p.stat().st_mtime_ns for p in (whole / ".climategs").glob("snow-*")] == [before]
 
 
 # ---- Maps of styles: found once a job, and what renders its images again -------------------------

@@ -6,7 +6,6 @@ import io
 import itertools
 import math
 import tempfile
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -318,34 +317,6 @@ def test_a_part_that_is_replaced_while_it_is_read(
 
     monkeypatch.setattr(type(store), "read", replaced)
     assert frames_of(store) == {0: (True, "")} and done
-
-
-def test_readers_while_blocks_are_published_and_merged(tmp_path: Path) -> None:
-    """A reader sees ever more blocks, each whole, and never an error."""
-    store, errors, counts = open_store(tmp_path), [], []
-    publish_part(store, "a/block-0", table({0: True, 1: True}))
-    stop = threading.Event()
-
-    def look() -> None:
-        try:
-            while not stop.is_set():
-                counts.append(len(frames_of(open_store(tmp_path))))
-        except Exception as error:
-            errors.append(error)
-
-    reader = threading.Thread(target=look)
-    reader.start()
-    for number in range(1, 15):
-        rows = {2 * number: True, 2 * number + 1: True}
-        failing = {frame: False for frame in rows}
-        publish_part(store, f"a/block-{number}", table(failing, "first"))
-        if number % 3 == 0:
-            compact(store)
-        publish_part(store, f"a/block-{number}", table(rows))
-    stop.set()
-    reader.join()
-    assert errors == [] and counts == sorted(counts) and all(n % 2 == 0 for n in counts)
-    assert frames_of(store) == {frame: (True, "") for frame in range(30)}
 
 
 def test_a_damaged_note_in_the_manifest(tmp_path: Path) -> None:

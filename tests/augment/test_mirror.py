@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from augment.errors import AdapterError, OutputError
-from augment.jobs import atomic
 from augment.jobs import mirror as mirror_module
 from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.files import decode_image
@@ -231,23 +230,6 @@ def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch):
     kept.write_bytes(b"of another length, at that time")
     os.utime(kept, ns=(time_ns, time_ns))
     assert trees.mirror(source, out).changed == 1
-
-
-def test_a_leftover_that_is_a_link_is_not_written(source, out, monkeypatch):
-    """A killed run's temporary name may lead to a source's file."""
-    table = source / "README.md"
-    before = table.read_bytes()
-
-    def taken(target: Path) -> Path:
-        path = target.with_name(f".1-1{TEMPORARY_SUFFIX}")
-        if not os.path.lexists(path):
-            os.link(table, path)
-        return path
-
-    monkeypatch.setattr(atomic, "temporary_beside", taken)
-    with pytest.raises(OutputError, match="cannot write"):
-        trees.mirror(source, out, links="copy")
-    assert table.read_bytes() == before
 
 
 def test_a_copy_that_shares_nothing(source, out):

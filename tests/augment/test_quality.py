@@ -408,17 +408,3 @@ def test_a_dataset_keeps_its_choices(bench: Workbench, tmp_path: Path) -> None:
     planned = plan_job(job(), progress=False)
     assert {b.recipe.render.scale for b in planned.blocks} == {0.75, 1.0}
     assert opened == ["fake:b?frames=2"]
-
-
-def test_a_scene_in_which_nothing_can_be_chosen_is_told(bench: Workbench, tmp_path: Path) -> None:
-    def render(scene, camera, recipe, *, backend: str) -> FakeView:
-        if scene.name == "b":
-            raise SceneError("it has no road")
-        return bench.render(scene, camera, recipe, backend=backend)
-
-    recipes = make_recipes(["slow"], texts={"slow": f"quality: {{max_flip: 0.5}}\n{PLAIN}"})
-    scenes = ["fake:a?frames=2", "fake:b?frames=2"]
-    result = run_generate(make_job(tmp_path, scenes, recipes, renderer=render), progress=False)
-    assert result.written == 4
-    why = "recipe slow, variant 0: quality max_flip 0.5 cannot choose its settings: it has no road"
-    assert result.unusable == {"fake:b?frames=2": why}

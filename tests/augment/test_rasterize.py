@@ -38,7 +38,6 @@ from augment.sky import CubemapSky
 from tests.assertions import assert_images_close, assert_labels_equal, assert_stored_render
 from tests.scenes import (
     GOLDEN,
-    GOLDEN_MODES,
     camera_ahead,
     golden_view,
     one_gaussian,
@@ -313,8 +312,7 @@ def assert_matches_definition(parts, camera, settings=DEFAULT, smog=None, *, max
 # ---- stored renders ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", GOLDEN_MODES)
-@pytest.mark.parametrize("name", GOLDEN)
+@pytest.mark.parametrize(("name", "mode"), GOLDEN)
 def test_stored_renders(shared_dir, name, mode):
     parts, camera, settings, arrays = golden_view(shared_dir, name, mode)
     assert_stored_render(render(parts, camera, {RGB, ALPHA, EXPECTED_DEPTH}, settings), arrays)

@@ -120,16 +120,8 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "width": SIZE[0],
         "height": SIZE[1],
         "surface": "solid",
-        "style": None,
-        "style_method": None,
-        "quality": None,
         "render_scale": 1.0,
-        "settings": None,
-        "water_path": None,
-        "snow_path": None,
         "box_2d_path": "street/fog-000/labels/boxes_2d.parquet",
-        "box_water_path": None,
-        "box_snow_path": None,
         "box_smog_path": "street/fog-000/labels/smog.parquet",
         "seed": 7,
         "recipe": "fog",
@@ -142,6 +134,8 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "message": "",
     }
     assert {name: row[name] for name in expected} == expected
+    absent = ("style", "quality", "settings", "water_path", "snow_path", "box_snow_path")
+    assert {row[name] for name in absent} == {None}
     numbers = recipe.columns()
     assert numbers.keys() <= row.keys()
     assert row["smog_extinction_per_m"] == numbers["smog_extinction_per_m"]

@@ -355,55 +355,46 @@ def test_the_same_support_is_the_same_bytes(support: SnowSupport, tmp_path: Path
     assert_equal(load_support(tmp_path / "b", "k"), empty)
 
 
-def changed(scene: Scene) -> dict[str, Scene]:
-    """The scene with one thing different at a time."""
-    ground, car, frame = scene.background, scene.actors[0], scene.frames[0]
-
-    def with_actor(**changes) -> Scene:
-        return dataclasses.replace(
-            scene, actors=(dataclasses.replace(car, **changes), *scene.actors[1:])
-        )
-
-    def with_ground(**changes) -> Scene:
-        return dataclasses.replace(scene, background=dataclasses.replace(ground, **changes))
-
+def test_keys_tell_contents_apart(scene: Scene) -> None:
+    cameras, ground, car = cameras_of(scene), scene.background, scene.actors[0]
+    again = drive(sheet((-2, 14), (-6, 6), semantic=1), actors=scene.actors)
+    key = support_key(scene, cameras, SETTINGS)
+    assert support_key(again, cameras_of(again), SETTINGS) == key
     moved = ground.means.clone()
     moved[7, 2] += 1e-3
     track = Track(car.track.timestamps_ns, car.track.world_from_actor + 0)
     track.world_from_actor[1, 0, 3] += 0.1
-    ego = frame.world_from_ego.clone()
+    ego = scene.frames[0].world_from_ego.clone()
     ego[1, 3] += 0.5
-    return {
-        "means": with_ground(means=moved),
-        "opacities": with_ground(opacities=ground.opacities * 0.9),
-        "colours": with_ground(sh=ground.sh * 0.9),
-        "no classes": with_ground(semantic=None),
-        "a class": with_ground(semantic=torch.full((len(ground),), 3).short()),
-        "a label": with_actor(label="Pedestrian"),
-        "a size": with_actor(size_m=(4.0, 1.8, 1.6)),
-        "a track": with_actor(track=track),
-        "fewer actors": dataclasses.replace(scene, actors=scene.actors[1:]),
-        "ego": dataclasses.replace(
-            scene, frames=(dataclasses.replace(frame, world_from_ego=ego), *scene.frames[1:])
-        ),
-    }
-
-
-def test_keys_tell_contents_apart(scene: Scene) -> None:
-    cameras = cameras_of(scene)
-    keys = {"as it is": support_key(scene, cameras, SETTINGS)}
-    again = drive(sheet((-2, 14), (-6, 6), semantic=1), actors=scene.actors)
-    assert support_key(again, cameras_of(again), SETTINGS) == keys["as it is"]
-    keys |= {what: support_key(other, cameras, SETTINGS) for what, other in changed(scene).items()}
-    keys["fewer cameras"] = support_key(scene, cameras[:1], SETTINGS)
-    keys["a wider camera"] = support_key(
-        scene, [dataclasses.replace(cameras[0], fx=70.0), *cameras[1:]], SETTINGS
-    )
+    scenes = [
+        dataclasses.replace(scene, background=dataclasses.replace(ground, **changes))
+        for changes in ({"means": moved}, {"sh": ground.sh * 0.9}, {"semantic": None})
+    ]
+    scenes += [
+        dataclasses.replace(scene, actors=(dataclasses.replace(car, **c), *scene.actors[1:]))
+        for c in ({"label": "Pedestrian"}, {"size_m": (4.0, 1.8, 1.6)}, {"track": track})
+    ]
+    first = dataclasses.replace(scene.frames[0], world_from_ego=ego)
+    scenes.append(dataclasses.replace(scene, frames=(first, *scene.frames[1:])))
+    keys = [key, *(support_key(other, cameras, SETTINGS) for other in scenes)]
+    keys.append(support_key(scene, cameras[:1], SETTINGS))
     for change in ({"cell_m": 0.3}, {"max_slope_deg": 40.0}, {"estimator": "median"}):
-        settings = dataclasses.replace(SETTINGS, **change)
-        keys[str(change)] = support_key(scene, cameras, settings)
-    assert len(set(keys.values())) == len(keys)
-    assert all(len(key) == 40 and int(key, 16) >= 0 for key in keys.values())
+        keys.append(support_key(scene, cameras, dataclasses.replace(SETTINGS, **change)))
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_support_is_found_once_and_a_damaged_file_is_written_anew(
+    scene: Scene, tmp_path: Path, caplog
+) -> None:
+    own = dataclasses.replace(scene)
+    first = support_of(own, SETTINGS, folder=tmp_path)
+    assert support_of(own, SETTINGS) is first
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-5])
+    again = support_of(dataclasses.replace(scene), SETTINGS, folder=tmp_path)
+    assert_equal(again, first)
+    assert "placed anew" in caplog.text and path.read_bytes() == whole
 
 
 def test_files_of_something_else_are_refused(support: SnowSupport, tmp_path: Path) -> None:

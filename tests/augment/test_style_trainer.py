@@ -325,6 +325,7 @@ def test_pairs_share_a_recolouring():
         sample_pairs(pair_photos(1), seeded(), 2, size_px=16)
 
 
+@pytest.mark.long
 def test_losses_fall_by_training():
     torch.manual_seed(0)
     net = Gscm()

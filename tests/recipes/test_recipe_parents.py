@@ -72,6 +72,7 @@ def test_a_preset_is_a_parent_whose_draws_stay() -> None:
     smog = load_recipe("dense-fog").resolve(0).weather.smog
     child = resolved("extends: dense-fog\nrender: {scale: 0.5}\n")
     assert child.weather.smog == smog and (child.name, child.render.scale) == ("mine", 0.5)
+    assert load_recipe("clear", {"extends": None}).resolve(0) == load_recipe("clear").resolve(0)
     clear = resolved("extends: dense-fog\nweather:\n  smog:\n")
     assert clear.weather == Recipe().weather
 

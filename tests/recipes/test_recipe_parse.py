@@ -345,7 +345,7 @@ def test_hostile_text_is_refused_or_read_quickly(text: str) -> None:
         read(text)
     except RecipeError as error:
         assert len(str(error)) < 400, "a message stays one readable line"
-    assert time.perf_counter() - start < 10  # about 0.3 s on an idle core; a hang would be minutes
+    assert time.perf_counter() - start < 30  # about 1 s on an idle core; a hang would be minutes
 
 
 TEXT = "weather: {smog: {visibility_m: 300}}\n"

@@ -286,7 +286,7 @@ def test_every_field_is_in_the_schema_with_its_description() -> None:
         node = node.get("anyOf", [node])[0]  # quality takes a word, too
         assert node["additionalProperties"] is False
         assert set(node["properties"]) == set(section.model_fields)
-        required = [name for name, leaf in section.LEAVES.items() if leaf.required]
+        required = [name for name, leaf in section.LEAVES.items() if leaf.info.is_required()]
         assert node.get("required", []) == required
         for name, leaf in section.LEAVES.items():
             assert leaf.description in node["properties"][name]["description"]
@@ -433,9 +433,13 @@ def field_table() -> str:
             path = section.PATH.removesuffix("[]")
             allowed = f"a list of up to {section.MAX_ITEMS} mappings, or null"
             rows.append(f"| `{path}` | {allowed} | `null` | {section.LIST_DESCRIPTION} |\n")
-        for spec in section.LEAVES.values():
-            known = "" if spec.default is None else f"`{words(spec.default)}`"
-            default = "required" if spec.required else "`null`" if spec.nullable else known
+        for name, spec in section.LEAVES.items():
+            if name == "probability":  # told once, above the table
+                continue
+            default = spec.info.get_default()
+            known = "" if default is None else f"`{words(default)}`"
+            default = "`null`" if spec.nullable else known
+            default = "required" if spec.info.is_required() else default
             rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")
     return "".join(rows)
 

@@ -17,15 +17,12 @@ import torch
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.jobs.quality import Trial
-from augment.render.constants import RasterSettings
-from augment.render.reference import blend_weights, order_by_depth, project_parts
-from augment.scene import PosedGaussians
-from recipes.schema import KNOBS, TIERS, knobs_of, settings_of
+from recipes.schema import KNOBS, TIERS, knobs_of
 from tests.streets import SMALL_STREET, open_street
 from tools.bench import EFFECTS, dataset, fit, flood, gpu, jobs, raster, scenes, snow, style, trade
-from tools.bench.gpu import GpuCase, Timing, count_blends, measure
-from tools.bench.harness import WallClock, rounds, run_in_subprocess, spread, spread_ratio
-from tools.bench.scenes import EffectCase, RasterCase, measure_effect, random_scene
+from tools.bench.gpu import GpuCase, Timing, measure
+from tools.bench.harness import WallClock, rounds, run_in_subprocess
+from tools.bench.scenes import EffectCase, RasterCase, measure_effect
 from tools.bench.trade import (
     DEPTH,
     JPEG,
@@ -34,9 +31,7 @@ from tools.bench.trade import (
     Unmeasured,
     depth_figures,
     flicker,
-    settings_of_trade,
     tier_from,
-    trade_recipe,
 )
 from tools.cli import main
 
@@ -70,12 +65,6 @@ def test_cases_take_turns_and_the_first_round_does_not_count():
     assert "".join(calls) == "baabba" and seconds == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
     with pytest.raises(ValueError, match="repeats >= 1 and a case"):
         rounds(cases, 0)
-
-
-def test_spreads_are_quantiles_and_ratios_are_taken_pair_by_pair():
-    found = spread([5.0, 1.0, 2.0, 3.0, 4.0])
-    assert found == {"median": 3.0, "min": 1.0, "p90": np.quantile([1, 2, 3, 4, 5], 0.9)}
-    assert spread_ratio([2.0, 9.0, 8.0], [1.0, 3.0, 8.0])["median"] == 2.0
 
 
 @pytest.mark.long
@@ -180,29 +169,6 @@ def test_fit_measures_steps_at_a_fixed_number_of_splats():
 SMALL = RasterCase(40, 20, 17)
 
 
-def test_blends_are_those_of_the_definition():
-    from augment.render.cuda.driver import list_tiles, project
-    from augment.render.cuda.splats import gather_inputs
-
-    gaussians, camera = random_scene(RasterCase(60, 20, 17))
-    opaque, large = gaussians.opacities.clamp_min(0.9), 30 * gaussians.scales
-    parts = [PosedGaussians(dataclasses.replace(gaussians, opacities=opaque, scales=large))]
-    settings = RasterSettings(transmittance_stop=0.05)
-    seen = project(gather_inputs(parts, camera, settings, None, None, with_color=False))
-    tiles = list_tiles(seen, camera, None)
-    counted = count_blends(seen, tiles, camera, settings)
-    splats = order_by_depth(project_parts(parts, camera, settings))
-    y, x = torch.meshgrid(torch.arange(17) + 0.5, torch.arange(20) + 0.5, indexing="ij")
-    pixels = torch.stack([x.reshape(-1), y.reshape(-1)])
-    weights, after = blend_weights(splats, pixels, torch.ones(340), settings)
-    assert counted["done"] == int((weights > 0).sum()) > 2000
-    assert bool((after[-1] <= 0.05).any())  # some pixels are finished before their lists end
-    lengths = tiles.tile_offsets.diff()
-    assert counted["listed"] == int((lengths * torch.tensor([256, 64, 16, 4])).sum())
-    assert counted["done"] <= counted["reached"] <= counted["listed"]
-    assert counted["entries"] <= int(lengths.sum()) and counted["used"] <= len(gaussians)
-
-
 @pytest.mark.long
 def test_a_gpus_frame_has_stages_a_floor_and_launches(monkeypatch):
     """Kernels interpreted on a tiny scene."""
@@ -252,19 +218,6 @@ def test_a_small_run_on_a_gpu(tmp_path):
     sections = result["facts"]["sections"]
     assert not [name for name in gpu.SECTIONS if "failed" in sections[name]]
     assert sections["raster"]["same_bits"] and sections["raster"]["peak_mib"] > 0
-
-
-def test_settings_differ_from_reference_in_one_knob():
-    recipe = trade_recipe("all")
-    assert None not in (recipe.style, *dict(recipe.weather).values())
-    (_, best), *others = settings_of_trade(recipe)
-    paths = [knob.path for knob in knobs_of(recipe)]
-    assert {row["knob"] for row, _ in others} == {*paths, WHOLE}
-    good = settings_of(best)
-    for row, setting in (each for each in others if each[0]["knob"] != WHOLE):
-        own = settings_of(setting)
-        moved = {path: own[path] for path in paths if own[path] != good[path]}
-        assert moved == {row["knob"]: row["value"]} or row["value"] == good[DEPTH]
 
 
 # ---- Errors whose answer is known ----------------------------------------------------------------

@@ -180,9 +180,17 @@ def test_inspect_says_what_is_there_and_writes_json(scene_uri, tmp_path, capsys)
 
 def test_recipes_lists_prints_and_exports(tmp_path, capsys):
     assert main(["recipes"]) == 0
-    assert "dense-fog" in capsys.readouterr().out.split()
+    assert "\ndense-fog      Fog in which a car 100 m ahead" in capsys.readouterr().out
     assert main(["recipes", "dense-fog"]) == 0
-    assert "visibility_m" in capsys.readouterr().out
+    assert "visibility_m" in (text := capsys.readouterr().out)
+    (tmp_path / "mine.yaml").write_text(text)
+    assert main(["recipes", str(tmp_path / "mine.yaml")]) == 0
+    assert capsys.readouterr().out == text
+    assert main(["recipes", str(tmp_path / "mine.yaml"), "--draws", "--set", "variants=3"]) == 0
+    draws = capsys.readouterr().out.splitlines()
+    assert "weather.smog.visibility_m: uniform from 50 to 120 (metres)" in draws
+    assert [line.split()[0] for line in draws[-3:]] == ["mine-000", "mine-001", "mine-002"]
+    assert all("weather.smog.visibility_m = " in line for line in draws[-3:])
     schema = tmp_path / "schema.json"
     assert main(["recipes", "--schema", str(schema)]) == 0
     assert "weather" in json.loads(schema.read_text())["properties"]
@@ -195,6 +203,7 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         (["render", "--scene", scene_uri, *out], "no recipe is named"),
         (["render", "no-such", "--scene", scene_uri, *out], "no such file"),
         (["render", "clear", "--scene", "nowhere:x", *out], "nowhere"),
+        ([*here, "--set", "render.scal=1"], "--set render.scal=1: render.scal: unknown field; did"),
         ([*here, "--frames", "x"], "--frames 'x'"),
         ([*here, "--frames", "9"], "no frame 9"),
         ([*here, "--cameras", "q"], "no camera q"),

@@ -252,29 +252,6 @@ def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
     assert changed(root, copy) == whole
 
 
-def test_images_that_are_gone_give_way_to_the_clear_ones(root, tmp_path):
-    one, two = scene_of(root, "one", (0, 1)), scene_of(root, "two", (2,))
-    out = tmp_path / "out"
-    render(one, out)
-    mirror_outputs(one, out, progress=False)
-
-    def broken(*_, **__):
-        raise ValueError("no")
-
-    job = RenderJob(one.source, [recipe_of(image="jpg")], out, overwrite=True)
-    run_job(job, scene_loader=lambda _: one, renderer=broken, progress=False)
-    render(two, out)
-    said = mirror_outputs(two, out, progress=False)
-    assert said[-1] == (
-        "  4 images of other scenes, such as camera/front/00.jpg, are no longer in the manifest: "
-        "the source's own stand there again"
-    )
-    assert changed(root, out / "source/fog-000/002") == {
-        "camera/front/02.jpg",
-        "camera/left/02.jpg",
-    }
-
-
 def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])

@@ -1,0 +1,216 @@
+"""What holds for raw drives of every dataset: held-out frames, labels on their own, and weathered
+sweeps in the form of the dataset's files."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import kitti_files
+import numpy as np
+import nuscenes_files
+import pandas as pd
+import pandaset_folder
+import pyarrow.parquet as pq
+import pytest
+from drivestudio_files import write_run
+from recording_folder import write_recording
+from shown import assert_same_bits
+
+from adapters.drivestudio.adapter import drivestudio_labels
+from adapters.kitti.adapter import KittiLabels
+from adapters.nuscenes.adapter import nuscenes_labels
+from adapters.pandaset import PandaSetLabels
+from adapters.procedural import StreetLabels
+from adapters.recording.adapter import RecordingLabels
+from adapters.street_gaussians.adapter import StreetGaussiansLabels
+from adapters.uri import SCHEMES
+from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar.beam import intensity_column
+from augment.errors import AdapterError
+from augment.jobs.tables import lidar_bytes
+from augment.labels import LidarSweep, StoresLidar
+
+QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
+RAW: dict[str, tuple[Callable[[Path], Path], dict[str, str]]] = {
+    "pandaset": (pandaset_folder.write_sequence, {"held_out": "1::2"}),
+    "nuscenes": (nuscenes_files.write_dataset, {"scene": "scene-0001", "held_out": "5:6"}),
+    "kitti": (kitti_files.write_raw, {"held_out": "1::2"}),
+    "recording": (write_recording, {"held_out": "1:2"}),
+}
+
+
+@pytest.mark.parametrize("scheme", RAW)
+def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: Path) -> None:
+    write, own = RAW[scheme]
+    query = QUERY | own
+    path = str(write(tmp_path / "data"))
+    scene = SCHEMES[scheme].open(path, query)
+    number = 5 if scheme == "nuscenes" else 1
+    frame, sweep = scene.frame(number), scene.lidar(number)
+    # All of the frame changes: its images are black, and its LiDAR sees a roof over the street.
+    for image in frame.image_paths.values():
+        assert cv2.imwrite(image, np.zeros_like(cv2.imread(image)))
+    columns = {name: np.tile(column, 2) for name, column in sweep.columns.items()}
+    columns["z"][len(sweep) :] += 6
+    codes = np.repeat([UNCHANGED, MOVED], len(sweep)).astype(np.uint8)
+    index = np.tile(np.arange(len(sweep), dtype=np.int32), 2)
+    roofed = LidarSweep({**columns, "source_index": index, "weather_code": codes})
+    for file in scene.labels.lidar_files(number):
+        file.write_bytes(scene.labels.lidar_content(number, file, roofed))
+    again = SCHEMES[scheme].open(path, query)
+    assert len(again.lidar(number)) == 2 * len(sweep)
+    assert_same_bits(scene, again)
+    # The frame itself stays, as do its boxes, which are the same of the labels alone.
+    assert len(again.frame(number).image_paths) == 2 and again.problems == ()
+    labels = pickle.loads(pickle.dumps(SCHEMES[scheme].open_labels(path, query)))
+    np.testing.assert_array_equal(labels.boxes(number).centers_m, scene.boxes(number).centers_m)
+    assert len(scene.boxes(number)) >= 2
+    np.testing.assert_array_equal(labels.lidar(0).points_m, scene.lidar(0).points_m)
+
+
+CODES = np.array([UNCHANGED, UNCHANGED, ATTENUATED, LOST, MOVED, SCATTERED], np.uint8)
+PANOPTIC = "panoptic/v1.0-mini/0_panoptic.npz"
+
+
+def _pandaset(root: Path) -> PandaSetLabels:
+    return PandaSetLabels(pandaset_folder.write_sequence(root, offset_m=np.array([9e4, -4e4, 30])))
+
+
+def _nuscenes(root: Path):
+    nuscenes_files.write_dataset(root)
+    token = nuscenes_files.data_token(1, "LIDAR_TOP", 0)
+    row = {"token": token, "sample_data_token": token, "filename": PANOPTIC}
+    nuscenes_files.write_table(root, "panoptic", [row])
+    labels = nuscenes_labels(str(root), {"scene": "scene-0002"})
+    (root / PANOPTIC).parent.mkdir(parents=True)
+    np.savez_compressed(root / PANOPTIC, data=np.arange(len(labels.lidar(0)), dtype=np.uint16))
+    return labels
+
+
+def _kitti(root: Path, matrix: np.ndarray | None = None):
+    drive = kitti_files.write_raw(root / "2011_09_26")
+    pose = kitti_files.world_from_street() @ kitti_files.street_from_velo(0)
+    (name,) = (p.relative_to(drive) for p in drive.glob("velodyne_points/data/*0.bin"))
+    return KittiLabels(
+        drive, {0: str(name)}, {0: 10**18}, {0: pose}, velodyne_from_rectified=matrix
+    )
+
+
+def _ours(root: Path) -> RecordingLabels:
+    (root / "lidar").mkdir(parents=True)
+    sweep = RecordingLabels(write_recording(root / "plain", frames=1)).lidar(0)
+    columns = {**sweep.columns, "note": np.array(["a", "b"], object)[np.arange(len(sweep)) % 2]}
+    columns["intensity"] = (np.arange(len(sweep)) % 256).astype(np.uint8)
+    (root / "lidar/000000.parquet").write_bytes(lidar_bytes(LidarSweep(columns)))
+    return RecordingLabels(root)
+
+
+DATASETS: dict[str, Callable[[Path], StoresLidar]] = {
+    "pandaset": _pandaset,
+    "nuscenes": _nuscenes,
+    "kitti": _kitti,
+    "kitti-object": lambda root: _kitti(root, np.eye(4)),
+    "recording": lambda root: RecordingLabels(write_recording(root, frames=1)),
+    "recording-of-ours": _ours,
+    "waymo": lambda root: drivestudio_labels(str(write_run(root, dataset="waymo").folder), {}),
+    "drivestudio-nuscenes": lambda root: drivestudio_labels(
+        str(write_run(root, dataset="nuscenes").folder), {}
+    ),
+}
+
+
+def weathered(sweep: LidarSweep) -> LidarSweep:
+    """All that can become of returns; those that moved by some metres."""
+    codes = CODES[np.arange(len(sweep)) % len(CODES)]
+    rng = np.random.default_rng(5)
+    columns = {name: np.array(column) for name, column in sweep.columns.items()}
+    moved = np.isin(codes, (MOVED, SCATTERED))
+    for axis in "xyz":
+        columns[axis] = np.where(moved, columns[axis] + rng.normal(0, 3, len(sweep)), columns[axis])
+        columns[axis][codes == LOST] = np.nan
+    name = intensity_column(sweep)
+    if name is not None:
+        values = columns[name] * np.where(codes == UNCHANGED, 1, 0.5)
+        columns[name] = values.astype(sweep.columns[name].dtype)
+    index = np.arange(len(sweep), dtype=np.int32)
+    return LidarSweep({**columns, "source_index": index, "weather_code": codes})
+
+
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_files_give_back_the_weathered_sweep(dataset: str, tmp_path: Path) -> None:
+    labels = DATASETS[dataset](tmp_path / "data")
+    assert isinstance(labels, StoresLidar)
+    source = labels.lidar(0)
+    wanted = drop_lost(weathered(source))
+    assert 0.8 < len(wanted) / len(source) < 0.9
+    files = labels.lidar_files(0)
+    contents = [labels.lidar_content(0, file, wanted) for file in files]
+    assert contents == [labels.lidar_content(0, file, wanted) for file in files]  # every time
+    for file, content in zip(files, contents, strict=True):
+        file.write_bytes(content)
+    read = labels.lidar(0)
+    assert {k: v.dtype for k, v in read.columns.items()} == {
+        k: v.dtype for k, v in source.columns.items()
+    }
+    moved = np.isin(wanted.columns["weather_code"], (MOVED, SCATTERED))
+    np.testing.assert_array_equal(read.points_m[~moved], wanted.points_m[~moved])
+    np.testing.assert_allclose(read.points_m, wanted.points_m, rtol=0, atol=1e-5)
+    told = "timestamp_ns" if dataset == "nuscenes" else ""  # by the bearing, of those that moved
+    for name in source.columns.keys() - {"x", "y", "z", told}:
+        np.testing.assert_array_equal(read.columns[name], wanted.columns[name], err_msg=name)
+    assert labels.lidar_files(99) == ()
+
+
+def test_pandas_opens_the_tables_and_their_rows_still_name_each_other(tmp_path: Path) -> None:
+    labels = _pandaset(tmp_path)
+    before = [pd.read_pickle(file) for file in labels.lidar_files(0)]
+    wanted = drop_lost(weathered(labels.lidar(0)))
+    for file, old in zip(labels.lidar_files(0), before, strict=True):
+        file.write_bytes(labels.lidar_content(0, file, wanted))
+        new = pd.read_pickle(file)
+        np.testing.assert_array_equal(new.index, old.index[wanted.columns["source_index"]])
+        assert list(new.columns) == list(old.columns) and new.dtypes.equals(old.dtypes)
+        assert new.columns.dtype == object  # as all versions of pandas read them
+    assert set(labels.lidar(0).columns["d"]) == {0, 1}
+
+
+def test_labels_of_nuscenes_returns_stay_with_their_returns(tmp_path: Path) -> None:
+    labels = _nuscenes(tmp_path)
+    wanted = drop_lost(weathered(labels.lidar(0)))
+    names = [file.parts[len(tmp_path.parts)] for file in labels.lidar_files(0)]
+    assert names == ["samples", "lidarseg", "panoptic"]
+    panoptic = labels.lidar_files(0)[2]
+    content = labels.lidar_content(0, panoptic, wanted)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:  # no time of day: the same bytes again
+        assert archive.getinfo("data.npy").date_time == (1980, 1, 1, 0, 0, 0)
+    panoptic.write_bytes(content)
+    with np.load(panoptic) as archive:
+        assert archive["data"].dtype == np.uint16
+        np.testing.assert_array_equal(archive["data"], wanted.columns["source_index"])
+    panoptic.write_bytes(b"PK no archive")
+    with pytest.raises(AdapterError, match=r"0_panoptic\.npz must hold an array `data`"):
+        labels.lidar_content(0, panoptic, wanted)
+    classes = labels.lidar_files(0)[1]
+    classes.write_bytes(b"abc")
+    with pytest.raises(AdapterError, match=r"_lidarseg\.bin has 3 classes, fewer than samples/"):
+        labels.lidar_content(0, classes, wanted)
+    (between,) = labels.lidar_files(1)  # no keyframe has none of them
+    assert between.relative_to(tmp_path).parts[0] == "sweeps"
+
+
+def test_a_recordings_file_keeps_its_notes(tmp_path: Path) -> None:
+    labels = _ours(tmp_path)
+    (file,) = labels.lidar_files(0)
+    schema = pq.read_schema(file)
+    file.write_bytes(labels.lidar_content(0, file, drop_lost(weathered(labels.lidar(0)))))
+    assert pq.read_schema(file).equals(schema, check_metadata=True)
+
+
+def test_sweeps_without_files_of_their_own_cannot_be_stored(tmp_path: Path) -> None:
+    assert not isinstance(StreetGaussiansLabels(tmp_path), StoresLidar)
+    assert not issubclass(StreetLabels, StoresLidar)
