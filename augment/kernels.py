@@ -61,7 +61,9 @@ def count_occlusion(
     box is nearer is not seen.
     """
     knows_actors = instance.size > 0
-    boxes_of = np.full(65536, -1, np.int64)  # the first box of each actor
+    boxes_of = np.empty(65536, np.int64)  # the first box of each actor
+    for actor in range(len(boxes_of)):
+        boxes_of[actor] = -1
     for box in range(len(found)):
         found[box, 2], found[box, 3] = depth.shape[1], depth.shape[0]
         if actors[box] > 0 and boxes_of[actors[box]] < 0:
@@ -75,7 +77,8 @@ def count_occlusion(
                         _add(found[box], row, column)
         for box in range(len(found)):  # a second box of an actor shows what the first one does
             if actors[box] > 0:
-                found[box] = found[boxes_of[actors[box]]]
+                for k in range(found.shape[1]):
+                    found[box, k] = found[boxes_of[actors[box]], k]
     for box in range(len(found)):
         left, top, right, bottom = windows[box]
         own = actors[box]
@@ -113,7 +116,8 @@ def count_occlusion(
                     found[box, 1] += 1
     for box in range(len(found)):
         if found[box, 0] == 0:
-            found[box, 2:] = 0
+            for k in range(2, found.shape[1]):
+                found[box, k] = 0
 
 
 @inner()

@@ -18,10 +18,7 @@ os.environ["CLIMATEGS_SCENE_CACHE_GB"] = "0"  # tests build what they look at
 
 import pytest
 import torch
-from filelock import FileLock
 from jaxtyping import config, install_import_hook
-from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import Dispatcher
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = re.compile(
@@ -49,26 +46,6 @@ def _checked_modules() -> list[str]:
 
 
 install_import_hook(_checked_modules(), "beartype.beartype")
-
-
-def _compile_each_kernel_once() -> None:
-    """Of test processes that want the same kernel, one compiles it; the others wait and read it
-    from numba's cache.
-    """
-    compile_alone = Dispatcher.compile
-    folder = Path(tempfile.gettempdir(), f"kernels-of-tests-{os.getuid()}")
-    folder.mkdir(exist_ok=True)
-
-    def compile_once(self: Dispatcher, sig: object) -> object:
-        name = f"{self.py_func.__module__}.{self.py_func.__qualname__}"
-        # In this order: a kernel's compilation compiles those that it calls, under numba's lock.
-        with global_compiler_lock, FileLock(folder / name, is_singleton=True):
-            return compile_alone(self, sig)
-
-    Dispatcher.compile = compile_once
-
-
-_compile_each_kernel_once()
 
 
 # Files of a few long tests. At the end one of them would keep a single core busy.

@@ -77,7 +77,7 @@ def compiling_noted(modules: Sequence[str] = (), *, on_gpu: bool = False) -> Ite
         timer.cancel()
     if say_once.cache_info().misses:
         seconds = time.perf_counter() - (started if on_gpu else say_once())
-        print_note(f"compiled the kernels in {seconds:.1f} s")
+        print_note(f"kernels compiled after {seconds:.1f} s")
 
 
 def fill(template: str, **facts: Any) -> str:

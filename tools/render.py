@@ -38,7 +38,6 @@ from augment.jobs.worker import shares_of
 from augment.labels import Boxes, LidarSweep
 from augment.plan import make_plan
 from augment.render.buffers import CPU, CUDA
-from augment.render.cpu import driver as cpu
 from augment.render.cuda.runtime import is_interpreted
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
@@ -66,7 +65,6 @@ ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     """Compile the kernels that the recipes take, or load them."""
     if not renders_on_gpu(backend):
-        cpu.warm_up()
         _warm_recipes(recipes)
     elif not is_interpreted():  # there is nothing to compile then, and drawing takes long
         _warm_recipes(recipes, CUDA)
@@ -78,7 +76,7 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
     """
     on_gpu = renders_on_gpu(backend)
-    with compiling_noted(kernel_modules(recipes), on_gpu=on_gpu):
+    with compiling_noted(kernel_modules(recipes, backend), on_gpu=on_gpu):
         if not on_gpu:
             warm_up(recipes)
             return
@@ -88,11 +86,13 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
         process.join()
 
 
-def kernel_modules(recipes: Sequence[Recipe]) -> list[str]:
-    """How the names of modules begin that hold the recipes' kernels for the CPU."""
+def kernel_modules(recipes: Sequence[Recipe], backend: str = CPU) -> list[str]:
+    """How the names of modules begin that hold the kernels of scenes and recipes for the CPU."""
+    if renders_on_gpu(backend):
+        return ["adapters"]
     present = [e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)]
     folders = (type(effect).__module__.removesuffix(".effect") for effect in present)
-    return ["augment.kernels", "augment.render", *folders]
+    return ["adapters", "augment.kernels", "augment.render", *folders]
 
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
@@ -106,10 +106,7 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
         chosen = tuple(
             e.kernels(section) if section is not None else None for e, section in present
         )
-        is_clear = not any(chosen)
         for_boxes = uses_boxes(recipe) and output.depth == "none"
-        if is_clear and not for_boxes and backend == CPU:  # `cpu.warm_up` has drawn one
-            continue
         ids = output.semantic or output.instance
         kernels = (*chosen, output.depth, ids, output.surface, for_boxes, recipe.lidar)
         if kernels not in seen:
@@ -304,9 +301,14 @@ def render_recipes(options: RenderOptions) -> int:
     out, backend = options.out, options.backend
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
-    with compiling_noted(kernel_modules(tried), on_gpu=renders_on_gpu(backend)):
-        warm_up(tried, backend)
-    scene = open_scene(options.scene)
+    on_gpu = renders_on_gpu(backend)
+    with compiling_noted(kernel_modules(tried, backend)):
+        scene = open_scene(options.scene)
+        if not on_gpu:
+            warm_up(tried, backend)
+    if on_gpu:
+        with compiling_noted(on_gpu=True):
+            warm_up(tried, backend)
     if options.camera_path is None:
         check_frames(scene)
     for problem in scene.problems:
@@ -415,7 +417,7 @@ def run_demo(out: Path, frames: int) -> int:
     uri = f"procedural:street?seed=3&frames={frames}"
     print_note(f"building {uri}")
     recipes = [load_recipe(name).resolve(0) for name in DEMO_RECIPES]
-    with compiling_noted(["adapters.street", *kernel_modules(recipes)]):
+    with compiling_noted(kernel_modules(recipes)):
         scene = open_scene(uri)
         warm_up(recipes)
     ready = time.perf_counter()

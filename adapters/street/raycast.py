@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from adapters.street.forms import Kind, Shapes
+from augment.render.cpu.jit import inner, serial_kernel
 
 # ---- Kernels: walk a tree of boxes, meet the shapes in its leaves --------------------------------
 # A box [6] is (-low, high), so that it grows by six maxima. A tree is flat and depth first: boxes
@@ -22,7 +22,7 @@ LEAF_SHAPES = 4
 NEAREST_M = 1e-7  # hits nearer than this are the surface the ray starts on
 
 
-@njit(cache=True)
+@serial_kernel
 def trace(
     origins,  # [N, 3] float64
     directions,  # [N, 3] float64, any length: distances come out in their unit
@@ -74,7 +74,7 @@ def trace(
         hit_local[ray, 0], hit_local[ray, 1], hit_local[ray, 2] = local
 
 
-@njit(cache=True)
+@inner()
 def _turn(m, x, y, z):
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
@@ -83,7 +83,7 @@ def _turn(m, x, y, z):
     )
 
 
-@njit(cache=True)
+@inner()
 def _enter(box, origin, direction, limit):
     """Distance at which a ray enters a box, infinite where it misses or starts too late."""
     low, high = 0.0, limit
@@ -100,7 +100,7 @@ def _enter(box, origin, direction, limit):
     return low if low <= high else math.inf
 
 
-@njit(cache=True)
+@inner()
 def _meet(kind, a, b, c, da, db, dc, limit):
     """Distance at which a ray, in a shape's own frame, meets it; infinite where it does not."""
     if kind <= 2:  # flat
@@ -134,7 +134,7 @@ def _meet(kind, a, b, c, da, db, dc, limit):
     return math.inf
 
 
-@njit(cache=True)
+@serial_kernel
 def build(
     shape_boxes,  # [P, 6] float64
     boxes,  # out: the tree, with room for 2 P nodes
@@ -167,26 +167,26 @@ def build(
     return nodes
 
 
-@njit(cache=True)
+@inner()
 def _grow(box, other):
     # Element by element: assignments to slices, whose shapes numba checks, take long to compile.
     for side in range(6):
         box[side] = max(box[side], other[side])
 
 
-@njit(cache=True)
+@inner()
 def _area(box):
     x, y, z = box[3] + box[0], box[4] + box[1], box[5] + box[2]
     return x * y + y * z + z * x
 
 
-@njit(cache=True)
+@inner()
 def _bin(box, axis, low, high):
     """Which of the equal parts between low and high holds twice the box's centre."""
     return min(BINS - 1, int((box[3 + axis] - box[axis] - low) / (high - low) * BINS))
 
 
-@njit(cache=True)
+@inner()
 def _split(boxes, order, start, stop, scratch):
     """Reorder a range so that its halves cost least by the surface-area heuristic, over bins."""
     best, best_axis, best_bin, best_low, best_high = math.inf, -1, 0, 0.0, 0.0

@@ -44,6 +44,8 @@ def find_type(form: Form) -> Any:
         name, parts = form[0], [find_type(part) for part in form[1:]]
         if name == "tuple":
             return types.Tuple(parts)
+        if len(set(parts)) == 1:  # which numba makes a type of its own
+            return types.NamedUniTuple(parts[0], len(parts), _find(name))
         return types.NamedTuple(parts, _find(name))
     text, _, constant = form.partition(" ")
     if "[" not in text:
@@ -74,13 +76,15 @@ def signatures_in_use() -> set[str]:
 
 @contextlib.contextmanager
 def compile_ahead(parts: Iterable[str]) -> Iterator[None]:
-    """Meanwhile other processes compile, one for each of this process's threads.
+    """Meanwhile other processes compile: one for each thread that this process has, but for one.
 
     parts: of the list, kernels whose module's name begins so.
     """
-    spawn = multiprocessing.get_context("spawn")
-    ways = (tuple(parts),)
-    beside = [spawn.Process(target=_compile, args=ways, daemon=True) for _ in range(thread_count())]
+    spawn, ways = multiprocessing.get_context("spawn"), (tuple(parts),)
+    beside = [
+        spawn.Process(target=compile_listed, args=ways, daemon=True)
+        for _ in range(thread_count() - 1)
+    ]
     for process in beside:
         process.start()
     try:
@@ -92,9 +96,10 @@ def compile_ahead(parts: Iterable[str]) -> Iterator[None]:
             process.kill()
 
 
-def _compile(parts: tuple[str, ...]) -> None:
+def compile_listed(parts: Iterable[str]) -> None:
+    """Compile what the list has of these parts and no other process is at."""
     for name, forms in read_signatures():
-        if name.startswith(parts):
+        if name.startswith(tuple(parts)):
             _find(name)
             compiled, signature = KERNELS[name], tuple(map(find_type, forms))
             with compiling(name, signature, wait=False) as is_mine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import subprocess
 import sys
@@ -13,9 +14,10 @@ import pytest
 from numba import prange
 
 from augment.render import threads
+from augment.render.compile_ahead import describe_type, find_type, read_signatures
 from augment.render.cpu import jit as cpu_jit
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import kernel
+from augment.render.cpu.jit import KERNELS, kernel
 from augment.render.cpu.simd import exp2, exp2_fine, log2
 from augment.render.threads import kernel_threads
 
@@ -70,6 +72,36 @@ def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch):
     )
     assert hits(kernel(double)) == 0
     assert hits(kernel(double)) == 1
+
+
+def test_the_list_of_signatures_names_kernels_and_types():
+    for name, forms in read_signatures():
+        importlib.import_module(name.partition(":")[0])
+        assert KERNELS[name].py_func.__code__.co_argcount == len(forms), name
+        assert [describe_type(find_type(form)) for form in forms] == forms
+
+
+COMPILED_BY_PRESETS = """
+from numba.core import event
+from tools.render import open_scene, warm_up
+from recipes.load import load_recipe, preset_names
+log = event.RecordingListener()
+event.register("numba:compile", log)
+open_scene("procedural:street?frames=1")
+warm_up([load_recipe(name).resolve(0) for name in preset_names()])
+print({e.data["dispatcher"].py_func.__name__ for _, e in log.buffer if e.is_start})
+"""
+
+
+@pytest.mark.long
+def test_what_presets_compile_is_in_the_list_of_signatures(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    ahead = "from augment.render.compile_ahead import compile_listed; compile_listed(['a'])"
+    subprocess.run([sys.executable, "-c", ahead], check=True)
+    found = subprocess.run(
+        [sys.executable, "-c", COMPILED_BY_PRESETS], check=True, capture_output=True, text=True
+    )
+    assert found.stdout == "set()\n"
 
 
 @pytest.mark.long
@@ -161,6 +193,7 @@ from concurrent.futures import ThreadPoolExecutor
 logging.basicConfig()
 import numba, torch
 from augment.render import threads
+from augment.render.compile_ahead import describe_type, find_type, read_signatures
 threads._preload_tbb = lambda: False
 from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings

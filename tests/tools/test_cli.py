@@ -310,7 +310,7 @@ def test_compiling_is_said_before_it_is_done(capsys):
         return 2 * x
 
     for said in (
-        ["compiling kernels (once; kept for the next run) ...", "compiled the kernels in"],
+        ["compiling kernels (once; kept for the next run) ...", "kernels compiled after"],
         [],
     ):
         with compiling_noted():

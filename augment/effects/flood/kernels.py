@@ -252,51 +252,57 @@ def fill_field(
     height. terms [N, 5]: S Dx Dx, S Dx Dy, S Dy Dy, k A Dx, k A Dy. Both float32, as the outputs
     [H, W].
     """
-    rows, width = normal_x.shape
+    images = (normal_x, normal_y, slope_variance)
+    for i in numba.prange(normal_x.shape[0]):
+        # A function of its own: numba compiles what stands in a parallel loop many times over.
+        _fill_row(np.int64(i), rotation, eye, height, lens, farthest, limits, waves, terms, images)
+
+
+@inner()
+def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, images):
+    normal_x, normal_y, slope_variance = images
+    width = normal_x.shape[1]
     ax, ay, az = rotation[0, 0] / lens[0], rotation[1, 0] / lens[0], rotation[2, 0] / lens[0]
     bx, by, bz = rotation[0, 1] / lens[1], rotation[1, 1] / lens[1], rotation[2, 1] / lens[1]
-    for i in numba.prange(rows):
-        v = (i + 0.5 - lens[3]) / lens[1]
-        row_z = v * rotation[2, 1]
-        first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
-        if first == end:
-            continue
-        kept = np.empty(len(waves) * KEPT, np.float32)
-        fading = np.empty(len(waves) * FADING, np.float32)
-        faded = np.empty(3, np.float32)
-        out = np.empty(3 * CHUNK, np.float32)
-        for begin in range(first, end, CHUNK):
-            stop = min(begin + CHUNK, end)
-            at = _anchor(begin, stop, row_z, rotation, lens)
-            u = (at + 0.5 - lens[2]) / lens[0]
-            x = u * rotation[0, 0] + v * rotation[0, 1] + rotation[0, 2]
-            y = u * rotation[1, 0] + v * rotation[1, 1] + rotation[1, 2]
-            z = _ray_z(at, row_z, rotation, lens)
-            z_begin = _ray_z(begin, row_z, rotation, lens)
-            z_last = _ray_z(stop - 1, row_z, rotation, lens)
-            s = -height / z
-            place = eye[0] + s * x, eye[1] + s * y
-            step = ax - az / z * x, ay - az / z * y
-            drop = bx * z - bz * x, by * z - bz * y
-            bend = bx * az - bz * ax, by * az - bz * ay
-            near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
-            sparse = (limits[1] * height / (near * near)) ** 2
-            dense = (limits[2] * height / (far * far)) ** 2
-            columns = float(begin - at), float(stop - 1 - at)
-            spacing = sparse, dense
-            many, some = _sort_waves(
-                waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded
-            )
-            start = np.float32(x), np.float32(y), np.float32(z)
-            ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
-            chunk = begin - at, stop - at
-            _shade_chunk(
-                kept, many, fading, some, faded, ray, np.float32(height), limits, *chunk, out
-            )
-            for j in range(stop - begin):
-                normal_x[i, begin + j] = out[j]
-                normal_y[i, begin + j] = out[CHUNK + j]
-                slope_variance[i, begin + j] = out[2 * CHUNK + j]
+    v = (i + 0.5 - lens[3]) / lens[1]
+    row_z = v * rotation[2, 1]
+    first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
+    if first == end:
+        return
+    kept = np.empty(len(waves) * KEPT, np.float32)
+    fading = np.empty(len(waves) * FADING, np.float32)
+    faded = np.empty(3, np.float32)
+    out = np.empty(3 * CHUNK, np.float32)
+    for begin in range(first, end, CHUNK):
+        stop = min(begin + CHUNK, end)
+        at = _anchor(begin, stop, row_z, rotation, lens)
+        u = (at + 0.5 - lens[2]) / lens[0]
+        x = u * rotation[0, 0] + v * rotation[0, 1] + rotation[0, 2]
+        y = u * rotation[1, 0] + v * rotation[1, 1] + rotation[1, 2]
+        z = _ray_z(at, row_z, rotation, lens)
+        z_begin = _ray_z(begin, row_z, rotation, lens)
+        z_last = _ray_z(stop - 1, row_z, rotation, lens)
+        s = -height / z
+        place = eye[0] + s * x, eye[1] + s * y
+        step = ax - az / z * x, ay - az / z * y
+        drop = bx * z - bz * x, by * z - bz * y
+        bend = bx * az - bz * ax, by * az - bz * ay
+        near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
+        sparse = (limits[1] * height / (near * near)) ** 2
+        dense = (limits[2] * height / (far * far)) ** 2
+        columns = float(begin - at), float(stop - 1 - at)
+        spacing = sparse, dense
+        many, some = _sort_waves(
+            waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded
+        )
+        start = np.float32(x), np.float32(y), np.float32(z)
+        ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
+        chunk = begin - at, stop - at
+        _shade_chunk(kept, many, fading, some, faded, ray, np.float32(height), limits, *chunk, out)
+        for j in range(stop - begin):
+            normal_x[i, begin + j] = out[j]
+            normal_y[i, begin + j] = out[CHUNK + j]
+            slope_variance[i, begin + j] = out[2 * CHUNK + j]
 
 
 # ---- Mirrored rays, eight at a time, through a pyramid of the nearest depth ----------------------

@@ -276,74 +276,80 @@ def fill(cells, depths, tops, firsts, lights, colors, splats):
 
     lights [3, 3]: direction of the sun, colours of lit and of shaded snow. splats: written.
     """
+    for i in prange(len(depths.heights)):
+        # A function of its own: numba compiles what stands in a parallel loop many times over.
+        _fill_cell(np.int64(i), cells, depths, tops, firsts, lights, colors, splats)
+
+
+@inner()
+def _fill_cell(i, cells, depths, tops, firsts, lights, colors, splats):
     centers, ground_normals, sizes = cells.centers, cells.normals, cells.sizes
     neighbours, tracks, light = cells.neighbours, cells.tracks, cells.light
     heights, mottle, draws = depths.heights, depths.mottle, depths.draws
     means, quats, scales = splats.means, splats.quats, splats.scales
     sh, normals, slopes = splats.sh, splats.normals, splats.slopes
-    for i in prange(len(heights)):
-        if heights[i] == 0:
-            continue
-        size, draw, h = np.float64(sizes[i]), draws[i], np.float64(heights[i])
-        x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
-        up = np.float64(ground_normals[i, 2])
-        gx = _slope(i, 0, neighbours, size, -ground_normals[i, 0] / up, centers, tops)
-        gy = _slope(i, 1, neighbours, size, -ground_normals[i, 1] / up, centers, tops)
-        steep = math.sqrt(gx * gx + gy * gy)
-        if steep > LEAN:
-            gx, gy, steep = gx * LEAN / steep, gy * LEAN / steep, LEAN
-        stretch = math.sqrt(1.0 + steep * steep)
-        normal = (-gx / stretch, -gy / stretch, 1.0 / stretch)
+    if heights[i] == 0:
+        return
+    size, draw, h = np.float64(sizes[i]), draws[i], np.float64(heights[i])
+    x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
+    up = np.float64(ground_normals[i, 2])
+    gx = _slope(i, 0, neighbours, size, -ground_normals[i, 0] / up, centers, tops)
+    gy = _slope(i, 1, neighbours, size, -ground_normals[i, 1] / up, centers, tops)
+    steep = math.sqrt(gx * gx + gy * gy)
+    if steep > LEAN:
+        gx, gy, steep = gx * LEAN / steep, gy * LEAN / steep, LEAN
+    stretch = math.sqrt(1.0 + steep * steep)
+    normal = (-gx / stretch, -gy / stretch, 1.0 / stretch)
 
-        in_x, in_y = _inwards(i, 0, neighbours, heights), _inwards(i, 1, neighbours, heights)
-        at_rim = in_x != 0 or in_y != 0
-        spread = RIM_SPREAD if at_rim else SPREAD + (STEEP_SPREAD - SPREAD) * min(steep, 1.0)
-        spread *= size
-        spread *= 1.0 + 0.2 * colors.grain * abs(_uniform(draw, 0))
-        # On steep sides discs are long, and scattered ones would colors like fur.
-        shift = (0.5 if at_rim else max(1.0 - 1.2 * steep, 0.1)) * SHIFT * size
-        dx, dy = shift * _uniform(draw, 1), shift * _uniform(draw, 2)
-        dx += DRAWN_IN * size * in_x if in_x < 2 else 0.0
-        dy += DRAWN_IN * size * in_y if in_y < 2 else 0.0
-        thick = min(THICK * size, 0.006 + 0.25 * h)
-        s = firsts[i]
-        means[s, 0] = np.float32(x + dx)
-        means[s, 1] = np.float32(y + dy)
-        means[s, 2] = np.float32(tops[i] + gx * dx + gy * dy - SUNK * thick)
-        _turn(normal[0], normal[1], normal[2], s, quats)
-        longer = min(stretch, RIM_STRETCH) if at_rim else stretch
-        scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
+    in_x, in_y = _inwards(i, 0, neighbours, heights), _inwards(i, 1, neighbours, heights)
+    at_rim = in_x != 0 or in_y != 0
+    spread = RIM_SPREAD if at_rim else SPREAD + (STEEP_SPREAD - SPREAD) * min(steep, 1.0)
+    spread *= size
+    spread *= 1.0 + 0.2 * colors.grain * abs(_uniform(draw, 0))
+    # On steep sides discs are long, and scattered ones would colors like fur.
+    shift = (0.5 if at_rim else max(1.0 - 1.2 * steep, 0.1)) * SHIFT * size
+    dx, dy = shift * _uniform(draw, 1), shift * _uniform(draw, 2)
+    dx += DRAWN_IN * size * in_x if in_x < 2 else 0.0
+    dy += DRAWN_IN * size * in_y if in_y < 2 else 0.0
+    thick = min(THICK * size, 0.006 + 0.25 * h)
+    s = firsts[i]
+    means[s, 0] = np.float32(x + dx)
+    means[s, 1] = np.float32(y + dy)
+    means[s, 2] = np.float32(tops[i] + gx * dx + gy * dy - SUNK * thick)
+    _turn(normal[0], normal[1], normal[2], s, quats)
+    longer = min(stretch, RIM_STRETCH) if at_rim else stretch
+    scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
 
-        bend = min(max(_hollow(i, neighbours, size, tops), -MAX_BEND), MAX_BEND)
-        pale = 1.0 + (PALE + PALE_GRAIN * colors.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
-        pale *= 1.0 - THIN_LOSS * math.exp(-h / THIN_M)
-        loss = SHADED_HOLLOW * bend
-        tints = (pale * (1.0 - loss), pale * (1.0 - 0.8 * loss), pale * (1.0 - 0.55 * loss))
-        dirt = min(max(0.8 + 0.2 * mottle[i] + 0.15 * _uniform(draw, 4), 0.3), 1.0)
-        packed = colors.packed * tracks[i] * tracks[i] * dirt
-        seen = min(max((light[i] - DARKEST) / (BRIGHTEST - DARKEST), 0.0), 1.0)
-        seen = seen * seen * (3.0 - 2.0 * seen)
-        rough = (ROUGH + ROUGH_GRAIN * colors.grain) / stretch
-        facing = _rough(normal, rough, draw, 5)
-        _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
+    bend = min(max(_hollow(i, neighbours, size, tops), -MAX_BEND), MAX_BEND)
+    pale = 1.0 + (PALE + PALE_GRAIN * colors.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
+    pale *= 1.0 - THIN_LOSS * math.exp(-h / THIN_M)
+    loss = SHADED_HOLLOW * bend
+    tints = (pale * (1.0 - loss), pale * (1.0 - 0.8 * loss), pale * (1.0 - 0.55 * loss))
+    dirt = min(max(0.8 + 0.2 * mottle[i] + 0.15 * _uniform(draw, 4), 0.3), 1.0)
+    packed = colors.packed * tracks[i] * tracks[i] * dirt
+    seen = min(max((light[i] - DARKEST) / (BRIGHTEST - DARKEST), 0.0), 1.0)
+    seen = seen * seen * (3.0 - 2.0 * seen)
+    rough = (ROUGH + ROUGH_GRAIN * colors.grain) / stretch
+    facing = _rough(normal, rough, draw, 5)
+    _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
 
-        for side in range(4):
-            count, drop = _walls(i, side, neighbours, sizes, centers, tops)
-            out_x = (1.0 if side == 1 else -1.0) if side < 2 else 0.0
-            out_y = (1.0 if side == 3 else -1.0) if side >= 2 else 0.0
-            for k in range(count):
-                s += 1
-                means[s, 0] = np.float32(x + (0.5 - INSET) * size * out_x)
-                means[s, 1] = np.float32(y + (0.5 - INSET) * size * out_y)
-                step = drop / (count + WALL_LIFT)
-                means[s, 2] = np.float32(tops[i] - step * (k + 0.5))
-                normal = (0.96 * out_x, 0.96 * out_y, 0.28)
-                _turn(normal[0], normal[1], normal[2], s, quats)
-                scales[s, 0], scales[s, 1] = WALL_SPREAD * step, SPREAD * size
-                scales[s, 2] = thick
-                normal = (0.8 * out_x, 0.8 * out_y, 0.6)  # of a rounded side, for its light
-                facing = _rough(normal, rough, draw, 8 + 12 * side + 3 * (k % 4))
-                _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
+    for side in range(4):
+        count, drop = _walls(i, side, neighbours, sizes, centers, tops)
+        out_x = (1.0 if side == 1 else -1.0) if side < 2 else 0.0
+        out_y = (1.0 if side == 3 else -1.0) if side >= 2 else 0.0
+        for k in range(count):
+            s += 1
+            means[s, 0] = np.float32(x + (0.5 - INSET) * size * out_x)
+            means[s, 1] = np.float32(y + (0.5 - INSET) * size * out_y)
+            step = drop / (count + WALL_LIFT)
+            means[s, 2] = np.float32(tops[i] - step * (k + 0.5))
+            normal = (0.96 * out_x, 0.96 * out_y, 0.28)
+            _turn(normal[0], normal[1], normal[2], s, quats)
+            scales[s, 0], scales[s, 1] = WALL_SPREAD * step, SPREAD * size
+            scales[s, 2] = thick
+            normal = (0.8 * out_x, 0.8 * out_y, 0.6)  # of a rounded side, for its light
+            facing = _rough(normal, rough, draw, 8 + 12 * side + 3 * (k % 4))
+            _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
 
 
 @kernel
