@@ -152,7 +152,9 @@ def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where:
     count = {"rgb": 3, "image": None, "faces": 6}[name]
     values = _take_array(tensors, name, name, count, precision, where)
     if values.numel() == 0 or (name == "faces" and values.shape[1] != values.shape[2]):
-        raise SceneError(f"{where}: {name} must not be empty, and faces square; got {list(values.shape)}")
+        raise SceneError(
+            f"{where}: {name} must not be empty, and faces square; got {list(values.shape)}"
+        )
     if not np.isfinite(_range(values)).all():
         raise SceneError(f"{where}: {name} holds NaN or infinite values")
     return sky_class(values)

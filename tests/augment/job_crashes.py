@@ -61,6 +61,7 @@ DISK_FULL, INTERRUPTED, KILLED = 28, 130, -signal.SIGKILL
 def main(folder: Path, names: list[str]) -> None:
     # tqdm's own is shared with forks, and one that is killed may hold it.
     tqdm.set_lock(threading.RLock())
+    tqdm.monitor_interval = 0  # its thread may hold the lock while a process forks
     faulthandler.register(signal.SIGUSR1)
     take_notes(folder / "notes")
     start_fork_server("generate_jobs", "augment.jobs.pools", "augment.jobs.worker")

@@ -182,7 +182,8 @@ def test_recipes_lists_prints_and_exports(tmp_path, capsys):
     assert main(["recipes"]) == 0
     assert "\ndense-fog      Fog in which a car 100 m ahead" in capsys.readouterr().out
     assert main(["recipes", "dense-fog"]) == 0
-    assert "visibility_m" in (text := capsys.readouterr().out)
+    text = capsys.readouterr().out
+    assert "visibility_m" in text
     (tmp_path / "mine.yaml").write_text(text)
     assert main(["recipes", str(tmp_path / "mine.yaml")]) == 0
     assert capsys.readouterr().out == text
