@@ -30,7 +30,7 @@ $(STAMP): pyproject.toml constraints.txt | check-system
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade "pip>=23.1"
 	$(BIN)/pip install --quiet $(COMPILE) torch --constraint constraints.txt
-	$(call install,".[video]")
+	$(call install,".")
 	touch $@
 
 $(TEST_STAMP): $(STAMP)

@@ -15,7 +15,7 @@ import json
 import multiprocessing
 from collections.abc import Iterable, Iterator
 from importlib import resources
-from typing import Any
+from typing import Any, cast
 
 import numba
 from numba import types
@@ -31,10 +31,9 @@ def describe_type(kind: Any) -> Form:
     if isinstance(kind, types.Array):
         return f"{kind.dtype}[{kind.ndim}]{kind.layout}{'' if kind.mutable else ' read-only'}"
     if isinstance(kind, types.BaseTuple):
-        named = getattr(kind, "instance_class", None)
-        is_named = named is not None and named is not tuple
-        name = f"{named.__module__}:{named.__qualname__}" if is_named else "tuple"
-        return [name, *map(describe_type, kind)]
+        named, parts = getattr(kind, "instance_class", tuple), list(cast("Iterable[Any]", kind))
+        name = "tuple" if named is tuple else f"{named.__module__}:{named.__qualname__}"
+        return [name, *map(describe_type, parts)]
     return str(kind)
 
 
