@@ -16,6 +16,7 @@ from numba import prange
 from augment.effects.snow.cells import OPEN_EDGE
 from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.render.sh import SH_C0
+from augment.semantics import SemanticClass
 
 # ---- Noise ---------------------------------------------------------------------------------------
 
@@ -216,6 +217,7 @@ class Cells(NamedTuple):
     light: np.ndarray
     tracks: np.ndarray
     banks: np.ndarray
+    semantic: np.ndarray
 
 
 class Depths(NamedTuple):
@@ -499,6 +501,11 @@ CRUMBLED = 0.8  # of the mottling noise, by which a track's sides are uneven
 WATER_MARGIN_M, WATER_RIM_M = 0.005, 0.02  # bare above the water, and thinner above that
 SHELTER = 0.4  # what the foot of an obstacle adds to the noise of the patches, which it keeps
 PILED, SCOURED = 0.8, 0.4  # by wind that blows at an obstacle, and off one
+# Through foliage most snow falls: what is left lies where this noise exceeds a threshold, which is
+# about a third of it, in flecks that the two finest octaves of the patches make.
+FOLIAGE = int(SemanticClass.VEGETATION)
+FOLIAGE_COARSE, FOLIAGE_FINE, FOLIAGE_ABOVE = 0.6, 0.8, 0.42
+FOLIAGE_SHARE, FOLIAGE_MOST_M = 0.3, 0.04  # of the depth, and most of it
 STEEPEST = 1.4  # of the logarithm of the drift: within four times the depth, or a quarter of it
 
 
@@ -537,6 +544,17 @@ def _field(x, y, size, turns, amplitudes, lengths, seeds):
 
 
 @inner()
+def _is_fleck(x, y, turns, seeds):
+    """Whether snow lies on foliage at a place; turns, seeds: of octaves, the last two count."""
+    total = 0.0
+    for back in range(2):
+        k = len(seeds) - 2 + back
+        u, v = turns[k, 0, 0] * x + turns[k, 0, 1] * y, turns[k, 1, 0] * x + turns[k, 1, 1] * y
+        total += (FOLIAGE_FINE if back else FOLIAGE_COARSE) * _noise(u, v, seeds[k])
+    return total > FOLIAGE_ABOVE
+
+
+@inner()
 def _pillow(t):
     t = min(max(t, 0.0), 1.0)
     return math.sqrt(t * (2.0 - t))
@@ -551,7 +569,7 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
     is not worked out.
     """
     centers, sizes, edges = cells.centers, cells.sizes, cells.edges
-    tracks, banks = cells.tracks, cells.banks
+    tracks, banks, semantic = cells.tracks, cells.banks, cells.semantic
     heights, mottle, draws = depths.heights, depths.mottle, depths.draws
     everywhere = numbers.threshold <= -1e9
     for i in prange(len(sizes)):
@@ -567,6 +585,8 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
             bx, by = np.float64(banks[i, 0]), np.float64(banks[i, 1])
             above = _field(x, y, 0.0, patches[0], patches[1], patches[2], patches[3])
             above += SHELTER * math.sqrt(bx * bx + by * by) - numbers.threshold
+        if semantic[i] == FOLIAGE and not _is_fleck(x, y, patches[0], patches[3]):
+            continue
         if not (room > 0.0 and above > 0.0):
             continue
         at_wind = banks[i, 0] * numbers.wind_x + banks[i, 1] * numbers.wind_y
@@ -574,6 +594,8 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
         drift = _field(x, y, size, drifts[0], drifts[1], drifts[2], drifts[3])
         drift = math.exp(min(max(drift, -STEEPEST), STEEPEST)) * piled
         full = numbers.depth_m * drift * _pillow(edges[i] / numbers.radius_m)
+        if semantic[i] == FOLIAGE:
+            full = min(FOLIAGE_SHARE * full, FOLIAGE_MOST_M)
         h = BARE_M + max(full - BARE_M, 0.0) * min(above / numbers.rim, 1.0)
         mottled = _field(x, y, size, mottling[0], mottling[1], mottling[2], mottling[3])
         track = np.float64(tracks[i])
