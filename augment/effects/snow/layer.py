@@ -28,7 +28,8 @@ from augment.effects.snow import kernels
 from augment.effects.snow.cells import EDGE_CAP_M, SnowCells, SnowSupport
 from augment.effects.snow.kernels import Cells, Depths, Splats
 from augment.effects.snow.light import Illumination
-from augment.effects.snow.near_camera import Grain, Layer, SnowLayers, crystals_of
+from augment.effects.snow.near_camera import Layer, SnowLayers, crystals_of
+from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene

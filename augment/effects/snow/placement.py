@@ -673,7 +673,7 @@ def _pixels(line: np.ndarray, corner: np.ndarray, cell_m: float) -> np.ndarray:
     return np.round(pixels * 2**_SHIFT).astype(np.int32)[:, None]
 
 
-# ---- Foliage: of trees, bushes and hedges, through which snow falls -------------------------------
+# ---- Foliage: of trees, bushes and hedges, through which snow falls ------------------------------
 
 # Too narrow for snow, whatever a reconstruction makes of them.
 BARE_CLASSES = (

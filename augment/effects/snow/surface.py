@@ -234,7 +234,7 @@ def _specks(
     return (is_linear | (sizes < np.where(low > 0, least, least_high)))[labels]
 
 
-# ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides -------------------
+# ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides ------------------
 
 VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens carry snow, side and rear windows do not
 _SHELL_M = 0.3  # narrower dips in a roof or bonnet are gaps between shells
