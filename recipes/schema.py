@@ -198,7 +198,7 @@ class Render(Section):
 class Output(Section):
     """What is written for each image."""
 
-    later_fields = ("surface",)
+    later_fields = ("surface", "trust")
     knobs = (
         Knob("depth", ("none", "expected", "median", "mode"), "depth estimator", 11, False),
         Knob(
@@ -232,6 +232,9 @@ class Output(Section):
     a flood and surface is not scene, else true."""
     labels: Flag = True
     """Pass 3D boxes through."""
+    trust: Flag = False
+    """Write where the picture can be believed: it shows a surface or the sky that an image which
+    the scene was made from has seen, from near enough."""
 
 
 class Recipe(Closed):
