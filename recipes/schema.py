@@ -233,8 +233,7 @@ class Output(Section):
     labels: Flag = True
     """Pass 3D boxes through."""
     trust: Flag = False
-    """Write where the picture can be believed: it shows a surface or the sky that an image which
-    the scene was made from has seen, from near enough."""
+    """Write which pixels can be believed: those that the scene's images saw from near enough."""
 
 
 class Recipe(Closed):
