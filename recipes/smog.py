@@ -49,16 +49,16 @@ class Smog(EffectModel):
     """Extinction coefficient at the base height."""
     color: Colour = (0.76, 0.78, 0.80)
     """Airlight colour, at the horizon: red, green, blue, display-encoded sRGB."""
-    overcast: Number = Field(default=0.0, ge=0, le=1)
-    """How much brighter airlight is above the horizon, and darker towards the road: 0 is one colour
-    in all directions, 0.5 what light scattered in thick fog over asphalt comes to, 1 an overcast
-    sky, whose zenith has three times the horizon's luminance."""
     scale_height_m: Number | None = Field(default=None, ge=0.1, le=1e5)
     """Height over which the density falls by e; null for uniform smog."""
     base_height_m: Number = Field(default=0.0, ge=-1e4, le=1e4)
     """Height above the road where the density is the one given; of no effect on uniform smog."""
     model: Literal["per_gaussian", "deferred"] = "per_gaussian"
     """per_gaussian fogs every splat before blending; deferred fogs the finished buffers."""
+    overcast: Number = Field(default=0.0, ge=0, le=1)
+    """How much brighter airlight is above the horizon, and darker towards the road: 0 is one colour
+    in all directions, 0.5 what light scattered in thick fog over asphalt comes to, 1 an overcast
+    sky, whose zenith has three times the horizon's luminance."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
