@@ -39,6 +39,7 @@ from augment.view_images import SURFACE_ALPHA
 
 SKY_FROM_M = 200.0  # a surface this far fades in any fog and casts no pane
 MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through what lets by more
+MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog is 20/255 and shows
 # 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
 MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
 HORIZON_RAD = math.radians(1.5)  # roads slope, and poses are off by as much
@@ -237,8 +238,8 @@ class _Look(NamedTuple):
 
 
 def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> Bool[np.ndarray, "H W"]:
-    """Pixels that can be believed: they show a surface or the sky, in the right place; below the
-    horizon nothing shines through; and an image that the scene was made from has seen the same,
+    """Pixels that can be believed: they show a surface or the sky, in the right place, below the
+    horizon of MIN_GROUND_ALPHA; and an image that the scene was made from has seen the same,
     unhidden, in no less than 1 / MAX_MAGNIFICATION of the pixels. camera: as rendered. Weather does
     not count. Of a scene whose views are not known, and in orthographic cameras, no pixel is seen.
     """
@@ -302,7 +303,7 @@ def _same_pose(a: Camera, b: Camera) -> bool:
 def _trusted(scene: Scene, camera: Camera, look: _Look, backend: str) -> np.ndarray:
     surface, below = look.has_surface, look.elevation_rad < -HORIZON_RAD
     open_sky = look.elevation_rad > 0
-    solid = surface & ~(below & (look.alpha < 1 - MAX_TRANSMITTANCE))
+    solid = surface & ~(below & (look.alpha < MIN_GROUND_ALPHA))
     if look.sky is not None:
         open_sky &= ~_inner(look.sky.solid)
         solid &= ~_pane(scene, camera, look)
