@@ -5,13 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from augment.base_photo import Photo, blackened, opaque_alpha
 from augment.cameras import Camera
-from augment.render.buffers import EXPECTED_DEPTH, RenderOutput
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
+from augment.render.composite import composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.fog import Fog, fog_raster
+from augment.render.fog import (
+    Fog,
+    blend_airlight,
+    fog_raster,
+    optical_depth_of_raster,
+    sky_optical_depth,
+)
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
@@ -24,7 +33,7 @@ class LayerRenderer:
     """Draws the parts of a scene, all of them or those on one side of a level plane.
 
     fog: in front of parts and sky. fog_on_buffers: whether it is applied to finished layers, and
-    not blended per Gaussian.
+    not blended per Gaussian. photo: what cameras that took it see in place of the splats' colours.
     """
 
     parts: Sequence[PosedGaussians]
@@ -33,6 +42,7 @@ class LayerRenderer:
     fog_on_buffers: bool
     settings: RasterSettings
     backend: str
+    photo: Photo | None = None
 
     def without_fog(self) -> LayerRenderer:
         return replace(self, fog=None)
@@ -43,11 +53,20 @@ class LayerRenderer:
         clip: HeightClip | None,
         buffers: frozenset[str],
         pixel_mask: Bool[Tensor, "H W"] | None = None,
+        shown: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """The layer's buffers, without sky; its colours are seen through the fog."""
+        """The layer's buffers, without sky; its colours are seen through the fog.
+
+        shown: how much of each pixel of a photo shows this layer; None for all of it.
+        """
         later = self.fog if self.fog_on_buffers else None
+        photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
+        parts = self.parts
+        if photo is not None:
+            buffers = buffers | photo.buffers_for(parts)
+            parts = blackened(parts) if shown is None else parts
         raster = rasterize(
-            self.parts,
+            parts,
             camera,
             buffers=buffers if later is None else buffers | {EXPECTED_DEPTH},
             settings=self.settings,
@@ -56,7 +75,65 @@ class LayerRenderer:
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
+        if photo is not None:
+            with timed("photo"):
+                raster = photo.paint(raster, parts, camera, shown)
         if later is None:
             return raster
         with timed("smog on buffers"):
             return replace(raster, rgb=fog_raster(raster, camera, later))
+
+    def draw_whole(
+        self, camera: Camera, buffers: frozenset[str]
+    ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
+        """The picture with its sky, not clamped, and the scene's buffers."""
+        if self.photo is not None:
+            return self._draw_on_photo(self.photo, camera, buffers)
+        with timed("rasterise"):
+            raster = self.draw(camera, None, buffers)
+        assert raster.rgb is not None and raster.alpha is not None
+        uniform = self.fog is not None and self.fog.scale_height_m is None  # hides the sky
+        with timed("airlight behind the splats" if uniform else "sky"):
+            return self.add_sky(raster.rgb, raster.alpha, camera), raster
+
+    def add_sky(
+        self, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], camera: Camera
+    ) -> Float[Tensor, "H W 3"]:
+        """A layer's colours before the sky, seen through the fog. camera: the view's, or a window
+        of it.
+        """
+        if self.photo is None:
+            return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
+        sky = self.photo.sky_colors(camera)
+        if self.fog is not None:
+            sky = blend_airlight(sky, self._sky_optical_depth(self.fog, camera, rgb), self.fog)
+        return rgb + (1 - alpha)[..., None] * sky
+
+    def _draw_on_photo(
+        self, photo: Photo, camera: Camera, buffers: frozenset[str]
+    ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
+        """The photo with what lies on the scene, through the smog up to each pixel's depth."""
+        requested = buffers | photo.buffers_for(self.parts) | {RGB, ALPHA}
+        if self.fog is not None:
+            requested = requested | {EXPECTED_DEPTH}
+        parts = blackened(self.parts)
+        with timed("rasterise"):
+            raster = rasterize(
+                parts, camera, buffers=requested, settings=self.settings, backend=self.backend
+            )
+        with timed("photo"):
+            rgb = photo.clear_picture(raster, parts)
+        if self.fog is None:
+            return rgb, raster
+        with timed("smog on buffers"):
+            assert raster.alpha is not None
+            alpha = opaque_alpha(raster.alpha)
+            seen = torch.exp(-optical_depth_of_raster(raster, camera, self.fog))
+            behind = torch.exp(-self._sky_optical_depth(self.fog, camera, alpha))
+            transmittance = photo.sharpen(torch.lerp(behind, seen, alpha))
+            return blend_airlight(rgb, -torch.log(transmittance), self.fog), raster
+
+    def _sky_optical_depth(self, fog: Fog, camera: Camera, like: Tensor) -> Tensor:
+        directions = camera.ray_directions(like.dtype, like.device)
+        slope = directions[..., 2] / directions.norm(dim=-1)
+        return sky_optical_depth(fog, slope, float(camera.centre[2]))

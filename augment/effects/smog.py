@@ -15,6 +15,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from augment.base_photo import RECORDED
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
@@ -63,8 +64,11 @@ class SmogEffect(Effect):
         fog, reason = _in_heights(smog, scene)
         if fog is None:
             return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS), reason))
-        on_buffers = smog.model == "deferred"
+        on_photo = recipe.render.base == RECORDED
+        on_buffers = on_photo or smog.model == "deferred"
         other = "weather.smog.model chooses the other way"
+        if on_photo:
+            other = "render.base is 'recorded': the photo's pixels are faded by their depth"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
