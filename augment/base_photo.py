@@ -16,10 +16,13 @@ filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,8 +34,21 @@ from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
-from augment.render.buffers import CUDA, OVERLAY, SPLAT_IDS, RenderOutput
+from augment.render import photo_kernels as kernels
+from augment.render.buffers import (
+    AUTO,
+    CPU,
+    CUDA,
+    OVERLAY,
+    RGB,
+    SPLAT_IDS,
+    RenderOutput,
+    kernels_for,
+)
+from augment.render.composite import map_colors
 from augment.render.cuda import runtime as gpu
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
+from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
 
@@ -40,8 +56,14 @@ RECORDED = "recorded"
 # What a photo shows is opaque, while reconstructed surfaces let some light through: the alphas that
 # are taken for nothing and for all.
 CLEAR_ALPHA, OPAQUE_ALPHA = 0.04, 0.96
-RADIUS = 1 / 160  # of the guided filter, over the image's width
-EPSILON = 0.03**2  # variance of display-encoded colour that counts as an edge
+# Of the guided filter: its radius over the image's width, and the variance of display-encoded
+# colour that counts as an edge.
+RADIUS, EDGE = 1 / 320, 0.05**2
+# Where nothing is rendered, rays that fall by more than this (metres a metre) see the road, no sky.
+LEVEL = 0.02
+MAX_CONDITION = 1e3  # of a colour map that is undone: 8 bits come back exactly
+HIGHEST_M = 4.0  # a camera above the road; more is a hill's
+ROWS = 32  # image rows a thread takes at a time
 _NO_COLOR = torch.zeros(1, 3, 4)  # a colour map that leaves black
 
 # ---- Which image a camera recorded ---------------------------------------------------------------
@@ -144,25 +166,29 @@ def _is_window(outer: Camera, inner: Camera) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PhotoStyle:
-    """A style's colour maps. splats [C, 3, 4]: one, or one a class. sky [3, 4]. levels [N]: the sky
-    in each of the background's splats, 0 to 1; None where there is none in any.
+    """A style's colour maps. splats [C, 3, 4]: one, or one a class. sky [3, 4]. levels [N + 2]: the
+    sky in each of the background's splats, 0 to 1, between zeros that stand for no splat and for
+    actors'; None where there is none in any.
     """
 
     splats: Float[Tensor, "C 3 4"]
     sky: Float[Tensor, "3 4"]
-    levels: Float[Tensor, "N"] | None = None
+    levels: Float[Tensor, "N+2"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A recorded image. camera: that took it, at its size. rgb: display-encoded float32, in the
-    scene's colours, which the camera's colour map makes the recorded ones; not clamped; on the side
-    that draws. pixels: as recorded.
+    """A recorded image. camera: that took it, at its size. pixels: as recorded. backend: that
+    draws. undone: the map from recorded colours to the scene's, which the camera's colour map turns
+    back in the finished picture; None where these are the same. height_m: of the camera above the
+    road; None where unknown.
     """
 
     camera: Camera
-    rgb: Float[Tensor, "H W 3"]
     pixels: UInt8[np.ndarray, "H W 3"]
+    backend: str
+    undone: Float[Tensor, "3 4"] | None = None
+    height_m: float | None = None
     style: PhotoStyle | None = None
 
     def is_seen_by(self, camera: Camera) -> bool:
@@ -171,7 +197,7 @@ class Photo:
 
     def buffers_for(self, parts: Sequence[PosedGaussians]) -> frozenset[str]:
         """That painting layers of these parts takes."""
-        own = {OVERLAY} if any(part.is_overlay for part in parts) else set[str]()
+        own = {RGB, OVERLAY} if any(part.is_overlay for part in parts) else set[str]()
         if self.style is not None and (len(self.style.splats) > 1 or self.style.levels is not None):
             own.add(SPLAT_IDS)
         return frozenset(own)
@@ -190,17 +216,16 @@ class Photo:
         """
         assert raster.rgb is not None and raster.alpha is not None
         land, sky, level = self.colors(raster, parts, camera)
-        surface = land if level is None else torch.lerp(land, sky, level[..., None])
+        surface = land if level is None else mix(land, sky, level)
         if shown is not None:
             weight = shown if camera is self.camera else shown * self._inside(camera)
-            own = raster.alpha[..., None] * surface
-            return replace(raster, rgb=torch.lerp(raster.rgb, own, weight[..., None]))
-        alpha = opaque_alpha(raster.alpha)
-        if raster.overlay is None:
-            return replace(raster, rgb=alpha[..., None] * surface, alpha=alpha)
-        alpha = torch.maximum(alpha, raster.overlay)
-        rgb = raster.rgb + (alpha - raster.overlay)[..., None] * surface
-        return replace(raster, rgb=rgb, alpha=alpha)
+            own = (1 - weight)[..., None] * raster.rgb
+            return replace(raster, rgb=add_faded(own, surface, weight * raster.alpha))
+        alpha = share = opaque_alpha(raster.alpha)
+        if raster.overlay is not None:
+            alpha = torch.maximum(alpha, raster.overlay)
+            share = alpha - raster.overlay
+        return replace(raster, rgb=add_faded(raster.rgb, surface, share), alpha=alpha)
 
     def clear_picture(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians]
@@ -212,59 +237,126 @@ class Photo:
             assert raster.alpha is not None
             alpha = opaque_alpha(raster.alpha)
             share = 1 - alpha if level is None else 1 - alpha * (1 - level)
-            rgb = torch.lerp(land, sky, self.sharpen(share)[..., None])
+            if self.height_m is not None:
+                share = share.masked_fill(self.fall > LEVEL, 0.0)
+            rgb = mix(land, sky, self.sharpen(share))
         if raster.overlay is None:
             return rgb
-        return (1 - raster.overlay)[..., None] * rgb + raster.rgb
+        assert raster.rgb is not None
+        return add_faded(raster.rgb, rgb, 1 - raster.overlay)
 
     def colors(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians], camera: Camera
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """What surfaces show [H, W, 3], what the sky shows, and how much of a surface is sky
-        [H, W], None for nothing of any; at the pixels of a window.
+        [H, W], None for nothing of any; at the pixels of a window. In the scene's colours, not
+        clamped.
         """
-        rgb, style = self._cut(camera), self.style
+        land, style, level = self._cut(self._land, camera), self.style, None
         if style is None:
-            return rgb, rgb, None
-        land, level, index = _mapped(rgb, style.splats[0]), None, None
-        if self.buffers_for(()):
-            assert raster.splat_ids is not None
-            index = raster.splat_ids
+            return land, land, None
         if len(style.splats) > 1:
-            assert index is not None
-            classes = torch.where(index >= 0, _classes(parts, rgb.device)[index.clamp_min(0)], 0)
+            assert raster.splat_ids is not None
+            there = raster.splat_ids >= 0
+            table = _classes(parts, land.device)
+            classes = torch.where(there, table[raster.splat_ids.clamp_min(0)], 0)
             for value in torch.unique(classes).tolist():
                 if value and not torch.equal(style.splats[value], style.splats[0]):
-                    own = (classes == value)[..., None]
-                    land = torch.where(own, _mapped(rgb, style.splats[value]), land)
+                    own = self._cut(self._in_colors(style.splats[value]), camera)
+                    land = torch.where((classes == value)[..., None], own, land)
         if style.levels is not None:
-            assert index is not None
-            known = (index >= 0) & (index < len(style.levels))  # the background comes first
-            levels = style.levels.to(rgb.device)
-            level = torch.where(known, levels[index.clamp(0, len(levels) - 1)], 0.0)
+            assert raster.splat_ids is not None
+            levels = style.levels.to(land.device)
+            level = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
         return land, self.sky_colors(camera), level
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """What the sky shows at the pixels of a window."""
-        rgb = self._cut(camera)
-        return rgb if self.style is None else _mapped(rgb, self.style.sky)
+        return self._cut(self._land if self.style is None else self._sky, camera)
+
+    @cached_property
+    def _land(self) -> Float[Tensor, "H W 3"]:
+        return self._in_colors(None if self.style is None else self.style.splats[0])
+
+    @cached_property
+    def _sky(self) -> Float[Tensor, "H W 3"]:
+        assert self.style is not None
+        return self._in_colors(self.style.sky)
+
+    def _in_colors(self, style_map: Float[Tensor, "3 4"] | None) -> Float[Tensor, "H W 3"]:
+        """The photo in the scene's colours, or under a style's map of them, which ends at 0."""
+        color_map, least = self.undone, -math.inf
+        if style_map is not None:
+            color_map, least = _composed(style_map, self.undone), 0.0
+        if self.backend != CUDA:
+            out = np.empty(self.pixels.shape, np.float32)
+            given = np.empty((0, 4), np.float32) if color_map is None else color_map.numpy()
+            with kernel_threads(ROWS):
+                kernels.scene_colors(self.pixels, given, np.float32(least), out)
+            return torch.from_numpy(out)
+        rgb = gpu.upload(self.pixels).float() / 255
+        if color_map is None:
+            return rgb
+        return map_colors(rgb, color_map, backend=CUDA).clamp_min(least)
 
     def sharpen(self, values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
         """Values of 0 to 1 whose edges move to the photo's."""
-        guide = self.pixels.astype(np.float32) / 255
-        source = np.ascontiguousarray(values.cpu().numpy())
         radius = max(2, round(RADIUS * self.camera.width))
-        step = 0.5 if radius >= 4 else 1.0  # of the fast filter, which needs two pixels
-        found = cv2.ximgproc.guidedFilter(guide, source, radius, EPSILON, scale=step)
+        source = np.ascontiguousarray(values.cpu().numpy())
+        guide = cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)  # in colour it takes twice as long
+        found = cv2.ximgproc.guidedFilter(guide, source, radius, EDGE * 255**2)
         return torch.from_numpy(found).clamp_(0, 1).to(values.device)
 
-    def _cut(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """The photo at a window's pixels; its border's colours beyond it."""
+    def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
+        """T of what the photo shows, up to the rendered depth; where nothing is rendered up to the
+        road or the sky. Its edges are the photo's.
+        """
+        assert raster.alpha is not None and raster.expected_depth is not None
+        alpha, depth = opaque_alpha(raster.alpha), raster.expected_depth
+        if kernels_for(AUTO, alpha, depth) == CPU:
+            return self.sharpen(self._transmittance_on_cpu(alpha, depth, fog))
+        camera, device, fall = self.camera, alpha.device, self.fall
+        lengths, eye_z_m = camera.ray_lengths(device=device), float(camera.centre[2])
+        seen = torch.exp(-optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall))
+        tau = sky_optical_depth(fog, -fall / lengths, eye_z_m)
+        if self.height_m is not None:
+            distance = self.height_m / fall.clamp_min(LEVEL) * lengths
+            road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
+            to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
+            tau = torch.where(fall > LEVEL, to_road, tau)
+        return self.sharpen(torch.lerp(torch.exp(-tau), seen, alpha))
+
+    def _transmittance_on_cpu(self, alpha: Tensor, depth: Tensor, fog: Fog) -> Tensor:
+        camera, out = self.camera, np.empty(tuple(alpha.shape), np.float32)
+        inverse_m = 0.0 if fog.scale_height_m is None else 1 / fog.scale_height_m
+        lens = (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)
+        over_base_m = float(camera.centre[2]) - fog.base_z_m
+        numbers = (
+            *(lens, (-camera.world_from_camera[2, :3]).tolist()),
+            (fog.sigma_per_m, inverse_m, over_base_m, MAX_EXPONENT),
+            (self.height_m or 0.0, LEVEL),
+        )
+        arrays = [np.array(own, np.float32) for own in numbers]
+        with kernel_threads(ROWS):
+            kernels.transmittance(alpha.numpy(), depth.detach().numpy(), *arrays, out)
+        return torch.from_numpy(out)
+
+    @cached_property
+    def fall(self) -> Float[Tensor, "H W"]:
+        """By how much each pixel's ray falls per metre of depth."""
+        camera, device = self.camera, self._device
+        x, y, z = (-camera.world_from_camera[2, :3]).tolist()
+        u = (torch.arange(camera.width, device=device) + 0.5 - camera.cx) / camera.fx
+        v = (torch.arange(camera.height, device=device) + 0.5 - camera.cy) / camera.fy
+        return (x * u + z) + (y * v)[:, None]
+
+    def _cut(self, rgb: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
+        """The photo's image at a window's pixels; its border's colours beyond it."""
         if camera is self.camera:
-            return self.rgb
+            return rgb
         rows, columns = self._places(camera)
         rows = rows.clamp(0, self.camera.height - 1)
-        return self.rgb[rows][:, columns.clamp(0, self.camera.width - 1)]
+        return rgb[rows][:, columns.clamp(0, self.camera.width - 1)]
 
     def _inside(self, camera: Camera) -> Tensor:
         rows, columns = self._places(camera)
@@ -272,9 +364,13 @@ class Photo:
         across = (columns >= 0) & (columns < self.camera.width)
         return down[:, None] & across
 
+    @property
+    def _device(self) -> torch.device:
+        return gpu.gpu_device() if self.backend == CUDA else torch.device("cpu")
+
     def _places(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """The photo's rows and columns of a window's."""
-        device = self.rgb.device
+        device = self._device
         top, left = round(self.camera.cy - camera.cy), round(self.camera.cx - camera.cx)
         rows = torch.arange(top, top + camera.height, device=device)
         return rows, torch.arange(left, left + camera.width, device=device)
@@ -283,7 +379,9 @@ class Photo:
 def open_photo(
     scene: Scene, camera: Camera, color_map: Float[Tensor, "3 4"] | None, *, backend: str
 ) -> Photo:
-    """The photo of a camera of the scene, at its size. color_map: that the finished picture takes.
+    """The photo of a camera of the scene, at its size, before any style.
+
+    color_map: that the finished picture takes.
 
     Raises:
         SceneError: there is none, it cannot be read, or the colour map has no inverse.
@@ -293,20 +391,22 @@ def open_photo(
         pixels = read_scaled(path, full, camera)
     except ImageFault as fault:
         raise SceneError(f"camera {camera.name}: recorded image {path} {fault}") from None
-    on_gpu = backend == CUDA
-    rgb = (gpu.upload(pixels) if on_gpu else torch.from_numpy(pixels)).float() / 255
+    undone = None
     if color_map is not None:
         matrix, offset = color_map[:, :3].double(), color_map[:, 3].double()
-        if float(torch.linalg.cond(matrix)) > 1e3:
+        if float(torch.linalg.cond(matrix)) > MAX_CONDITION:
             raise SceneError(
                 f"scene {scene.name!r}: the colour map of camera {camera.name!r} has no inverse "
                 f"({color_map.tolist()}), so its photo has no colours in the scene; render with "
                 f"exposure: neutral"
             )
         inverse = torch.linalg.inv(matrix)
-        undone = torch.cat([inverse, -(inverse @ offset)[:, None]], 1).float().to(rgb.device)
-        rgb = rgb @ undone[:, :3].T + undone[:, 3]
-    return Photo(camera, rgb, pixels)
+        undone = torch.cat([inverse, -(inverse @ offset)[:, None]], 1).float()
+    height_m = None
+    if scene.has_known_gravity and scene.ground_z_m is not None:
+        above = float(camera.centre[2]) - scene.ground_z_m
+        height_m = min(above, HIGHEST_M) if above > 0 else None
+    return Photo(camera, pixels, backend, undone, height_m)
 
 
 def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
@@ -322,9 +422,41 @@ def opaque_alpha(alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     return ((alpha - CLEAR_ALPHA) / (OPAQUE_ALPHA - CLEAR_ALPHA)).clamp(0, 1)
 
 
-def _mapped(rgb: Tensor, color_map: Tensor) -> Tensor:
-    color_map = color_map.to(rgb.device, rgb.dtype)
-    return (rgb @ color_map[:, :3].T + color_map[:, 3]).clamp_min(0)
+def mix(
+    rgb: Float[Tensor, "H W 3"], other: Float[Tensor, "#H #W 3"], weight: Float[Tensor, "H W"]
+) -> Float[Tensor, "H W 3"]:
+    """(1 - weight) rgb + weight other: each to the bit where the other's weight is 0."""
+    if kernels_for(AUTO, rgb, other, weight) != CPU:
+        return (1 - weight)[..., None] * rgb + weight[..., None] * other
+    return _run(kernels.mix, rgb, other, weight)
+
+
+def add_faded(
+    base: Float[Tensor, "H W 3"], rgb: Float[Tensor, "H W 3"], weight: Float[Tensor, "H W"]
+) -> Float[Tensor, "H W 3"]:
+    """base + weight rgb."""
+    if kernels_for(AUTO, base, rgb, weight) != CPU:
+        return base + weight[..., None] * rgb
+    return _run(kernels.add_faded, base, rgb, weight)
+
+
+def _run(kernel: Any, *images: Tensor) -> Tensor:
+    out = np.empty(tuple(images[0].shape), np.float32)
+    with kernel_threads(ROWS):
+        kernel(*(image.detach().contiguous().numpy() for image in images), out)
+    return torch.from_numpy(out)
+
+
+def _composed(
+    outer: Float[Tensor, "3 4"], inner: Float[Tensor, "3 4"] | None
+) -> Float[Tensor, "3 4"]:
+    """The map of what `inner` gives, float32."""
+    if inner is None:
+        return outer.contiguous()
+    matrix, first = outer[:, :3].double(), inner.double()
+    found = matrix @ first
+    found[:, 3] += outer[:, 3]
+    return found.float()
 
 
 def _classes(parts: Sequence[PosedGaussians], device: torch.device) -> Int16[Tensor, "N"]:

@@ -9,18 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from augment.base_photo import Photo, blackened, opaque_alpha
+from augment.base_photo import Photo, blackened, mix
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.composite import composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.fog import (
-    Fog,
-    blend_airlight,
-    fog_raster,
-    optical_depth_of_raster,
-    sky_optical_depth,
-)
+from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
@@ -106,34 +100,30 @@ class LayerRenderer:
             return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
         sky = self.photo.sky_colors(camera)
         if self.fog is not None:
-            sky = blend_airlight(sky, self._sky_optical_depth(self.fog, camera, rgb), self.fog)
+            slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
+            slope = slope / camera.ray_lengths(rgb.dtype, rgb.device)
+            tau = sky_optical_depth(self.fog, slope, float(camera.centre[2]))
+            sky = blend_airlight(sky, tau, self.fog)
         return rgb + (1 - alpha)[..., None] * sky
 
     def _draw_on_photo(
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
         """The photo with what lies on the scene, through the smog up to each pixel's depth."""
-        requested = buffers | photo.buffers_for(self.parts) | {RGB, ALPHA}
+        requested = (buffers - {RGB}) | photo.buffers_for(self.parts) | {ALPHA}
         if self.fog is not None:
             requested = requested | {EXPECTED_DEPTH}
         parts = blackened(self.parts)
         with timed("rasterise"):
+            settings = replace(self.settings, sh_degree=0)  # black in all bands
             raster = rasterize(
-                parts, camera, buffers=requested, settings=self.settings, backend=self.backend
+                parts, camera, buffers=requested, settings=settings, backend=self.backend
             )
         with timed("photo"):
             rgb = photo.clear_picture(raster, parts)
         if self.fog is None:
             return rgb, raster
         with timed("smog on buffers"):
-            assert raster.alpha is not None
-            alpha = opaque_alpha(raster.alpha)
-            seen = torch.exp(-optical_depth_of_raster(raster, camera, self.fog))
-            behind = torch.exp(-self._sky_optical_depth(self.fog, camera, alpha))
-            transmittance = photo.sharpen(torch.lerp(behind, seen, alpha))
-            return blend_airlight(rgb, -torch.log(transmittance), self.fog), raster
-
-    def _sky_optical_depth(self, fog: Fog, camera: Camera, like: Tensor) -> Tensor:
-        directions = camera.ray_directions(like.dtype, like.device)
-        slope = directions[..., 2] / directions.norm(dim=-1)
-        return sky_optical_depth(fog, slope, float(camera.centre[2]))
+            transmittance = photo.transmittance(raster, self.fog)
+            airlight = torch.tensor(self.fog.rgb, dtype=rgb.dtype, device=rgb.device)
+            return mix(rgb, airlight[None, None], 1 - transmittance), raster

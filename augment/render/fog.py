@@ -128,28 +128,12 @@ def fog_raster(raster: RenderOutput, camera: Camera, medium: Fog) -> Float[Tenso
     """Deferred fog on a render with colour, alpha and expected depth."""
     rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
-    return fog_buffers(rgb, alpha, *_points(depth, camera, medium))
-
-
-def optical_depth_of_raster(
-    raster: RenderOutput, camera: Camera, medium: Fog
-) -> Float[Tensor, "H W"]:
-    """tau up to the expected depth."""
-    assert raster.expected_depth is not None
-    ray_distance, _, eye_z_m, point_z_m = _points(raster.expected_depth, camera, medium)
-    return optical_depth(medium, ray_distance, eye_z_m, point_z_m)
-
-
-def _points(
-    depth: Float[Tensor, "H W"], camera: Camera, medium: Fog
-) -> tuple[Tensor, Fog, float, Tensor | None]:
-    """Ray distances, the medium, the eye's height, and heights where the medium asks for them."""
     ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
     eye_z_m = float(camera.centre[2])
-    if medium.scale_height_m is None:
-        return ray_distance, medium, eye_z_m, None
-    rise = camera.ray_directions(depth.dtype, depth.device)[..., 2]
-    return ray_distance, medium, eye_z_m, eye_z_m + depth * rise
+    point_z_m = None
+    if medium.scale_height_m is not None:
+        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype, depth.device)[..., 2]
+    return fog_buffers(rgb, alpha, ray_distance, medium, eye_z_m, point_z_m)
 
 
 def optical_depth_of_arrays(

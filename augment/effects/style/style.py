@@ -263,10 +263,12 @@ class SceneStyle:
         """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
         return tuple(part if part.is_overlay else self._mapped(part, backend) for part in parts)
 
-    @property
+    @cached_property
     def on_photo(self) -> PhotoStyle:
         """The maps for a photo of the scene."""
-        levels = None if self.levels is None else self.levels.float() / LEVELS
+        levels = None
+        if self.levels is not None:
+            levels = torch.nn.functional.pad(self.levels.float() / LEVELS, (1, 1))
         return PhotoStyle(self.maps.splats, self.maps.sky, levels)
 
     @property
