@@ -288,21 +288,22 @@ class Photo:
         color_map, least = self.undone, -math.inf
         if style_map is not None:
             color_map, least = _composed(style_map, self.undone), 0.0
-        if self.backend != CUDA:
+        if self.backend == CPU:
             out = np.empty(self.pixels.shape, np.float32)
             given = np.empty((0, 4), np.float32) if color_map is None else color_map.numpy()
             with kernel_threads(ROWS):
                 kernels.scene_colors(self.pixels, given, np.float32(least), out)
             return torch.from_numpy(out)
-        rgb = gpu.upload(self.pixels).float() / 255
+        pixels = torch.from_numpy(self.pixels)
+        rgb = (gpu.upload(pixels) if self.backend == CUDA else pixels).float() / 255
         if color_map is None:
             return rgb
-        return map_colors(rgb, color_map, backend=CUDA).clamp_min(least)
+        return map_colors(rgb, color_map, backend=self.backend).clamp_min(least)
 
     def sharpen(self, values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
         """Values of 0 to 1 whose edges move to the photo's."""
         radius = max(2, round(RADIUS * self.camera.width))
-        source = np.ascontiguousarray(values.cpu().numpy())
+        source = np.ascontiguousarray(values.detach().cpu().float().numpy())
         guide = cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)  # in colour it takes twice as long
         found = cv2.ximgproc.guidedFilter(guide, source, radius, EDGE * 255**2)
         return torch.from_numpy(found).clamp_(0, 1).to(values.device)
@@ -313,7 +314,7 @@ class Photo:
         """
         assert raster.alpha is not None and raster.expected_depth is not None
         alpha, depth = opaque_alpha(raster.alpha), raster.expected_depth
-        if kernels_for(AUTO, alpha, depth) == CPU:
+        if kernels_for(self.backend, alpha, depth) == CPU:
             return self.sharpen(self._transmittance_on_cpu(alpha, depth, fog))
         camera, device, fall = self.camera, alpha.device, self.fall
         lengths, eye_z_m = camera.ray_lengths(device=device), float(camera.centre[2])
