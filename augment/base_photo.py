@@ -47,7 +47,7 @@ from augment.render.buffers import (
 )
 from augment.render.composite import map_colors
 from augment.render.cuda import runtime as gpu
-from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
+from augment.render.fog import MAX_EXPONENT, Fog, airlight_gain, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
@@ -326,6 +326,13 @@ class Photo:
             to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
             tau = torch.where(fall > LEVEL, to_road, tau)
         return self.sharpen(torch.lerp(torch.exp(-tau), seen, alpha))
+
+    def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
+        """The fog's colour at each pixel; of one pixel where it is one."""
+        color = torch.tensor(fog.rgb, device=self._device)[None, None]
+        if fog.overcast == 0:
+            return color
+        return color + airlight_gain(fog, -self.fall / self.camera.ray_lengths(device=self._device))
 
     def _transmittance_on_cpu(self, alpha: Tensor, depth: Tensor, fog: Fog) -> Tensor:
         camera, out = self.camera, np.empty(tuple(alpha.shape), np.float32)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.base_photo import Photo, blackened, mix
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
-from augment.render.composite import composite_sky
+from augment.render.composite import add_elevation, composite_sky
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.layout import HeightClip
@@ -59,10 +58,11 @@ class LayerRenderer:
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
             parts = blackened(parts) if shown is None else parts
+        tilted = self.fog if self.fog is not None and self.fog.overcast > 0 else None
         raster = rasterize(
             parts,
             camera,
-            buffers=buffers if later is None else buffers | {EXPECTED_DEPTH},
+            buffers=buffers | {EXPECTED_DEPTH} if later or tilted else buffers,
             settings=self.settings,
             fog=None if self.fog_on_buffers else self.fog,
             clip=clip,
@@ -72,10 +72,14 @@ class LayerRenderer:
         if photo is not None:
             with timed("photo"):
                 raster = photo.paint(raster, parts, camera, shown)
-        if later is None:
-            return raster
-        with timed("smog on buffers"):
-            return replace(raster, rgb=fog_raster(raster, camera, later))
+        if later is not None:
+            with timed("smog on buffers"):
+                raster = replace(raster, rgb=fog_raster(raster, camera, later))
+        if tilted is not None:
+            with timed("airlight by elevation"):
+                rgb = add_elevation(raster, camera, tilted, backend=self.backend)
+                raster = replace(raster, rgb=rgb)
+        return raster
 
     def draw_whole(
         self, camera: Camera, buffers: frozenset[str]
@@ -103,7 +107,7 @@ class LayerRenderer:
             slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
             slope = slope / camera.ray_lengths(rgb.dtype, rgb.device)
             tau = sky_optical_depth(self.fog, slope, float(camera.centre[2]))
-            sky = blend_airlight(sky, tau, self.fog)
+            sky = blend_airlight(sky, tau, self.fog, slope)
         return rgb + (1 - alpha)[..., None] * sky
 
     def _draw_on_photo(
@@ -125,5 +129,4 @@ class LayerRenderer:
             return rgb, raster
         with timed("smog on buffers"):
             transmittance = photo.transmittance(raster, self.fog)
-            airlight = torch.tensor(self.fog.rgb, dtype=rgb.dtype, device=rgb.device)
-            return mix(rgb, airlight[None, None], 1 - transmittance), raster
+            return mix(rgb, photo.airlight(self.fog), 1 - transmittance), raster
