@@ -326,7 +326,7 @@ def _draw_bed(
     scene_buffers: frozenset[str],
     margins: Margins,
     seen: Bool[Tensor, "h w"],
-    shown: Float[Tensor, "h w"] | None,
+    shown: Float[Tensor, "rows columns"] | None,
 ) -> RenderOutput:
     """What lies below the surface; not what the front hides, nor, in a mere picture, the water."""
     reach = math.inf if scene_buffers else visible_depth_m(medium)
