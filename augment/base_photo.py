@@ -325,7 +325,7 @@ class Photo:
             road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
             to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
             tau = torch.where(fall > LEVEL, to_road, tau)
-        return self.sharpen(torch.lerp(torch.exp(-tau), seen, alpha))
+        return self.sharpen(alpha * seen + (1 - alpha) * torch.exp(-tau))
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
         """The fog's colour at each pixel; of one pixel where it is one."""

