@@ -195,6 +195,19 @@ class Render(Section):
     picture, are left out; 0 leaves out none."""
 
 
+class Sensor(Section):
+    """What the camera adds to what reaches it, after all weather; depth, classes, masks and labels
+    know nothing of it.
+    """
+
+    noise: Number = Field(default=0.0, ge=0, le=0.2)
+    """Sigma of sensor noise at mid grey, of the range from black to white; darker and lighter
+    colours have that of photons and reading there. Neighbouring pixels share it, as after
+    demosaicing. 0.004 is one 8-bit level; 0 for none."""
+    psf_px: Number = Field(default=0.0, ge=0, le=16)
+    """Sigma of the lens's blur, pixels of the rendered picture; 0 for none."""
+
+
 class Output(Section):
     """What is written for each image."""
 
@@ -253,6 +266,7 @@ class Recipe(Closed):
     style: Style | None = None
     quality: Quality = Quality()
     render: Render = Render()
+    camera: Sensor = Sensor()
     output: Output = Output()
 
     @model_validator(mode="after")
@@ -276,6 +290,7 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
+        left_out += [] if self.camera != Sensor() else ["camera"]
         left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
         left_out += [
             f"{path}.{name}"

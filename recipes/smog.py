@@ -18,6 +18,7 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
+    later_fields = ("scatter",)
     meant_by = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
@@ -54,6 +55,10 @@ class Smog(EffectModel):
     """Height above the road where the density is the one given; of no effect on uniform smog."""
     model: Literal["per_gaussian", "deferred"] = "per_gaussian"
     """per_gaussian fogs every splat before blending; deferred fogs the finished buffers."""
+    scatter: Number = Field(default=0.0, ge=0, le=4)
+    """Forward scatter, which blurs things the more the deeper they stand in fog: 1 for droplets of
+    20 um, which deflect by diffraction as much light as they block; 0 for none, as of the fine
+    particles of smog and haze, whose light goes astray as airlight."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:

@@ -18,28 +18,34 @@ from jaxtyping import Float32, Float64, Int64
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.effect import Active, Effect, EffectView, Placed, Step, skipped
+from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
 from augment.jobs.box_tables import BoxTable
-from augment.render.buffers import EXPECTED_DEPTH
+from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
+from augment.render.scatter import scatter_forward
 from augment.scene import Scene
+from augment.timing import timed
 from recipes.schema import Recipe, Smog
 from recipes.smog import KOSCHMIEDER
 
 # ---- The effect ----------------------------------------------------------------------------------
 
 PER_GAUSSIAN, ON_BUFFERS, SKY = "smog per Gaussian", "smog on buffers", "sky"
+SCATTER = "forward scatter"
 
 
 @dataclass(frozen=True)
 class PlacedSmog:
-    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat."""
+    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat.
+    scatter: strength of the forward scatter.
+    """
 
     fog: Fog
     on_buffers: bool
+    scatter: float = 0.0
 
 
 class SmogEffect(Effect):
@@ -62,7 +68,8 @@ class SmogEffect(Effect):
         smog = self.of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
-            return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS), reason))
+            nothing = skipped((PER_GAUSSIAN, ON_BUFFERS), reason)
+            return Placed(None, (*nothing, *skipped((SCATTER,), reason, PICTURE)))
         on_buffers = smog.model == "deferred"
         other = "weather.smog.model chooses the other way"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
@@ -72,12 +79,27 @@ class SmogEffect(Effect):
             Step(PER_GAUSSIAN, not on_buffers, other if on_buffers else reason),
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
             sky,
+            Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
         )
-        buffers = frozenset({EXPECTED_DEPTH}) if on_buffers else frozenset()
-        return Placed(PlacedSmog(fog, on_buffers), steps, buffers)
+        buffers = {EXPECTED_DEPTH} if on_buffers else set[str]()
+        if smog.scatter > 0:
+            buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
+        return Placed(PlacedSmog(fog, on_buffers, smog.scatter), steps, frozenset(buffers))
 
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
         return replace(layers, fog=own.data.fog, fog_on_buffers=own.data.on_buffers)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        if own.data.scatter == 0:
+            return drawn
+        alpha, depth = drawn.raster.alpha, drawn.raster.median_depth
+        assert alpha is not None and depth is not None
+        fog, strength = own.data.fog, own.data.scatter
+        with timed(SCATTER):
+            rgb = scatter_forward(
+                drawn.rgb, alpha, depth, camera, fog, strength, backend=own.backend
+            )
+        return replace(drawn, rgb=rgb)
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView
