@@ -533,6 +533,12 @@ class Scene:
         changing = {name for name, color_map in maps if not torch.equal(color_map, identity)}
         return tuple(name for name in self.camera_names if name in changing)
 
+    @cached_property
+    def common_color_map(self) -> Float[Tensor, "3 4"] | None:
+        """Mean of all colour maps, float64; None where none changes anything."""
+        maps = [*self.color_maps.values(), *self.image_color_maps.values()]
+        return torch.stack(maps).double().mean(0) if self.mapped_cameras else None
+
     def boxes(self, frame_index: int) -> Boxes:
         return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)
 

@@ -11,6 +11,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from augment.render.cpu.jit import inner, kernel
+from augment.render.fog import ENCODING, MAX_EXPONENT
 from augment.render.layout import LANES, U
 from augment.render.sh import BLACK, FOLDED
 
@@ -36,12 +37,52 @@ def renormalise_alpha(alpha, rgb, overlay, least):
                     overlay[pixel] *= scale
 
 
+@inner()
+def airlight_gain(slope, overcast):
+    """What varying airlight is multiplied by, less 1 (augment.render.fog)."""
+    if overcast == 0:
+        return np.float32(0)
+    growth = math.log1p(np.float32(2) * overcast * abs(slope)) / np.float32(ENCODING)
+    return math.expm1(growth if slope > 0 else -growth)
+
+
 @kernel
-def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
+def add_elevation(rgb, alpha, depth, u, v, rise, medium, varying):
+    """rgb += alpha (1 - t) gain varying, in place: what elevation adds to the airlight.
+
+    depth: [H, W], z. u [W], v [H]: image coordinates at unit depth. rise [3]: world z along the
+    camera's axes. medium: extinction at its base, height of the eye above that in scale heights,
+    1 / scale height (0 of uniform fog), overcast. All float32.
+    """
+    sigma, eye, per_height, overcast = medium[0], medium[1], medium[2], medium[3]
+    half, one = np.float32(0.5), np.float32(1)
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            if alpha[i, j] > 0:
+                length = math.sqrt(u[j] * u[j] + v[i] * v[i] + one)
+                climb = u[j] * rise[0] + v[i] * rise[1] + rise[2]
+                tau = sigma * depth[i, j] * length
+                if per_height > 0:
+                    up = depth[i, j] * climb * per_height
+                    x = abs(up)
+                    mean = one - half * x if x < np.float32(1e-4) else -math.expm1(-x) / x
+                    lowest = eye + min(up, np.float32(0))
+                    tau *= math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
+                gain = airlight_gain(climb / length, overcast)
+                gain *= alpha[i, j] * -math.expm1(-tau)
+                for c in range(U(3)):
+                    rgb[i, j, c] += gain * varying[c]
+
+
+@kernel
+def composite_cubemap(
+    rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, overcast, airlight, varying, out
+):
     """out = rgb + (1 - alpha) sky of a cube map, through fog where strength >= 0.
 
     faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border). rotation:
-    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.
+    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up. overcast,
+    airlight [3], varying [3]: of the fog.
     """
     height, width = alpha.shape
     half, one = np.float32(0.5), np.float32(1)
@@ -77,16 +118,19 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
             fc, fr = column - np.float32(c0), row - np.float32(r0)
             transmittance = one - alpha[i, j]
             visible = one
+            gain = np.float32(0)
             if strength >= 0:
                 visible = np.float32(0)
+                slope = z / math.sqrt(x * x + y * y + z * z)
                 if z > 0:
-                    slope = z / math.sqrt(x * x + y * y + z * z)
                     visible = math.exp(-strength / slope)
+                gain = airlight_gain(slope, overcast)
             for c in range(3):
                 top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
                 bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
                 color = top * (one - fr) + bottom * fr
-                color = visible * color + (one - visible) * airlight[c]
+                air = airlight[c] + gain * varying[c]
+                color = visible * color + (one - visible) * air
                 out[i, j, c] = rgb[i, j, c] + transmittance * color
 
 
