@@ -126,7 +126,8 @@ def test_what_is_near_stays_sharp_and_leaves_no_halo_in_the_fog():
 def test_far_things_are_softer_than_near_ones():
     view = camera()
     rgb = torch.rand(view.height, view.width, 3, generator=torch.Generator().manual_seed(2))
-    kept = [float(spread_of(rgb, at_depth(view, t, FOG), view).std()) for t in (1e-5, 0.1, 0.5, 1, 3)]
+    depths = (1e-5, 0.1, 0.5, 1, 3)
+    kept = [float(spread_of(rgb, at_depth(view, t, FOG), view).std()) for t in depths]
     assert kept == sorted(kept, reverse=True)
     assert kept[0] == pytest.approx(float(rgb.std()), rel=1e-3)
     weak = spread_of(rgb, at_depth(view, 1.0, FOG), view, strength=0.1)
