@@ -202,11 +202,10 @@ class Sensor(Section):
     """
 
     noise: Number = Field(default=0.0, ge=0, le=0.2)
-    """Sigma of sensor noise at mid grey, of the range from black to white; darker and lighter
-    colours have that of photons and reading there. Neighbouring pixels share it, as after
-    demosaicing. 0.004 is one 8-bit level; 0 for none."""
+    """Sigma of sensor noise at mid grey, black to white being 1: of photons and reading, demosaiced.
+    0.004 is one 8-bit level."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
-    """Sigma of the lens's blur, pixels of the rendered picture; 0 for none."""
+    """Sigma of the lens's blur, pixels of the rendered picture."""
 
 
 class Output(Section):

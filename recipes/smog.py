@@ -60,9 +60,8 @@ class Smog(EffectModel):
     in all directions, 0.5 what light scattered in thick fog over asphalt comes to, 1 an overcast
     sky, whose zenith has three times the horizon's luminance."""
     scatter: Number = Field(default=0.0, ge=0, le=4)
-    """Forward scatter, which blurs things the more the deeper they stand in fog: 1 for droplets of
-    20 um, which deflect by diffraction as much light as they block; 0 for none, as of the fine
-    particles of smog and haze, whose light goes astray as airlight."""
+    """Forward scatter, which blurs what stands deep in fog: 1 for all that droplets of 20 um
+    diffract, 0 for none, as of the finer particles of smog and haze."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
