@@ -211,7 +211,7 @@ class Sensor(Section):
 class Output(Section):
     """What is written for each image."""
 
-    later_fields = ("surface",)
+    later_fields = ("surface", "trust")
     knobs = (
         Knob("depth", ("none", "expected", "median", "mode"), "depth estimator", 11, False),
         Knob(
@@ -245,6 +245,8 @@ class Output(Section):
     a flood and surface is not scene, else true."""
     labels: Flag = True
     """Pass 3D boxes through."""
+    trust: Flag = False
+    """Write which pixels can be believed: those that the scene's images saw from near enough."""
 
 
 class Recipe(Closed):
