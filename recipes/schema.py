@@ -202,8 +202,8 @@ class Sensor(Section):
     """
 
     noise: Number = Field(default=0.0, ge=0, le=0.2)
-    """Sigma of sensor noise at mid grey, black to white being 1: of photons and reading, demosaiced.
-    0.004 is one 8-bit level."""
+    """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
+    255."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
     """Sigma of the lens's blur, pixels of the rendered picture."""
 
