@@ -122,12 +122,11 @@ def test_parents_that_are_refused(tmp_path: Path) -> None:
 
 def test_an_override_is_the_field_written_in_the_file() -> None:
     texts = ["weather.smog.visibility_m={uniform: [40, 80]}", "weather.smog.color=[0.5, 0.5, 0.5]"]
-    texts += ["weather.smog.scale_height_m=80", "variants=2"]
-    template = load_recipe("light-haze", read_overrides(texts))
+    template = load_recipe("dense-fog", read_overrides([*texts, "variants=2"]))
     assert template.values["weather.smog.visibility_m"] == Uniform(40.0, 80.0)
-    smog = "visibility_m: {uniform: [40, 80]}, color: [0.5, 0.5, 0.5], scale_height_m: 80"
-    text = f"seed: 1\nweather: {{smog: {{{smog}}}}}"
-    written = parse_recipe(text, source="r.yaml", name="light-haze")
+    smog = "{visibility_m: {uniform: [40, 80]}, color: [0.5, 0.5, 0.5]}"
+    text = f"extends: dense-fog\nweather: {{smog: {smog}}}"
+    written = parse_recipe(text, source="r.yaml", name="dense-fog")
     assert template.variants == 2 and template.resolve(1) == written.resolve(1)
     without = load_recipe("winter-fog", {"weather.snow": None, "extends": "clear"}).resolve(0)
     assert without.weather.snow is None and without.weather.smog is not None
