@@ -20,8 +20,9 @@ from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
 from recipes.errors import RecipeError
-from recipes.schema import Recipe
+from recipes.schema import Recipe, Sensor
 
+LENS, NOISE = "lens blur", "sensor noise"  # the last passes of all
 BARE = "bare surface"  # the pass that draws the scene without what lies on it
 
 
@@ -36,7 +37,7 @@ class Plan:
     what a ray meets first, such as water, not the scene under it. finds_boxes: labels or instance
     images need the depth of the solid surfaces. recorded_exposure: cameras' colour maps apply to
     the finished picture. on_photo: the recorded image stays the picture, and the scene supplies the
-    weather. steps: every pass considered, in order.
+    weather. sensor, seed: of the recipe. steps: every pass considered, in order.
     """
 
     placed: Mapping[str, Placed]
@@ -51,6 +52,8 @@ class Plan:
     finds_boxes: bool
     recorded_exposure: bool
     on_photo: bool
+    sensor: Sensor
+    seed: int
     steps: tuple[Step, ...]
 
     @property
@@ -136,6 +139,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         finds_boxes=finds_boxes,
         recorded_exposure=exposure.runs,
         on_photo=recipe.render.base == RECORDED,
+        sensor=recipe.camera,
+        seed=recipe.seed,
         steps=_all_steps(recipe, scene, placed, buffers, bare_buffers, exposure),
     )
 
@@ -169,6 +174,8 @@ def _all_steps(
         Step(BARE, bool(bare), without),
         *of_effects(PICTURE),
         exposure,
+        Step(LENS, recipe.camera.psf_px > 0, f"camera.psf_px is {recipe.camera.psf_px:g}"),
+        Step(NOISE, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"),
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
         Step("semantic image", output.semantic, _asked("semantic", recipe)),
         Step("instance image", output.instance, _asked("instance", recipe)),
