@@ -38,7 +38,7 @@ from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
 
 SKY_FROM_M = 200.0  # a surface this far fades in any fog and casts no pane
-MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through what lets by more
+MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through
 MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog is 20/255 and shows
 # 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
 MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
@@ -421,9 +421,10 @@ def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarr
 class ViewTrust:
     """Shares of one judged view, 0 to 1. sky_covered: of the sky, what has a surface nearer than
     SKY_FROM_M; None where the sky is unknown or absent. ground_open, ground_leaks: of what lies
-    below the horizon, the recording car left out, what has no surface, and what lets by more than
-    MAX_TRANSMITTANCE; None where nothing lies there or up is unknown. own_car: of all pixels.
-    reach_m: distance within which 95 % of the surfaces lie; None without any.
+    below the horizon, the recording car left out, what has no surface, and what lets more than
+    MAX_TRANSMITTANCE of the light through; None where nothing lies there or up is unknown.
+    own_car: of all pixels. reach_m: distance within which 95 % of the surfaces lie; None without
+    any.
     """
 
     frame: int
@@ -599,8 +600,8 @@ def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
     open_too = worst is not None and leaks is not None and leaks[1] < 2 * worst[1]
     if leaks is not None and leaks[1] > MAX_GROUND_OPEN and not open_too:
         found.append(
-            f"{_percent(leaks[1])} of the ground lets by more than "
-            f"{_percent(MAX_TRANSMITTANCE)} of the light behind it{_where(own, leaks)}"
+            f"{_percent(leaks[1])} of the ground lets more than {_percent(MAX_TRANSMITTANCE)} of "
+            f"the light behind it through{_where(own, leaks)}"
         )
     covered = _worst(own.views, "sky_covered")
     if covered is not None and covered[1] > MAX_SKY_COVERED:
