@@ -35,6 +35,7 @@ from augment.sky import (
 )
 
 ROWS = 32  # image rows a thread takes at a time
+NUM_GAINS = 1025  # of airlight by slope in the kernels' table, which then errs by 1e-6
 AIRLIGHT_SIZE = 64  # texels along a face of airlight by elevation, which then errs by 1e-4
 
 
@@ -61,6 +62,13 @@ def _airlight(fog: Fog) -> Sky:
     return CubemapSky(horizon + airlight_gain(fog, slopes))
 
 
+@functools.lru_cache(maxsize=16)
+def _gains(overcast: float) -> np.ndarray:
+    """What varying airlight is multiplied by, less 1, by slope; float32, none without overcast."""
+    slopes = torch.linspace(-1, 1, NUM_GAINS if overcast > 0 else 0)
+    return airlight_gain(Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast), slopes)[:, 0].numpy()
+
+
 def add_elevation(
     raster: RenderOutput, camera: Camera, fog: Fog, *, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
@@ -79,10 +87,11 @@ def add_elevation(
     eye, per_height = 0.0, 0.0
     if fog.scale_height_m is not None:
         eye, per_height = float(camera.centre[2]) - fog.base_z_m, 1 / fog.scale_height_m
-    medium = fog.sigma_per_m, eye * per_height, per_height, fog.overcast
+    medium = fog.sigma_per_m, eye * per_height, per_height
     u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    numbers = u, v, camera.world_from_camera[2, :3].numpy(), medium, fog.varying_rgb or fog.rgb
+    numbers = u, v, camera.world_from_camera[2, :3].numpy(), medium, _gains(fog.overcast)
+    numbers = *numbers, fog.varying_rgb or fog.rgb
     with kernel_threads(ROWS):
         composite_kernels.add_elevation(
             rgb.detach().numpy(), alpha.detach().contiguous().numpy(),
@@ -129,16 +138,16 @@ def _composite_cubemap(
     rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, fog: Fog | None
 ) -> Tensor:
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    strength, overcast, airlight, varying = -1.0, 0.0, (0.0, 0.0, 0.0), None
+    strength, gains, airlight, varying = -1.0, _gains(0.0), (0.0, 0.0, 0.0), None
     if fog is not None:
         strength = vertical_optical_depth(fog, float(camera.centre[2]))
-        overcast, airlight, varying = fog.overcast, fog.rgb, fog.varying_rgb
+        gains, airlight, varying = _gains(fog.overcast), fog.rgb, fog.varying_rgb
     with kernel_threads(ROWS):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(),
             faces.contiguous().numpy(), camera.world_from_camera[:3, :3].numpy().astype(np.float32),
             np.float32(1 / camera.fx), np.float32(1 / camera.fy), np.float32(camera.cx),
-            np.float32(camera.cy), np.float32(min(strength, 1e30)), np.float32(overcast),
+            np.float32(camera.cy), np.float32(min(strength, 1e30)), gains,
             np.asarray(airlight, np.float32), np.asarray(varying or airlight, np.float32), out,
         )  # fmt: skip
     return torch.from_numpy(out)
