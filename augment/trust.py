@@ -548,9 +548,12 @@ def _judge_camera(
     )
     middles = [held[(2 * k + 1) * len(held) // (2 * count)] for k in range(count)] if held else []
     drawn = {} if is_unfitted else {f.index: f.cameras[name] for f in middles}
-    views = tuple(
-        judge_view(scene, _small(camera), index, backend=backend) for index, camera in drawn.items()
-    )
+    views, failed = list[ViewTrust](), list[str]()
+    for index, camera in drawn.items():
+        try:
+            views.append(judge_view(scene, _small(camera), index, backend=backend))
+        except Exception as error:  # as in a job: one bad frame is named, and the others go on
+            failed.append(f"frame {index} cannot be drawn: {error}")
     centres = [view.camera.centre for view in own]
     steps = [float((b - a).norm()) for a, b in itertools.pairwise(centres)]
     found = CameraTrust(
@@ -560,10 +563,10 @@ def _judge_camera(
         seen_path_m=sum(steps, 0.0),
         nearest=farthest,
         away=away,
-        views=views,
+        views=tuple(views),
         problems=(),
     )
-    problems = _problems(found, is_unfitted, len(held))
+    problems = failed + _problems(found, is_unfitted, len(held))
     if farthest is not None and scale is not None and not is_unfitted:
         magnified = magnified_sentence(1 / farthest.magnification, 1.0)
         problems += [] if magnified is None else [magnified]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from augment.jobs.layout import item_paths
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.recorded_sky import elevation_rad, find_sky
-from augment.scene import Gaussians, Scene
+from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky
 from augment.trust import (
     MAX_MAGNIFICATION,
@@ -261,5 +262,9 @@ def test_extremes_give_figures_and_no_nan():
         view = judge_view(scene, camera, 0)
         assert 0 <= view.ground_open <= view.ground_leaks <= 1
         assert trust_mask(scene, camera).shape == (30, 40)
+    lost = Track(torch.tensor([0]), torch.full((1, 4, 4), math.nan, dtype=torch.float64))
+    actor = Actor("a", "car", background, lost, (4.0, 2.0, 1.5))
+    broken = judge_scene(dataclasses.replace(scene, actors=(actor,)))
+    assert "frame 0 cannot be drawn" in broken.problems[0]
     no_up = dataclasses.replace(scene, has_known_gravity=False)
     assert judge_view(no_up, camera, 0).ground_open is None
