@@ -652,6 +652,7 @@ def splats_of(*counts: int, opacity: float | None = None, seed: int = 0) -> Spla
         sh_v=normal(4, 3) ** 2,
         age=rng.integers(1, 1000, total).astype(np.int32),
         grads=np.zeros((total, 3), np.float32),
+        smallest=np.zeros(total, np.float32),
     )
 
 
