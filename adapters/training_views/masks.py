@@ -108,7 +108,7 @@ def sky_mask(
     free = _above_surfaces(camera, drawn | hit, lidar_top_rad)
     sure = free & looks_like_sky(rgb, free)
     rise = camera.ray_directions().numpy()[..., 2]
-    above = (rise > 0) & ~(cv2.dilate(hit.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    above = (rise > 0) & ~hit
     likely = above & ~drawn & _as_bright_as_sky(rgb, free if free.any() else above)
     if not likely.any():
         return none
@@ -116,7 +116,8 @@ def sky_mask(
     labels[likely] = cv2.GC_PR_FGD
     labels[sure] = cv2.GC_FGD
     labels[~above] = cv2.GC_BGD
-    sky = _refined(rgb, _cut(rgb, labels)) & above
+    beside = cv2.dilate(hit.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    sky = _refined(rgb, _cut(rgb, labels)) & above & ~beside
     return _joined_to(sky, sure) & ~_thin(rgb, sky)
 
 
@@ -155,11 +156,13 @@ def _refined(rgb: np.ndarray, small: np.ndarray) -> np.ndarray:
 
 def _joined_to(sky: np.ndarray, sure: np.ndarray) -> np.ndarray:
     """The sky's connected pieces that are sure in part or reach the image's upper border: a bright
-    window is neither."""
-    _, pieces = cv2.connectedComponents(sky.astype(np.uint8), connectivity=4)
+    window is neither. Wires part nothing."""
+    border = max(2, round(_BORDER_PART * sky.shape[1]))
+    grown = cv2.dilate(sky.astype(np.uint8), np.ones((2 * border + 1,) * 2, np.uint8))
+    _, pieces = cv2.connectedComponents(grown, connectivity=4)
     kept = np.zeros(int(pieces.max()) + 1, np.bool_)
-    kept[pieces[sure]] = True
-    kept[pieces[0]] = True
+    kept[pieces[sure & sky]] = True
+    kept[pieces[0][sky[0]]] = True
     return kept[pieces] & sky
 
 

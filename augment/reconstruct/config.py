@@ -23,8 +23,8 @@ class LossWeights:
     d_ssim: float = 0.2
     depth: float = 2.0
     surface: float = 0.05
-    sky: float = 0.05
-    ground: float = 0.05
+    sky: float = 0.15
+    ground: float = 0.2
 
 
 class FitConfig(BaseModel):

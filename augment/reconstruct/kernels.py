@@ -594,7 +594,7 @@ def sight(means, pose, intrinsics, sky, px_per_m, seen, in_sky):
         if not (left < u < right and top < v < bottom):
             continue
         px_per_m[i] = max(px_per_m[i], fx / depth)
-        column, row = int(math.floor(u)), int(math.floor(v))
+        column, row = math.floor(u), math.floor(v)
         if not (0 <= column < width and 0 <= row < height):
             continue
         seen[i] += 1

@@ -201,8 +201,8 @@ def densify(
     """One round: removes the faint, the refuted and the unusable, then doubles the best others.
 
     If none would be left, only unusable ones go: a scene is never emptied. extent_m: how far the
-    scene reaches, against which absurd sizes show. refuted: bool [N], see `refuted_by_sky`. The result's arrays are its own, part after
-    part, children next to their parents, grads zero.
+    scene reaches, against which absurd sizes show. refuted: bool [N], see `Sightings`. The result's
+    arrays are its own, part after part, children next to their parents, grads zero.
 
     Raises:
         SceneError: no splat is usable any more.
@@ -304,7 +304,12 @@ class Sightings:
         self.in_sky = np.zeros(count, np.int32)
 
     def add(
-        self, splats: Splats, part: int, world_from_part: np.ndarray, camera: Camera, sky: np.ndarray
+        self,
+        splats: Splats,
+        part: int,
+        world_from_part: np.ndarray,
+        camera: Camera,
+        sky: np.ndarray,
     ) -> None:
         """One view of one part. world_from_part: float64 [4, 4]. sky: bool [H, W]."""
         own = slice(int(splats.starts[part]), int(splats.starts[part + 1]))
@@ -315,14 +320,6 @@ class Sightings:
                 splats.means[own], pose.astype(np.float32), intrinsics, sky,
                 self.px_per_m[own], self.seen[own], self.in_sky[own],
             )  # fmt: skip
-
-    @property
-    def smallest(self) -> np.ndarray:
-        """float32 [N]: the least sizes in metres, FILTER_PX where a splat is seen best; 0 of those
-        that no view shows.
-        """
-        rate = np.maximum(self.px_per_m, np.float32(1e-6))
-        return np.where(self.px_per_m > 0, np.float32(FILTER_PX) / rate, np.float32(0))
 
     @property
     def refuted(self) -> np.ndarray:

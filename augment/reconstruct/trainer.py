@@ -34,6 +34,7 @@ from augment.reconstruct.loss import (
 )
 from augment.reconstruct.splats import (
     CORRECTIONS,
+    FILTER_PX,
     ColorAdam,
     DenseAdam,
     Sightings,
@@ -561,7 +562,7 @@ class Trainer:
         self.camera_poses = CameraPoses(source)
         self._extent_m = _extent(source)
         self._skies = {key: np.packbits(source.load(key).sky) for key in source.train}
-        kept = ~self._look()
+        kept = ~self._look(with_actors=True)
         self.splats = rebuild(self.splats, np.flatnonzero(kept | ~kept.any()))
         bound_sizes(self.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
@@ -742,22 +743,25 @@ class Trainer:
         if config.densify != "none" and densify_due(growth, self.step, self._steps):
             self.splats = densify(
                 self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m,
-                refuted=self._look(),
+                refuted=self._look(with_actors=False),
             )  # fmt: skip
 
-    def _look(self) -> np.ndarray:
-        """Brings the least sizes up to date by all training views; who of the splats their sky
-        refutes, bool [N]: of the background alone, since boxes say that actors are there.
+    def _look(self, *, with_actors: bool) -> np.ndarray:
+        """Brings the least sizes up to date by all training views, of actors where asked for (they
+        hardly change: children inherit them). Returns which splats the sky refutes, bool [N]: of
+        the background alone, since boxes say that actors are there.
         """
         found = Sightings(len(self.splats))
         for key, bits in self._skies.items():
             camera = self.camera_poses.corrected(self._source.camera(key))
             count = camera.height * camera.width
             sky = np.unpackbits(bits, count=count).view(np.bool_)
-            parts = self._posed(camera)
+            sky = sky.reshape(camera.height, camera.width)
+            parts = self._posed(camera) if with_actors else _PosedParts([0], np.eye(4)[None])
             for part, pose in zip(parts.numbers, parts.poses, strict=True):
-                found.add(self.splats, part, pose, camera, sky.reshape(camera.height, camera.width))
-        self.splats.smallest[:] = found.smallest
+                found.add(self.splats, part, pose, camera, sky)
+        shown = found.px_per_m > 0
+        self.splats.smallest[shown] = FILTER_PX / found.px_per_m[shown]
         return found.refuted & (self.splats.part_of == 0)
 
 
