@@ -141,7 +141,8 @@ def _cut(rgb: np.ndarray, labels: np.ndarray) -> np.ndarray:
     if is_sky.any() and not is_sky.all():
         cv2.setRNGSeed(_CUT_SEED)
         models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(small, labels, None, *models, _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+        whole = (0, 0, *size)
+        cv2.grabCut(small, labels, whole, *models, _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
         is_sky = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     return is_sky
 
@@ -159,7 +160,7 @@ def _joined_to(sky: np.ndarray, sure: np.ndarray) -> np.ndarray:
     window is neither. Wires part nothing."""
     border = max(2, round(_BORDER_PART * sky.shape[1]))
     grown = cv2.dilate(sky.astype(np.uint8), np.ones((2 * border + 1,) * 2, np.uint8))
-    _, pieces = cv2.connectedComponents(grown, connectivity=4)
+    pieces = np.asarray(cv2.connectedComponents(grown, connectivity=4)[1], np.int32)
     kept = np.zeros(int(pieces.max()) + 1, np.bool_)
     kept[pieces[sure & sky]] = True
     kept[pieces[0][sky[0]]] = True
