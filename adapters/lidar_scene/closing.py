@@ -38,6 +38,7 @@ from augment.render.buffers import ALPHA, EXPECTED_DEPTH, SPLAT_IDS
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass, class_of_label
+from augment.view_images import SURFACE_ALPHA
 
 _WIDTH = 480  # columns of the images that are drawn
 _CELL_PX = 2  # of those, from one new disc to the next
@@ -45,8 +46,7 @@ _IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # that images are decoded at
 _STEP_M = 1.2  # images are taken that far apart on the way
 _MIN_FRAMES, _FRAMES_PART = 4, 1 / 3  # and no more frames than these
 _TRANSMITTANCE = 0.02  # of a closed pixel, at most
-_SURFACE_ALPHA = 0.5  # less is no surface
-_BEHIND, _BEHIND_M = 0.005, 0.02  # of its depth, and metres, that a disc lies behind what leaks
+_BEHIND, _BEHIND_M = 0.002, 0.02  # of its depth, and metres, that a disc lies behind what leaks
 _NEIGHBOURS, _FAR_QUANTILE = 16, 0.75
 _CELLS_PER_LAB = 1.0  # a difference in colour (CIELAB) as a distance in the image
 _SQUARE_M = 0.5  # of the map of the ground
@@ -71,12 +71,15 @@ def close_parts(
     still: Sequence[BoxSample],
     views: Sequence[View],
     points: PointSet,
+    *,
+    max_gaussians: int,
 ) -> list[Gaussians]:
     """The Gaussians of the world and of each track's object, with discs added until few pixels of
     the images are open below the horizon.
 
     parts: the world's, then those of the tracks, in their frames. still: boxes of objects that are
-    part of the world. points: of the world, the ground among them."""
+    part of the world. points: of the world, the ground among them. max_gaussians: of all parts;
+    where they come near it, discs are larger and fewer."""
     parts = list(parts)
     ground = _GroundMap.of(points)
     standing = [
@@ -89,10 +92,6 @@ def close_parts(
             pose = track.motion.pose_at(view.camera.timestamp_ns)
             if pose is not None:
                 posed[number] = pose
-        cells = _draw(parts, posed, view.camera)
-        image = _read_cells(view, cells.camera)
-        if image is None:
-            continue  # a problem of the scene already
         boxes = standing + [
             _Box(n, pose, tracks[n - 1].size_m, class_of_label(tracks[n - 1].label))
             for n, pose in posed.items()
@@ -100,7 +99,21 @@ def close_parts(
         ]
         centre = view.camera.centre.numpy()
         boxes.sort(key=lambda box: -np.linalg.norm(box.world_from_box[:3, 3] - centre))
-        discs = _discs(cells, image, ground, boxes)  # a nearer box after, and so before, a further
+        drawn = _draw(parts, posed, view.camera)
+        photo = _read_photo(view, drawn.camera)
+        if photo is None:
+            continue  # a problem of the scene already
+        side_px, most = _CELL_PX, (max_gaussians - sum(map(len, parts))) // 2
+        while True:
+            cells = drawn.cells(side_px)
+            size = (cells.camera.width, cells.camera.height)
+            image = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+            discs = _discs(cells, image, ground, boxes)  # of a nearer box over those of a further
+            if len(discs.part) <= most or min(size) == 1:
+                break
+            side_px *= 2
+        if len(discs.part) > most:
+            break
         for number in np.unique(discs.part):
             own = discs.select(discs.part == number)
             new = own.gaussians(cells.camera, posed[int(number)])
@@ -188,7 +201,7 @@ def _meet_ground(
 
 
 class _Cells(NamedTuple):
-    """A view drawn, by cells of _CELL_PX pixels a side: of each what its most open pixel has.
+    """A view drawn, by square cells of pixels: of each what its most open pixel has.
 
     camera: whose pixels are the cells. is_open: bool [h, w], light comes through below the horizon.
     has_surface: bool [h, w]. depth: float64 [h, w]. part, semantic: of the splat that counts most,
@@ -202,7 +215,49 @@ class _Cells(NamedTuple):
     semantic: np.ndarray
 
 
-def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Camera) -> _Cells:
+class _Drawn(NamedTuple):
+    """A view drawn: alpha, depth [H, W], float32; part, semantic: of the splat that counts most,
+    int [H, W], at pixels with a surface."""
+
+    camera: Camera
+    alpha: np.ndarray
+    depth: np.ndarray
+    part: np.ndarray
+    semantic: np.ndarray
+
+    def cells(self, side_px: int) -> _Cells:
+        camera = self.camera
+        rows, columns = -(-camera.height // side_px), -(-camera.width // side_px)
+        small = dataclasses.replace(
+            camera, width=columns, height=rows,
+            fx=camera.fx / side_px, fy=camera.fy / side_px,
+            cx=camera.cx / side_px, cy=camera.cy / side_px,
+        )  # fmt: skip
+
+        def blocks(image: np.ndarray) -> np.ndarray:
+            """[h, w, side_px^2]; those at the border repeat its pixels."""
+            beyond = ((0, rows * side_px - camera.height), (0, columns * side_px - camera.width))
+            padded = np.pad(image, beyond, mode="edge")
+            split = padded.reshape(rows, side_px, columns, side_px).swapaxes(1, 2)
+            return split.reshape(rows, columns, -1)
+
+        most_open = blocks(self.alpha).argmin(2)[..., None]
+        alpha, depth, part, semantic = (
+            np.take_along_axis(blocks(image), most_open, 2)[..., 0] for image in self[1:]
+        )
+        # Half a cell above the horizon counts: splats there are seen from lower cameras too.
+        below = small.ray_directions().numpy()[..., 2] < 0.5 / small.fy
+        return _Cells(
+            small,
+            (alpha < 1 - _TRANSMITTANCE) & below,
+            alpha >= SURFACE_ALPHA,
+            depth.astype(np.float64),
+            part,
+            semantic,
+        )
+
+
+def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Camera) -> _Drawn:
     camera = camera.scaled(min(1.0, _WIDTH / camera.width))
     drawn = [
         PosedGaussians(parts[n], torch.from_numpy(pose) if n else None, instance_id=n)
@@ -211,50 +266,24 @@ def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Came
     raster = rasterize(drawn, camera, buffers=(ALPHA, EXPECTED_DEPTH, SPLAT_IDS))
     assert raster.alpha is not None and raster.expected_depth is not None
     assert raster.splat_ids is not None
-    rows, columns = -(-camera.height // _CELL_PX), -(-camera.width // _CELL_PX)
-    small = dataclasses.replace(
-        camera, width=columns, height=rows,
-        fx=camera.fx / _CELL_PX, fy=camera.fy / _CELL_PX,
-        cx=camera.cx / _CELL_PX, cy=camera.cy / _CELL_PX,
-    )  # fmt: skip
-
-    def cells(image: torch.Tensor) -> np.ndarray:
-        """[h, w, _CELL_PX^2]; those at the border repeat its pixels."""
-        beyond = ((0, rows * _CELL_PX - camera.height), (0, columns * _CELL_PX - camera.width))
-        padded = np.pad(image.numpy(), beyond, mode="edge")
-        blocks = padded.reshape(rows, _CELL_PX, columns, _CELL_PX).swapaxes(1, 2)
-        return blocks.reshape(rows, columns, -1)
-
-    alphas = cells(raster.alpha)
-    most_open = alphas.argmin(2)[..., None]
-    alpha = np.take_along_axis(alphas, most_open, 2)[..., 0]
-    ids = np.take_along_axis(cells(raster.splat_ids), most_open, 2)[..., 0]
-    depth = np.take_along_axis(cells(raster.expected_depth), most_open, 2)[..., 0]
-    numbers = np.array(list(posed))
-    firsts = np.cumsum([0, *(len(parts[n]) for n in posed)])
-    part = numbers[np.clip(np.searchsorted(firsts, ids, side="right") - 1, 0, len(numbers) - 1)]
-    classes = [parts[n].semantic for n in posed]
-    table = np.concatenate([c.numpy() for c in classes if c is not None] or [np.zeros(1, np.int16)])
-    # Half a cell above the horizon counts: splats there are seen from lower cameras too.
-    below = small.ray_directions().numpy()[..., 2] < 0.5 / small.fy
-    return _Cells(
-        small,
-        (alpha < 1 - _TRANSMITTANCE) & below,
-        (alpha >= _SURFACE_ALPHA) & (ids >= 0),
-        depth.astype(np.float64),
-        part,
-        table[np.maximum(ids, 0)],
+    ids = raster.splat_ids.numpy().clip(0)
+    # One more than there are: of an image in which nothing stands.
+    part = np.append(np.repeat(list(posed), [len(parts[n]) for n in posed]), 0)
+    classes = [parts[n].semantic.numpy() for n in posed if len(parts[n])]
+    semantic = np.concatenate([*classes, np.zeros(1, np.int16)])
+    return _Drawn(
+        camera, raster.alpha.numpy(), raster.expected_depth.numpy(), part[ids], semantic[ids]
     )
 
 
-def _read_cells(view: View, camera: Camera) -> np.ndarray | None:
-    """The photo at the cells, RGB uint8 [h, w, 3], what it shows of the recording car filled from
-    around it; None if it cannot be decoded."""
-    wanted = camera.width * _CELL_PX / view.camera.width
-    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= min(wanted, 1.0)))
+def _read_photo(view: View, camera: Camera) -> np.ndarray | None:
+    """The photo at the camera's size, RGB uint8 [H, W, 3], what it shows of the recording car
+    filled from around it; None if it cannot be decoded."""
+    wanted = camera.width / view.camera.width
+    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= wanted))
     if image is None:
         return None
-    size = (camera.width, camera.height)
+    size = (camera.width // _CELL_PX or 1, camera.height // _CELL_PX or 1)
     image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     car = view.shows_car(*size)
     if car.all() or not car.any():
@@ -388,7 +417,7 @@ def _fill_box(
     which of it they are, and their depths.
 
     A vehicle has no holes: below the highest of its surface in a column of cells it goes on to the
-    sill, behind the box's side as the nearest of it. Of anything else only open cells are closed."""
+    sill, as far behind the box's side as the nearest of it. Of all else open cells are closed."""
     nothing = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0))
     window = box.window(cells.camera)
     if window is None:

@@ -47,6 +47,7 @@ logger = logging.getLogger(__name__)
 _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
 _MASK_SCALE = 0.25  # of images in which the recording car is looked for
+_MEASURED_PART = 0.9  # of max_gaussians, at most, is for what was measured; the rest closes it
 _MIN_POINTS = 8  # that surfaces are sought in
 _TRIAL = 3.0  # voxels of the trial in units of those asked for
 _REACHES_M = (8.0, 16.0)
@@ -103,7 +104,8 @@ def build_lidar_scene(
     if ground is None:
         ground = measure_from_classes(background.points, background.semantic, path)
     paths = [path, *(_path_in(track, path, times_ns) for track in tracks)]
-    sampled = _sample_all([background, *actors], paths, options)
+    measured = options.max_gaussians * (1 if added else _MEASURED_PART)
+    sampled = _sample_all([background, *actors], paths, options.voxel_m, int(measured))
     surfels = [surfels_from_points(p.points, e, semantic=p.semantic) for p, e in sampled]
     bodies = [Body(*pair) for pair in zip(surfels, [None, *tracks], strict=True)]
     sky = SkyGatherer(options.sky_size, math.radians(drive.lidar_top_deg))
@@ -116,7 +118,14 @@ def build_lidar_scene(
     if added is not None:
         parts[0] = join_gaussians([parts[0], added])
     elif any(map(len, parts)):
-        parts = close_parts(parts, tracks, _still_boxes(drive), views, sampled[0][0])
+        parts = close_parts(
+            parts,
+            tracks,
+            _still_boxes(drive),
+            views,
+            sampled[0][0],
+            max_gaussians=options.max_gaussians,
+        )
     if not any(map(len, parts)):
         raise AdapterError(
             f"{drive.source}: none of the points that were measured is in any image; check that "
@@ -186,10 +195,11 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
 
 
 def _sample_all(
-    things: Sequence[PointSet], paths: Sequence[np.ndarray], options: DriveOptions
+    things: Sequence[PointSet], paths: Sequence[np.ndarray], finest_m: float, most: int
 ) -> list[tuple[PointSet, np.ndarray]]:
-    """Every thing thinned and its gaps filled with one voxel size, the smallest that respects
-    max_gaussians. things: the world first. paths: the driven path in each one's frame."""
+    """Every thing thinned and its gaps filled with one voxel size, the smallest from finest_m on
+    that gives so many points at most. things: the world first. paths: the driven path in each
+    one's frame."""
 
     def sample(voxel_m: float) -> tuple[list[tuple[PointSet, np.ndarray]], int]:
         sampled = [
@@ -201,14 +211,14 @@ def _sample_all(
         return sampled, count
 
     # A coarse trial tells what the fine one needs: on surfaces the count goes with the square.
-    _, trial = sample(_TRIAL * options.voxel_m)
-    needed = 1.01 * _TRIAL * (trial / options.max_gaussians) ** 0.5
-    voxel_m = options.voxel_m * max(1.0, needed)
+    _, trial = sample(_TRIAL * finest_m)
+    needed = 1.01 * _TRIAL * (trial / most) ** 0.5
+    voxel_m = finest_m * max(1.0, needed)
     while True:
         sampled, count = sample(voxel_m)
-        if count <= options.max_gaussians:
+        if count <= most:
             return sampled
-        voxel_m *= max(1.02, (count / options.max_gaussians) ** 0.55)
+        voxel_m *= max(1.02, (count / most) ** 0.55)
 
 
 def _sample(
