@@ -29,12 +29,12 @@ import torch
 from scipy.spatial import cKDTree
 
 from adapters.lidar_scene.image_views import View, read_image
-from adapters.lidar_scene.split import ObjectTrack, PointSet
+from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels, ground_points
 from adapters.raw_drive import BoxSample
 from adapters.world import join_gaussians
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, SPLAT_IDS
+from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass, class_of_label
@@ -263,8 +263,8 @@ def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Came
         PosedGaussians(parts[n], torch.from_numpy(pose) if n else None, instance_id=n)
         for n, pose in posed.items()
     ]
-    raster = rasterize(drawn, camera, buffers=(ALPHA, EXPECTED_DEPTH, SPLAT_IDS))
-    assert raster.alpha is not None and raster.expected_depth is not None
+    raster = rasterize(drawn, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+    assert raster.alpha is not None and raster.median_depth is not None
     assert raster.splat_ids is not None
     ids = raster.splat_ids.numpy().clip(0)
     # One more than there are: of an image in which nothing stands.
@@ -272,7 +272,7 @@ def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Came
     classes = [parts[n].semantic.numpy() for n in posed if len(parts[n])]
     semantic = np.concatenate([*classes, np.zeros(1, np.int16)])
     return _Drawn(
-        camera, raster.alpha.numpy(), raster.expected_depth.numpy(), part[ids], semantic[ids]
+        camera, raster.alpha.numpy(), raster.median_depth.numpy(), part[ids], semantic[ids]
     )
 
 
@@ -355,6 +355,8 @@ def _discs(
         part[window][inside], there[window][inside] = box.part, depth[inside]
         semantic[window][inside], on_ground[window][inside] = box.semantic, False
         close[window] |= inside
+        if box.part:  # beside a silhouette, what is behind may count as the object's
+            close &= (part != box.part) | box.holds(centre + there[..., None] * rays)
     depth = np.clip(there[close], 0.2, _FURTHEST_M)
     points = centre + depth[:, None] * rays[close]
     colours = image[close].astype(np.float32) / 255
@@ -388,6 +390,11 @@ class _Box(NamedTuple):
     world_from_box: np.ndarray
     size_m: np.ndarray
     semantic: SemanticClass
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [..., 3] lie in it or within a skin's breadth, bool [...]."""
+        local = (points - self.world_from_box[:3, 3]) @ self.world_from_box[:3, :3]
+        return (np.abs(local) <= self.size_m / 2 + SKIN_M).all(axis=-1)
 
     def window(self, camera: Camera) -> tuple[slice, slice] | None:
         """Rows and columns of the image that may show it; None where none does."""
