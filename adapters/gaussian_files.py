@@ -341,6 +341,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
         ground_z_m=ground_z_m,
         has_metric_scale=world.is_metric,
         has_known_gravity=world.knows_up,
+        seen_frames=None if views else (),
         problems=(*problems, *world.problems, *about_frames),
     )
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render.buffers import EXPECTED_DEPTH, RenderOutput
+from augment.render.composite import add_elevation
 from augment.render.constants import RasterSettings
 from augment.render.fog import Fog, fog_raster
 from augment.render.layout import HeightClip
@@ -46,17 +47,22 @@ class LayerRenderer:
     ) -> RenderOutput:
         """The layer's buffers, without sky; its colours are seen through the fog."""
         later = self.fog if self.fog_on_buffers else None
+        tilted = self.fog if self.fog is not None and self.fog.overcast > 0 else None
         raster = rasterize(
             self.parts,
             camera,
-            buffers=buffers if later is None else buffers | {EXPECTED_DEPTH},
+            buffers=buffers | {EXPECTED_DEPTH} if later or tilted else buffers,
             settings=self.settings,
             fog=None if self.fog_on_buffers else self.fog,
             clip=clip,
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
-        if later is None:
-            return raster
-        with timed("smog on buffers"):
-            return replace(raster, rgb=fog_raster(raster, camera, later))
+        if later is not None:
+            with timed("smog on buffers"):
+                raster = replace(raster, rgb=fog_raster(raster, camera, later))
+        if tilted is not None:
+            with timed("airlight by elevation"):
+                rgb = add_elevation(raster, camera, tilted, backend=self.backend)
+                raster = replace(raster, rgb=rgb)
+        return raster

@@ -166,6 +166,7 @@ def _all_steps(
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
         Step("semantic image", output.semantic, _asked("semantic", recipe)),
         Step("instance image", output.instance, _asked("instance", recipe)),
+        Step("trust mask", output.trust, _asked("trust", recipe)),
     )
 
 

@@ -423,6 +423,8 @@ class Scene:
     recorded_source: the URI of the recording that a fitted scene was made from, for its labels;
     None where `source` itself is the recording. made_by: how the Gaussians came about, facts for
     people and reports in JSON's own types.
+    seen_frames: those that the scene was made from where `frames` are others (a camera path's,
+    invented ones); empty where they are not known.
     """
 
     name: str
@@ -442,6 +444,7 @@ class Scene:
     ground: Ground | None = None
     has_known_gravity: bool = True
     image_color_maps: Mapping[tuple[str, int], Float[Tensor, "3 4"]] = field(default_factory=dict)
+    seen_frames: tuple[Frame, ...] | None = None
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():
@@ -532,6 +535,12 @@ class Scene:
         identity = torch.eye(3, 4)
         changing = {name for name, color_map in maps if not torch.equal(color_map, identity)}
         return tuple(name for name in self.camera_names if name in changing)
+
+    @cached_property
+    def common_color_map(self) -> Float[Tensor, "3 4"] | None:
+        """Mean of all colour maps, float64; None where none changes anything."""
+        maps = [*self.color_maps.values(), *self.image_color_maps.values()]
+        return torch.stack(maps).double().mean(0) if self.mapped_cameras else None
 
     def boxes(self, frame_index: int) -> Boxes:
         return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)

@@ -14,6 +14,7 @@ from augment import effects
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
+from augment.jobs.layout import TRUST
 from augment.jobs.processes import choose_backend
 from augment.plan import BARE, Plan, ViewPlan, make_plan, plan_view
 from augment.render.buffers import AUTO, EXPECTED_DEPTH, RenderOutput
@@ -21,6 +22,7 @@ from augment.render.composite import composite_sky, map_colors
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.timing import timed
+from augment.trust import trust_mask
 from augment.view_images import SURFACE_ALPHA, ViewImages, begin_images
 from recipes.schema import Recipe
 
@@ -46,7 +48,11 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     images = begin_images(buffers, plan)
     camera = buffers.camera  # and not the buffers, which the images may long outlive
-    return PendingView(lambda: _weathered(images(), camera, plan, recipe))
+    trust = dict[str, np.ndarray]()
+    if recipe.output.trust:
+        with timed("trust mask"):
+            trust[TRUST] = trust_mask(scene, camera, backend=backend).astype(np.uint8) * 255
+    return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust))
 
 
 def render_buffers(
@@ -138,9 +144,11 @@ def _bare(
     return BareBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
 
 
-def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -> WeatheredView:
+def _weathered(
+    images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe, trust: Mapping[str, np.ndarray]
+) -> WeatheredView:
     """The images with what labels are measured from."""
-    masks, views = dict[str, np.ndarray](), dict[str, EffectView]()
+    masks, views = dict(trust), dict[str, EffectView]()
     for effect in effects.EFFECTS:
         if effect.of(recipe) is None:
             continue
@@ -234,8 +242,8 @@ class WeatheredView:
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene
     (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], 255 where an
-    effect is what the pixel shows, by name, and effects: what its labels are measured from; of all
-    effects that the recipe has. surface: None where nobody asks for boxes.
+    effect is what the pixel shows, by name, and of TRUST. effects: what their labels are measured
+    from; of all effects that the recipe has. surface: None where nobody asks for boxes.
     """
 
     camera: Camera

@@ -29,6 +29,13 @@ def _in_full(key: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
 
 
+ALL = ("all",)
+
+
+def _all_by_word(value: Any) -> Any:
+    return ALL if value == "all" else value
+
+
 class JobScene(Closed):
     """A scene of the job, or with `*` in its path all that match."""
 
@@ -38,8 +45,11 @@ class JobScene(Closed):
     """Its folder in the output, where the scene's own will not do."""
     frames: Text = "all"
     """Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene."""
-    cameras: tuple[Text, ...] | None = Field(default=None, min_length=1)
-    """Names of cameras; null for all."""
+    cameras: Annotated[tuple[Text, ...] | None, BeforeValidator(_all_by_word)] = Field(
+        default=None, min_length=1
+    )
+    """Names of cameras; null for all, but of a fitted scene those that it was fitted to; `all` for
+    all of them."""
     recipes: tuple[Text, ...] | None = Field(default=None, min_length=1)
     """Names of the job's recipes; null for all."""
 

@@ -183,9 +183,10 @@ class Render(Section):
     """Opacity compensated for the screen blur."""
     sh_degree: Whole | None = Field(default=None, ge=0, le=3)
     """Highest spherical-harmonics band; null for all."""
-    exposure: Literal["recorded", "neutral"] = "recorded"
-    """recorded gives each camera's picture the colours of its recording, where the scene knows
-    them; neutral leaves the scene's own."""
+    exposure: Literal["common", "recorded", "neutral"] = "common"
+    """recorded gives each camera's picture the colours of its recording, fog included, where the
+    scene knows them; common gives fog one colour in all cameras, by the mean of their exposures;
+    neutral leaves the scene's own colours."""
     transmittance_stop: Number = Field(default=1e-4, ge=1e-6, le=0.25)
     """A pixel is finished once no more than this share of the light behind shines through; what it
     shows by then stands for the rest. 1e-6 blends what no picture in 8 bits shows; 0.5 would leave
@@ -198,7 +199,7 @@ class Render(Section):
 class Output(Section):
     """What is written for each image."""
 
-    later_fields = ("surface",)
+    later_fields = ("surface", "trust")
     knobs = (
         Knob("depth", ("none", "expected", "median", "mode"), "depth estimator", 11, False),
         Knob(
@@ -232,6 +233,8 @@ class Output(Section):
     a flood and surface is not scene, else true."""
     labels: Flag = True
     """Pass 3D boxes through."""
+    trust: Flag = False
+    """Write which pixels can be believed: those that the scene's images saw from near enough."""
 
 
 class Recipe(Closed):

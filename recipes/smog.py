@@ -14,10 +14,11 @@ MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
 
 class Smog(EffectModel):
-    """Fog, haze or smog: Beer-Lambert extinction towards one airlight colour."""
+    """Fog, haze or smog: Beer-Lambert extinction towards an airlight colour."""
 
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
+    later_fields = ("overcast",)
     meant_by = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
@@ -47,13 +48,17 @@ class Smog(EffectModel):
     extinction_per_m: Number | None = Field(default=None, ge=0, le=MAX_EXTINCTION_PER_M)
     """Extinction coefficient at the base height."""
     color: Colour = (0.76, 0.78, 0.80)
-    """Airlight colour: red, green, blue, display-encoded sRGB."""
+    """Airlight colour, at the horizon: red, green, blue, display-encoded sRGB."""
     scale_height_m: Number | None = Field(default=None, ge=0.1, le=1e5)
     """Height over which the density falls by e; null for uniform smog."""
     base_height_m: Number = Field(default=0.0, ge=-1e4, le=1e4)
     """Height above the road where the density is the one given; of no effect on uniform smog."""
     model: Literal["per_gaussian", "deferred"] = "per_gaussian"
     """per_gaussian fogs every splat before blending; deferred fogs the finished buffers."""
+    overcast: Number = Field(default=0.0, ge=0, le=1)
+    """How much brighter airlight is above the horizon, and darker towards the road: 0 is one colour
+    in all directions, 0.5 what light scattered in thick fog over asphalt comes to, 1 an overcast
+    sky, whose zenith has three times the horizon's luminance."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:

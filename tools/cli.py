@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field, model_validator
 from tyro.conf import Positional, arg
 
 from tools.options import (
+    FITTED,
     Command,
     FitOptions,
     Overrides,
@@ -66,7 +67,8 @@ class RenderOptions(RecipeCommand):
             others (docs/scenes.md), or a bare path, which is recognised by what it holds.
         out: The output folder. Further recipes and scenes may go into the same one.
         frames: Frame numbers: all, 4, 0,5,9, or 0:20:2 (start:stop:step, stop excluded).
-        cameras: Camera names separated by commas, or all.
+        cameras: Camera names separated by commas, or all. fitted: all, but of a fitted scene those
+            that it was fitted to.
         scale: Resolution relative to the recipe's.
         variants: How many draws from each recipe's ranges. The recipe's own number by default.
         workers: Processes. The bits do not depend on it. One is best where a GPU draws.
@@ -88,7 +90,7 @@ class RenderOptions(RecipeCommand):
     scene: str
     out: Annotated[Path, _local("`climategs generate` writes to object stores")]
     frames: Annotated[str, AfterValidator(_check_frames)] = "all"
-    cameras: str = "all"
+    cameras: str = FITTED
     scale: Annotated[float, Field(gt=0)] = 1.0
     variants: Count | None = None
     workers: Count = 1

@@ -25,6 +25,7 @@ from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.timing import stopwatch
+from augment.trust import judge_scene
 from augment.views import render_view
 from recipes.fields import replaced
 from recipes.load import load_recipe
@@ -38,7 +39,9 @@ VIEWS = 3
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
-    """Counts, bounds, memory, what is known and what is not, and the problems found."""
+    """Counts, bounds, memory, what is known and what is not, the problems found, and what of a few
+    small views of it is not fit for weather.
+    """
     actors = [
         {
             "track_id": a.track_id,
@@ -73,6 +76,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "image_color_maps": dict(Counter(name for name, _ in scene.image_color_maps)),
         "made_by": dict(scene.made_by),
         "problems": list(scene.problems),
+        "trust": judge_scene(scene).as_dict(),
     }
 
 

@@ -26,6 +26,7 @@ from augment.files.scene_file import is_scene_folder, save_scene
 from augment.reconstruct.trainer import StepRecord, Trainer
 from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
+from augment.trust import judge_scene
 from tools.fit_report import evaluate_views, mean_scores, truth_facts, truth_line, write_report
 from tools.options import FitOptions, parse_depth, resolved_uri
 from tools.output import check_scene_out, path_beside, print_note
@@ -273,9 +274,12 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
     print_note(f"writing {options.out} and evaluating all views")
     plan, step = training.plan, training.trainer.step
     made_by = {"command": "fit", "step": step, "steps": plan.steps}
-    made_by |= {"settings": plan.settings, "data": plan.data}
+    made_by |= {"settings": plan.settings, "data": plan.data, "fitted": _fitted(run)}
     scene = dataclasses.replace(training.trainer.scene(), made_by=made_by)
     save_scene(scene, options.out.absolute())
+    trust = judge_scene(scene, scale=options.scale)
+    for problem in trust.problems:
+        print_note(f"not fit for weather: {problem}")
     facts: dict[str, Any] = {
         "scene": options.scene,
         "complete": complete,
@@ -287,6 +291,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "settings": plan.settings,
         "problems": run.problems(),
         "checks": run.checks,
+        "trust": trust.as_dict(),
     }
     source, test = run.source, run.source.test
     if not complete and len(test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
@@ -302,6 +307,14 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
     report = write_report(folder, scene, source, training.rows, facts, test=test)
     _show_end(options.out, training.folder)
     return report
+
+
+def _fitted(run: _Run) -> dict[str, Any]:
+    """What is learnt from, as augment.trust.FitRecord."""
+    views: dict[str, list[int]] = {}
+    for key in run.source.train:
+        views.setdefault(key.camera, []).append(key.frame)
+    return {"scale": run.options.scale, "views": views}
 
 
 def _report_folder(folder: Path) -> Path:

@@ -167,6 +167,9 @@ class FitOptions(FitConfig, SceneCommand):
         }
 
 
+FITTED = "fitted"  # cameras that a scene was made from
+
+
 def names_in(text: str) -> tuple[str, ...] | None:
     """Of names separated by commas; None for all."""
     return None if text == "all" else tuple(text.split(","))

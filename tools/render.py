@@ -41,6 +41,7 @@ from augment.render.buffers import CPU, CUDA
 from augment.render.cuda.runtime import is_interpreted
 from augment.scene import Gaussians, Ground, Scene
 from augment.sky import CubemapSky
+from augment.trust import judge_scene, left_out_sentence, unfitted_cameras
 from augment.views import render_view
 from recipes.fields import found
 from recipes.job import load_job, load_job_recipes, scaled_recipe
@@ -48,7 +49,7 @@ from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video
 from tools.export import mirror_outputs, recipes_for_source
-from tools.options import names_in
+from tools.options import FITTED, names_in
 from tools.output import compiling_noted, fill, print_images, print_note
 
 if TYPE_CHECKING:
@@ -327,6 +328,11 @@ def render_recipes(options: RenderOptions) -> int:
     for resolved in recipes:
         make_plan(resolved, scene)  # refuse once, not for every image
     chosen = parse_frames(options.frames).select([frame.index for frame in scene.frames])
+    cameras = _cameras(options, scene, path)
+    frames = [f for f in path or scene.frames if chosen is None or f.index in chosen]
+    scale = max(resolved.render.scale for resolved in recipes)
+    for problem in judge_scene(scene, frames, cameras, scale=scale, count=1).problems:
+        print_note(f"note: not fit for weather: {problem}")
     notes = lidar_notes(recipes)
     labelled = SceneIndex.of(scene, path).labelled
     asked = labelled if chosen is None else labelled.intersection(chosen)
@@ -338,7 +344,7 @@ def render_recipes(options: RenderOptions) -> int:
         recipes=recipes,
         out_dir=out,
         frames=chosen,
-        cameras=names_in(options.cameras),
+        cameras=cameras,
         camera_path=path,
         workers=options.workers,
         backend=backend,
@@ -360,6 +366,19 @@ def render_recipes(options: RenderOptions) -> int:
     if options.sheet and result.written + result.skipped:
         print(f"pictures: {draw_sheet(out)}")
     return 1 if result.failed else 0
+
+
+def _cameras(
+    options: RenderOptions, scene: Scene, path: Sequence[Frame] | None
+) -> Sequence[str] | None:
+    """Names, or None for all; a note says which are left out."""
+    if options.cameras != FITTED:
+        return names_in(options.cameras)
+    left_out = () if path is not None else unfitted_cameras(scene)
+    if not left_out:
+        return None
+    print_note(f"note: {left_out_sentence(left_out, '--cameras all')}")
+    return [name for name in scene.camera_names if name not in left_out]
 
 
 def resolve_recipes(

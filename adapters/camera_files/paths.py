@@ -572,6 +572,7 @@ def with_camera_path(scene: Scene, path: str | Path) -> Scene:
     return dataclasses.replace(
         scene,
         frames=frames,
+        seen_frames=scene.frames if scene.seen_frames is None else scene.seen_frames,
         labels=None,
         source=add_to_uri(scene.source, CAMERA_PATH_KEY, str(path)),
         problems=(*(p for p in scene.problems if not p.startswith(NO_CAMERAS)), *problems),

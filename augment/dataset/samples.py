@@ -8,6 +8,7 @@ A sample is a dictionary:
     instance          int32 [H, W], 0 = none, else the object's number: `boxes` has them; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
     snow              bool [H, W], where the pixel shows snow; None where there is no snow
+    trust             bool [H, W], where the picture can be believed; None where nobody asked
     boxes             all boxes of the frame, see `box_tensors`; None where there are none
     lidar             the frame's sweep, see `lidar_tensors`; None where there is none
     camera            name, width, height, timestamp_ns, K float64 [3, 3] in pixels of the image,
@@ -61,12 +62,12 @@ _BUFFERS = {
     "semantic": Buffer(np.uint8, torch.from_numpy),
     "instance": Buffer(np.uint16, lambda ids: torch.from_numpy(ids.astype(np.int32))),
 }
-# Only such weather has it. uint8, 0 or 255.
+# Only such weather has it, or who asked for it. uint8, 0 or 255.
 _MASK = Buffer(np.uint8, lambda mask: torch.from_numpy(mask == 255), in_all=False)
 
 
 def buffers() -> dict[str, Buffer]:
-    """By name: depth, semantic, instance, and the effects' masks."""
+    """By name: depth, semantic, instance, and the masks."""
     return _BUFFERS | dict.fromkeys(mask_names(), _MASK)
 
 

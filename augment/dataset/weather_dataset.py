@@ -389,7 +389,7 @@ class WeatherDataset(Dataset):
     `pyarrow.compute.field("smog_extinction_per_m") > 0.02`. scenes, variants, cameras, frames: what
     to keep, None for all. image_type: `float32` in [0, 1] or `uint8`. verify: compare every image
     with its checksum, about 1 ms a megabyte. load: what to read, of image, depth, semantic,
-    instance, water, snow, boxes and lidar; all but lidar by default, and what is not read is None.
+    instance, water, snow, trust, boxes and lidar; all but lidar by default, others are None.
     box_frame: whose axes boxes and LiDAR points are in: `world`, the dataset's own, unchanged to
     the bit; `ego`, x forward, y left, z up; or `camera` (OpenCV), x right, y down, z forward.
     transform: called with every sample; what it returns is the sample.
@@ -433,7 +433,7 @@ class WeatherDataset(Dataset):
         _check_all_have(self.rows, self.options.load, self.uris)
 
     def given(self) -> frozenset[str]:
-        """What of `load` the samples have, the masks of water and snow left out."""
+        """What of `load` the samples have, the masks left out."""
         load = self.options.load.difference(mask_names())
         return frozenset(k for k in load if k == "image" or self.rows.has(k).any())
 

@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+import torch
+from jaxtyping import Float, Float32, Float64, Int64
+from torch import Tensor
 
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
@@ -31,15 +33,20 @@ from recipes.smog import KOSCHMIEDER
 
 # ---- The effect ----------------------------------------------------------------------------------
 
-PER_GAUSSIAN, ON_BUFFERS, SKY = "smog per Gaussian", "smog on buffers", "sky"
+PER_GAUSSIAN, ON_BUFFERS = "smog per Gaussian", "smog on buffers"
+ELEVATION, SKY = "airlight by elevation", "sky"
+DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is inverted
 
 
 @dataclass(frozen=True)
 class PlacedSmog:
-    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat."""
+    """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat.
+    is_common: whether the mean of the cameras' exposures gives its colour in all of them.
+    """
 
     fog: Fog
     on_buffers: bool
+    is_common: bool = False
 
 
 class SmogEffect(Effect):
@@ -62,7 +69,10 @@ class SmogEffect(Effect):
         smog = self.of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
-            return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS), reason))
+            return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason))
+        is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
+        if is_common:
+            reason += "; one airlight for all cameras, by the mean of their exposures"
         on_buffers = smog.model == "deferred"
         other = "weather.smog.model chooses the other way"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
@@ -71,13 +81,17 @@ class SmogEffect(Effect):
         steps = (
             Step(PER_GAUSSIAN, not on_buffers, other if on_buffers else reason),
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
+            Step(ELEVATION, fog.overcast > 0, f"weather.smog.overcast is {fog.overcast:g}"),
             sky,
         )
-        buffers = frozenset({EXPECTED_DEPTH}) if on_buffers else frozenset()
-        return Placed(PlacedSmog(fog, on_buffers), steps, buffers)
+        buffers = {EXPECTED_DEPTH} if on_buffers or fog.overcast > 0 else set[str]()
+        return Placed(PlacedSmog(fog, on_buffers, is_common), steps, frozenset(buffers))
 
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
-        return replace(layers, fog=own.data.fog, fog_on_buffers=own.data.on_buffers)
+        fog, common = own.data.fog, own.scene.common_color_map
+        if own.data.is_common and common is not None:
+            fog = before_map(fog, own.scene.color_map(camera), common)
+        return replace(layers, fog=fog, fog_on_buffers=own.data.on_buffers)
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView
@@ -110,7 +124,28 @@ def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:
         reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
     if not scene.has_metric_scale:
         reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
-    return Fog(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
+    fog = Fog(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m, smog.overcast)
+    return fog, reason
+
+
+def before_map(
+    fog: Fog, color_map: Float[Tensor, "3 4"] | None, common: Float[Tensor, "3 4"]
+) -> Fog:
+    """The fog that a camera's colour map M gives the airlight that the common map C gives `fog`.
+
+    Maps are affine, so M(t c + (1 - t) a) = t M(c) + (1 - t) M(a): a = M^-1 C(A) leaves surfaces
+    the exposure of their camera. The inverse is damped, a = A + (M'M + d)^-1 M' (C - M)(A), and
+    no gain of it exceeds 1 / (2 sqrt d) = 50: airlight keeps its own colour where a camera records
+    next to nothing of it, and its bits where M is C. color_map: None for the identity.
+    """
+    own = torch.eye(3, 4, dtype=torch.float64) if color_map is None else color_map.double()
+    left, gains, right = torch.linalg.svd(own[:, :3])
+    damped = (gains / (gains**2 + DAMPING))[:, None]
+    change = right.T @ (damped * (left.T @ (common - own)))  # [3, 4]
+    airlight = torch.tensor(fog.rgb, dtype=torch.float64)
+    varying = airlight + change[:, :3] @ airlight
+    rgb = varying + change[:, 3]
+    return replace(fog, rgb=tuple(rgb.tolist()), varying_rgb=tuple(varying.tolist()))
 
 
 # ---- On labelled boxes ---------------------------------------------------------------------------

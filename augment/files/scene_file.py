@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal, NamedTuple, TypeVar
@@ -418,6 +418,14 @@ class SceneDocument(_Closed):
     problems: list[Text]
     actors: list[ActorEntry]
     frames: list[FrameEntry]
+    seen_frames: list[FrameEntry] | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_usual(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+        document = serialize(self)
+        if self.seen_frames is None:  # so that older versions still read it
+            del document["seen_frames"]
+        return document
 
 
 def read_document(path: Path) -> SceneDocument:
@@ -480,7 +488,7 @@ def _no_constant(name: str) -> float:
 
 # ---- scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
 
-_LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item
+_LISTS = ("actors", "frames", "seen_frames", "problems", "image_color_maps")  # with a line an item
 
 
 def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
@@ -519,16 +527,22 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
         "made_by": made_by,
         "problems": list(scene.problems),
         "actors": list(scene.actors),
-        "frames": [
-            replace(
-                frame,
-                cameras=dict(frame.cameras),
-                image_paths={n: os.path.abspath(path) for n, path in frame.image_paths.items()},
-            )
-            for frame in scene.frames
-        ],
+        "frames": _stored_frames(scene.frames),
+        "seen_frames": None if scene.seen_frames is None else _stored_frames(scene.seen_frames),
     }
     return checked(SceneDocument, content, f"scene {scene.name!r}").model_dump()
+
+
+def _stored_frames(frames: Sequence[Frame]) -> list[Frame]:
+    """With what may be any mapping as dictionaries, and absolute paths."""
+    return [
+        replace(
+            frame,
+            cameras=dict(frame.cameras),
+            image_paths={n: os.path.abspath(path) for n, path in frame.image_paths.items()},
+        )
+        for frame in frames
+    ]
 
 
 def document_text(document: dict[str, Any]) -> str:
@@ -556,6 +570,8 @@ def scene_of(
             _actor(entry, part) for entry, part in zip(document.actors, parts[1:], strict=True)
         )
         frames = tuple(_frame(entry) for entry in document.frames)
+        seen = document.seen_frames
+        seen_frames = None if seen is None else tuple(_frame(entry) for entry in seen)
         repeated = len(frames) - len({frame.index for frame in frames})
         if repeated:
             raise ValueError(f"{repeated} frame numbers are given twice")
@@ -574,6 +590,7 @@ def scene_of(
             actors=actors,
             sky=sky,
             frames=frames,
+            seen_frames=seen_frames,
             world_origin_m=np.array(document.world_origin_m, np.float64),
             ground=None if document.ground is None else Ground(**document.ground.model_dump()),
             problems=tuple(document.problems),

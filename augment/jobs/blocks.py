@@ -27,7 +27,8 @@ from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, reading_bac
 from augment.jobs.manifest import OK, Identity, Part, Pictured, list_parts, read_manifest
 from augment.jobs.store import Store
 from augment.scene import Scene
-from recipes.job import JobRecipes, JobScene
+from augment.trust import judge_scene, seen_views, unfitted_cameras
+from recipes.job import ALL, JobRecipes, JobScene
 from recipes.schema import Recipe, parse_frames
 
 # ---- What a job knows of a scene without keeping it open, and the blocks of images it is cut into
@@ -45,7 +46,9 @@ class FrameRecord:
 @dataclass(frozen=True)
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
-    has_lidar: whether there is any. open_s: how long opening it took.
+    has_lidar: whether there is any. open_s: how long opening it took. unfitted: cameras that it was
+    never fitted to. learnt_scale: of the images that it was made from over the cameras. problems:
+    what is not fit for weather, as of augment.trust.SceneTrust.
     """
 
     uri: str
@@ -54,6 +57,9 @@ class SceneRecord:
     has_lidar: bool
     open_s: float
     frames: tuple[FrameRecord, ...]
+    unfitted: tuple[str, ...] = ()
+    learnt_scale: float | None = None
+    problems: tuple[str, ...] = ()
 
     @staticmethod
     def of(scene: Scene, uri: str, open_s: float) -> SceneRecord:
@@ -67,7 +73,14 @@ class SceneRecord:
             for frame in sorted(scene.frames, key=lambda frame: frame.index)
         ]
         lidar = has_lidar(scene, [frame.number for frame in frames])
-        return SceneRecord(uri, scene.name, scene.source, lidar, open_s, tuple(frames))
+        unfitted = unfitted_cameras(scene)
+        cameras = [name for name in scene.camera_names if name not in unfitted]
+        return SceneRecord(
+            *(uri, scene.name, scene.source, lidar, open_s, tuple(frames)),
+            unfitted=unfitted,
+            learnt_scale=seen_views(scene).scale,
+            problems=judge_scene(scene, cameras=cameras, scale=None, count=1).problems,
+        )
 
     def to_json(self) -> bytes:
         return _RECORD.dump_json(self)
@@ -144,10 +157,15 @@ def cut_into_blocks(
     backend: str = "auto",
 ) -> list[Block]:
     """The scene's blocks, variant by variant, in the order of the frames. frames: as
-    `recipes.schema` reads them; ranges end with the scene. block_images: about how many images one
+    `recipes.schema` reads them; ranges end with the scene. cameras: names; None for all but those
+    that were never fitted, and `all` for these too. block_images: about how many images one
     has. Blocks begin at fixed frames, so that most stay the same when the selection grows.
     """
     known = {name for frame in record.frames for name in frame.cameras}
+    if cameras is None:
+        cameras = tuple(sorted(known - set(record.unfitted))) if record.unfitted else None
+    elif tuple(cameras) == ALL:
+        cameras = None
     if cameras is not None and (unknown := sorted(set(cameras) - known)):
         raise SceneError(
             f"scene {record.name!r} has no camera {', '.join(unknown)}; it has "

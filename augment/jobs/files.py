@@ -36,6 +36,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.box_tables import BOXES_2D, MODAL_SIDES, SIDES, BoxNumbers, BoxTable, BoxWeather
+from augment.jobs.layout import TRUST
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
 from augment.labels import Boxes, LabelSource
@@ -482,13 +483,14 @@ def _require(array: np.ndarray, dtype: type, ndim: int, name: str) -> None:
 @dataclass(frozen=True)
 class Written:
     """checksum: SHA-256 of the image file, hexadecimal. files: relative to the output folder.
-    Times in seconds.
+    trusted_fraction: of its pixels, None where nobody asked. Times in seconds.
     """
 
     checksum: str
     files: tuple[str, ...]
     encode_s: float
     write_s: float
+    trusted_fraction: float | None = None
 
 
 def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
@@ -504,6 +506,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
             f"are measured from, for a recipe with {_listed(sorted(expected)) or 'no effect'}"
         )
     output, masks = recipe.output, {e.mask for e in effects.EFFECTS if e.name in expected}
+    masks |= {TRUST} if output.trust else set()
     requested = {
         "rgb": True,
         "depth_m": output.depth != "none",
@@ -553,7 +556,10 @@ def write_view(
     encoded = time.perf_counter()
     for relative, data in files.items():
         write_atomic(out_dir / relative, data, clear=False)
-    return Written(checksum, tuple(files), encoded - started, time.perf_counter() - encoded)
+    write_s = time.perf_counter() - encoded
+    trust = view.masks.get(TRUST)
+    trusted = None if trust is None else float((trust == 255).mean())
+    return Written(checksum, tuple(files), encoded - started, write_s, trusted)
 
 
 class WritePump:

@@ -61,6 +61,7 @@ from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
+from augment.trust import left_out_sentence, magnified_sentence
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe
 
@@ -406,6 +407,7 @@ SCENES = f"{STATE_FOLDER}/scenes"
 EXECUTORS = ("serial", "processes", "ray")
 _COMPACT_S = 60.0
 _CLAIM_S = 30.0
+_MAX_NOTES = 20
 
 
 @dataclass(frozen=True)
@@ -585,8 +587,12 @@ class _Generation:
         if pending:
             records = self._plan.records
             with_lidar = [block for block in pending if records[block.scene].has_lidar]
-            for note in lidar_notes({b.variant: b.recipe for b in with_lidar}.values()):
+            notes = lidar_notes({b.variant: b.recipe for b in with_lidar}.values())
+            notes += _trust_notes(pending, records)
+            for note in notes[:_MAX_NOTES]:
                 _log.warning("note: %s", note)
+            if more := notes[_MAX_NOTES:]:
+                _log.warning("note: and %d more; `climategs inspect` says them", len(more))
             self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
         skipped, started = work.tally.skipped, time.perf_counter()
         self._bar = tqdm(total=total, initial=skipped, unit="image", disable=not self._progress)
@@ -649,6 +655,21 @@ class _Generation:
             time.sleep(0.2)
         self._merged_at = time.monotonic()
         self._merge_s = self._merged_at - started
+
+
+def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) -> list[str]:
+    """What of the scenes to be rendered is left out, or not fit for weather."""
+    notes = []
+    for name in dict.fromkeys(block.scene for block in blocks):
+        record, own = records[name], [block for block in blocks if block.scene == name]
+        cameras = {camera for block in own for camera in block.cameras}
+        if left_out := [camera for camera in record.unfitted if camera not in cameras]:
+            notes.append(f"{name}: {left_out_sentence(left_out, '`cameras: all` in the job')}")
+        notes += [f"{name}: {text}" for text in record.problems]
+        scale = max(block.recipe.render.scale for block in own)
+        if sentence := magnified_sentence(record.learnt_scale, scale):
+            notes.append(f"{name}: {sentence}")
+    return notes
 
 
 def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool) -> Plan:

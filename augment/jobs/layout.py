@@ -47,6 +47,7 @@ def variant_name(recipe: Recipe) -> str:
 # Kinds of files whose paths a row of the manifest has, but for those of effects.
 _IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
 _LAST = "calibration"
+TRUST = "trust"  # the mask of what of a picture can be believed, see augment.trust
 
 
 def path_kinds() -> tuple[str, ...]:
@@ -56,8 +57,8 @@ def path_kinds() -> tuple[str, ...]:
 
 
 def mask_names() -> tuple[str, ...]:
-    """Of the mask images that effects have."""
-    return tuple(e.mask for e in reversed(effects.EFFECTS) if e.mask)
+    """Of the mask images: of effects, and of what can be believed."""
+    return (*(e.mask for e in reversed(effects.EFFECTS) if e.mask), TRUST)
 
 
 def path_columns(paths: Mapping[str, str | None]) -> dict[str, str | None]:
@@ -89,6 +90,7 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
     output, base = recipe.output, variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
     masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
+    masks |= {TRUST} if output.trust else set()
     used = {
         "image": f"{base}/images/{stem}.{output.image}",
         **{mask: f"{base}/{mask}/{stem}.png" for mask in masks},

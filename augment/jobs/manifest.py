@@ -61,7 +61,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
         **{"width": whole, "height": whole},
         **dict.fromkeys(("surface", "lidar", "lidar_note", *words, "quality"), text),
-        **{"render_scale": pa.float64(), "settings": text},
+        **{"render_scale": pa.float64(), "settings": text, "trusted_fraction": pa.float64()},
     }
 
 
@@ -185,6 +185,9 @@ def _check_values(table: pa.Table, where: str) -> None:
         elif name == "render_scale":
             scaled = pc.and_(pc.greater(column, 0), pc.is_finite(column))
             _refuse(table, name, pc.invert(scaled), "a number above 0, or null", where)
+        elif name == "trusted_fraction":
+            shares = pc.and_(pc.greater_equal(column, 0), pc.less_equal(column, 1))
+            _refuse(table, name, pc.invert(shares), "0 to 1, or null", where)
         elif pa.types.is_floating(column.type):
             _refuse(table, name, pc.is_inf(column), "a finite number, or NaN", where)
         elif name == "status":
@@ -535,6 +538,7 @@ def image_row(
     checksum: str = "",
     lidar: str | None = None,
     lidar_note: str | None = None,
+    trusted_fraction: float | None = None,
 ) -> dict[str, Any]:
     """The row by columns. paths: by column; a failed image has none, whatever they say."""
     return {
@@ -545,6 +549,7 @@ def image_row(
         **shown_words(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
+        "trusted_fraction": trusted_fraction,
         "seed": recipe.seed,
         "recipe": recipe.name,
         **vars(identity),

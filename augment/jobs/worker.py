@@ -209,7 +209,9 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one image. lidar, lidar_note: as of PassedLidar. box_weather: of its boxes."""
+    """What became of one image. lidar, lidar_note: as of PassedLidar. box_weather: of its boxes.
+    trusted_fraction: as of Written.
+    """
 
     variant: int
     frame: int
@@ -220,6 +222,7 @@ class Outcome:
     lidar: str | None = None
     lidar_note: str | None = None
     box_weather: BoxWeather = field(default_factory=dict)
+    trusted_fraction: float | None = None
 
 
 @dataclass(frozen=True)
@@ -392,7 +395,13 @@ class FrameRunner:
             return
         self._times.add(ENCODE, written.encode_s)
         self._times.add(WRITE, written.write_s)
-        done = replace(failed, status=OK, checksum=written.checksum, box_weather=box_weather)
+        done = replace(
+            failed,
+            status=OK,
+            checksum=written.checksum,
+            box_weather=box_weather,
+            trusted_fraction=written.trusted_fraction,
+        )
         self._pump.after(drawn.lidar, lambda: self._complete(done, drawn.lidar, written.files))
 
     def _complete(self, done: Outcome, lidar: Future, files: tuple[str, ...]) -> None:

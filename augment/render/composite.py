@@ -5,6 +5,8 @@ out = rgb + (1 - alpha) sky(direction),   sky seen through the fog that lies bef
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -12,25 +14,90 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import composite_kernels
-from augment.render.buffers import AUTO, CPU, kernels_for
-from augment.render.fog import Fog, blend_airlight, sky_optical_depth, vertical_optical_depth
+from augment.render.buffers import AUTO, CPU, RenderOutput, kernels_for
+from augment.render.fog import (
+    Fog,
+    airlight_gain,
+    blend_airlight,
+    optical_depth,
+    sky_optical_depth,
+    vertical_optical_depth,
+    ways_of_raster,
+)
 from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
+from augment.sky import (
+    ConstantSky,
+    CubemapSky,
+    Sky,
+    bordered_faces,
+    directions_of_cubemap,
+    sample_at,
+)
 
 ROWS = 32  # image rows a thread takes at a time
+NUM_GAINS = 1025  # of airlight by slope in the kernels' table, which then errs by 1e-6
+AIRLIGHT_SIZE = 64  # texels along a face of airlight by elevation, which then errs by 1e-4
 
 
 def sky_behind(sky: Sky, fog: Fog | None) -> tuple[Sky, Fog | None]:
     """What has to be evaluated per pixel: the sky and the fog before it, or less.
 
-    Uniform fog hides the sky altogether (infinite distance), so only its colour is left; fog
+    Uniform fog hides the sky altogether (infinite distance), so only its airlight is left; fog
     without density changes nothing.
     """
     if fog is None or fog.sigma_per_m == 0:
         return sky, None
     if fog.scale_height_m is None:
-        return ConstantSky(torch.tensor(fog.rgb, dtype=torch.float32)), None
+        return _airlight(fog), None
     return sky, fog
+
+
+@functools.lru_cache(maxsize=16)
+def _airlight(fog: Fog) -> Sky:
+    """The airlight of endless fog in every direction."""
+    horizon = torch.tensor(fog.rgb, dtype=torch.float32)
+    if fog.overcast == 0:
+        return ConstantSky(horizon)
+    slopes = directions_of_cubemap(AIRLIGHT_SIZE)[..., 2]
+    return CubemapSky(horizon + airlight_gain(fog, slopes))
+
+
+@functools.lru_cache(maxsize=16)
+def _gains(overcast: float) -> np.ndarray:
+    """What varying airlight is multiplied by, less 1, by slope; float32, none without overcast."""
+    slopes = torch.linspace(-1, 1, NUM_GAINS if overcast > 0 else 0)
+    return airlight_gain(Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast), slopes)[:, 0].numpy()
+
+
+def add_elevation(
+    raster: RenderOutput, camera: Camera, fog: Fog, *, backend: str = CPU
+) -> Float[Tensor, "H W 3"]:
+    """Colours in fog that were drawn with the airlight of the horizon, with that of their rays.
+
+    raster: colour, alpha and expected depth, by which the fog's share of a pixel is judged, as
+    deferred fog does; hence exact for one surface a pixel. backend: as of `map_colors`.
+    """
+    rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
+    assert rgb is not None and alpha is not None and depth is not None
+    if kernels_for(backend, rgb, alpha) != CPU or not rgb.is_contiguous():
+        tau = optical_depth(fog, *ways_of_raster(raster, camera, fog))
+        rays = camera.ray_directions(rgb.dtype, rgb.device)
+        gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
+        return rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
+    eye, per_height = 0.0, 0.0
+    if fog.scale_height_m is not None:
+        eye, per_height = float(camera.centre[2]) - fog.base_z_m, 1 / fog.scale_height_m
+    medium = fog.sigma_per_m, eye * per_height, per_height
+    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    numbers = u, v, camera.world_from_camera[2, :3].numpy(), medium, _gains(fog.overcast)
+    numbers = *numbers, fog.varying_rgb or fog.rgb
+    with kernel_threads(ROWS):
+        composite_kernels.add_elevation(
+            rgb.detach().numpy(), alpha.detach().contiguous().numpy(),
+            depth.detach().contiguous().numpy(), *(np.asarray(n, np.float32) for n in numbers),
+        )  # fmt: skip
+    return rgb
 
 
 def composite_sky(
@@ -63,7 +130,7 @@ def composite_sky(
     if fog is not None:
         slope = directions[..., 2] / directions.norm(dim=-1)
         tau = sky_optical_depth(fog, slope, float(camera.centre[2]))
-        color = blend_airlight(color, tau, fog)
+        color = blend_airlight(color, tau, fog, slope)
     return rgb + (1 - alpha)[..., None] * color
 
 
@@ -71,17 +138,17 @@ def _composite_cubemap(
     rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, fog: Fog | None
 ) -> Tensor:
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    strength, airlight = -1.0, (0.0, 0.0, 0.0)
+    strength, gains, airlight, varying = -1.0, _gains(0.0), (0.0, 0.0, 0.0), None
     if fog is not None:
         strength = vertical_optical_depth(fog, float(camera.centre[2]))
-        airlight = fog.rgb
+        gains, airlight, varying = _gains(fog.overcast), fog.rgb, fog.varying_rgb
     with kernel_threads(ROWS):
         composite_kernels.composite_cubemap(
             rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(),
             faces.contiguous().numpy(), camera.world_from_camera[:3, :3].numpy().astype(np.float32),
             np.float32(1 / camera.fx), np.float32(1 / camera.fy), np.float32(camera.cx),
-            np.float32(camera.cy), np.float32(min(strength, 1e30)),
-            np.asarray(airlight, np.float32), out,
+            np.float32(camera.cy), np.float32(min(strength, 1e30)), gains,
+            np.asarray(airlight, np.float32), np.asarray(varying or airlight, np.float32), out,
         )  # fmt: skip
     return torch.from_numpy(out)
 

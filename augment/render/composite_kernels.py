@@ -11,6 +11,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from augment.render.cpu.jit import inner, kernel
+from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import LANES, U
 from augment.render.sh import BLACK, FOLDED
 
@@ -36,12 +37,57 @@ def renormalise_alpha(alpha, rgb, overlay, least):
                     overlay[pixel] *= scale
 
 
+@inner()
+def airlight_gain(slope, gains):
+    """What varying airlight is multiplied by, less 1; gains: by slope, from -1 to 1, or empty."""
+    if gains.size == 0:
+        return np.float32(0)
+    half = np.float32((gains.size - 1) // 2)
+    place = min(max((slope + np.float32(1)) * half, np.float32(0)), half + half)
+    first = min(int(place), gains.size - 2)
+    share = place - np.float32(first)
+    return gains[first] + share * (gains[first + 1] - gains[first])
+
+
 @kernel
-def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
+def add_elevation(rgb, alpha, depth, u, v, rise, medium, gains, varying):
+    """rgb += alpha (1 - t) gain varying, in place: what elevation adds to the airlight.
+
+    depth: [H, W], z. u [W], v [H]: image coordinates at unit depth. rise [3]: world z along the
+    camera's axes. medium: extinction at its base, height of the eye above that in scale heights,
+    1 / scale height (0 of uniform fog). All float32.
+    """
+    sigma, eye, per_height = medium[0], medium[1], medium[2]
+    half, one = np.float32(0.5), np.float32(1)
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            if alpha[i, j] > 0:
+                length = math.sqrt(u[j] * u[j] + v[i] * v[i] + one)
+                climb = u[j] * rise[0] + v[i] * rise[1] + rise[2]
+                tau = sigma * depth[i, j] * length
+                if per_height > 0:
+                    up = depth[i, j] * climb * per_height
+                    x = abs(up)
+                    # Below 0.01 the difference 1 - exp(-x) would lose two digits.
+                    series = one - half * x * (one - x * np.float32(1 / 3))
+                    mean = series if x < np.float32(0.01) else (one - math.exp(-x)) / x
+                    lowest = eye + min(up, np.float32(0))
+                    tau *= math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
+                gain = airlight_gain(climb / length, gains)
+                gain *= alpha[i, j] * (one - math.exp(-tau))
+                for c in range(U(3)):
+                    rgb[i, j, c] += gain * varying[c]
+
+
+@kernel
+def composite_cubemap(
+    rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, gains, airlight, varying, out
+):
     """out = rgb + (1 - alpha) sky of a cube map, through fog where strength >= 0.
 
     faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border). rotation:
-    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.
+    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up. gains:
+    as of airlight_gain. airlight [3], varying [3]: of the fog.
     """
     height, width = alpha.shape
     half, one = np.float32(0.5), np.float32(1)
@@ -77,16 +123,19 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
             fc, fr = column - np.float32(c0), row - np.float32(r0)
             transmittance = one - alpha[i, j]
             visible = one
+            gain = np.float32(0)
             if strength >= 0:
                 visible = np.float32(0)
+                slope = z / math.sqrt(x * x + y * y + z * z)
                 if z > 0:
-                    slope = z / math.sqrt(x * x + y * y + z * z)
                     visible = math.exp(-strength / slope)
+                gain = airlight_gain(slope, gains)
             for c in range(3):
                 top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
                 bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
                 color = top * (one - fr) + bottom * fr
-                color = visible * color + (one - visible) * airlight[c]
+                air = airlight[c] + gain * varying[c]
+                color = visible * color + (one - visible) * air
                 out[i, j, c] = rgb[i, j, c] + transmittance * color
 
 

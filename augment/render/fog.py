@@ -9,6 +9,16 @@ Uniform fog has tau = sigma d. With a scale height H the density is sigma0 exp(-
     a = (z_eye - z0) / H,  b = (z - z0) / H,
 
 which is symmetric in its two ends and has no large factor that another must cancel.
+
+The airlight may depend on the elevation e of the ray. Of an overcast sky, 1 + 2 sin e times the
+horizon's luminance is measured and standard (Moon and Spencer 1942; ISO 15469, type 16). Inside
+thick fog Eddington's approximation has the same form, 1 + k sin e with k = 3/2 g (1 - a) / (1 + a):
+1.0 over asphalt of albedo a = 0.1 for droplets of asymmetry g = 0.85. Below the horizon, where that
+would end below zero, its reciprocal goes on with the same slope, which is a choice of ours:
+
+    c_air(e) = c_air g(e)      g = (1 + k sin e)^(1/2.2), e >= 0      g(-e) = 1 / g(e)
+
+The root is what display encoding, close to a power of 2.2, makes of a factor of the luminance.
 """
 
 from __future__ import annotations
@@ -24,19 +34,24 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.buffers import RenderOutput
 
+ENCODING = 2.2  # display-encoded colour is about this root of luminance
 MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; fog that dense has t = 0 at any distance
 
 
 @dataclass(frozen=True)
 class Fog:
     """Fog in a scene, of any kind. sigma_per_m: extinction at height base_z_m (scene world). rgb:
-    airlight, display-encoded. scale_height_m: None for uniform.
+    airlight at the horizon, display-encoded. scale_height_m: None for uniform. overcast: k / 2, 0
+    for one airlight in all directions. varying_rgb: of `rgb`, what g multiplies; None for all of
+    it. The rasterisers draw `rgb`; `composite.add_elevation` adds the rest to their pictures.
     """
 
     sigma_per_m: float
     rgb: tuple[float, float, float]
     scale_height_m: float | None = None
     base_z_m: float = 0.0
+    overcast: float = 0.0
+    varying_rgb: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sigma_per_m) and self.sigma_per_m >= 0):
@@ -98,11 +113,27 @@ def vertical_optical_depth(medium: Fog, eye_z_m: float) -> float:
 
 
 def blend_airlight(
-    rgb: Float[Tensor, "*B 3"], tau: Float[Tensor, "*B"], medium: Fog
+    rgb: Float[Tensor, "*B 3"],
+    tau: Float[Tensor, "*B"],
+    medium: Fog,
+    slope: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B 3"]:
-    """t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns rgb to the bit."""
+    """t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns rgb to the bit.
+
+    slope: vertical part of the unit direction; None for the airlight of the horizon.
+    """
     t = torch.exp(-tau)[..., None]
-    return t * rgb + (1 - t) * torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
+    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
+    if slope is not None and medium.overcast > 0:
+        airlight = airlight + airlight_gain(medium, slope)
+    return t * rgb + (1 - t) * airlight
+
+
+def airlight_gain(medium: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
+    """Airlight in a direction less that at the horizon. slope: as of `blend_airlight`."""
+    growth = torch.log1p(2 * medium.overcast * slope.abs()) / ENCODING * slope.sign()
+    varying = medium.rgb if medium.varying_rgb is None else medium.varying_rgb
+    return torch.expm1(growth)[..., None] * growth.new_tensor(varying)
 
 
 def fog_buffers(
@@ -126,14 +157,25 @@ def fog_buffers(
 
 def fog_raster(raster: RenderOutput, camera: Camera, medium: Fog) -> Float[Tensor, "H W 3"]:
     """Deferred fog on a render with colour, alpha and expected depth."""
-    rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
-    assert rgb is not None and alpha is not None and depth is not None
+    assert raster.rgb is not None and raster.alpha is not None
+    ways = ways_of_raster(raster, camera, medium)
+    return fog_buffers(raster.rgb, raster.alpha, ways[0], medium, *ways[1:])
+
+
+def ways_of_raster(
+    raster: RenderOutput, camera: Camera, medium: Fog
+) -> tuple[Float[Tensor, "H W"], float, Float[Tensor, "H W"] | None]:
+    """Ray distance, the eye's height and the points' of expected depths, as `optical_depth` takes
+    them.
+    """
+    depth = raster.expected_depth
+    assert depth is not None
     ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
     eye_z_m = float(camera.centre[2])
     point_z_m = None
     if medium.scale_height_m is not None:
         point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype, depth.device)[..., 2]
-    return fog_buffers(rgb, alpha, ray_distance, medium, eye_z_m, point_z_m)
+    return ray_distance, eye_z_m, point_z_m
 
 
 def optical_depth_of_arrays(

@@ -249,7 +249,9 @@ def street():
 @pytest.mark.parametrize("scale_height_m", [None, 15.0])
 def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):
     scene, view = street
-    smog = {"visibility_m": 80, "scale_height_m": scale_height_m, "model": model}
+    overcast = 0.5 if scale_height_m else 0.0
+    smog = {"visibility_m": 80, "scale_height_m": scale_height_m, "overcast": overcast}
+    smog |= {"model": model}
     error = smog_error(recipe_of({"smog": smog}), scene, view)
     smooth = error[view.regions["smooth"]]
     assert len(smooth) > 10_000  # most of the picture that is not sky is measured

@@ -124,7 +124,8 @@ def test_an_override_is_the_field_written_in_the_file() -> None:
     texts = ["weather.smog.visibility_m={uniform: [40, 80]}", "weather.smog.color=[0.5, 0.5, 0.5]"]
     template = load_recipe("dense-fog", read_overrides([*texts, "variants=2"]))
     assert template.values["weather.smog.visibility_m"] == Uniform(40.0, 80.0)
-    text = "seed: 1\nweather: {smog: {visibility_m: {uniform: [40, 80]}, color: [0.5, 0.5, 0.5]}}"
+    smog = "{visibility_m: {uniform: [40, 80]}, color: [0.5, 0.5, 0.5]}"
+    text = f"extends: dense-fog\nweather: {{smog: {smog}}}"
     written = parse_recipe(text, source="r.yaml", name="dense-fog")
     assert template.variants == 2 and template.resolve(1) == written.resolve(1)
     without = load_recipe("winter-fog", {"weather.snow": None, "extends": "clear"}).resolve(0)

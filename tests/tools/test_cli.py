@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -14,12 +15,14 @@ import numba
 import pytest
 import torch
 from fitted_scenes import assert_same, fitted_scene
+from streets import open_street
 
 from adapters.base import open_scene
 from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.files.ply import write_ply
 from augment.files.scene_file import load_scene_parts, save_scene
+from augment.jobs.manifest import read_manifest
 from augment.scene import Gaussians, Scene
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
@@ -467,3 +470,29 @@ def test_what_is_there_is_replaced_only_if_wanted(uri, tmp_path):
         with pytest.raises(OutputError, match="holds something else"):
             export_scene(uri, tmp_path / "photos", kind=kind, overwrite=True)
     assert names(tmp_path / "photos") == ["holiday.jpg"]
+
+
+@pytest.mark.long
+def test_commands_say_what_is_not_fit_and_leave_out_cameras_that_were_never_fitted(
+    tmp_path, capsys
+):
+    fit = {"scale": 0.1, "views": {"front": [0, 1]}}
+    street = dataclasses.replace(open_street(), made_by={"fitted": fit})
+    save_scene(street, tmp_path / "fitted")
+    uri, out = f"scene:{tmp_path / 'fitted'}", str(tmp_path / "out")
+    assert main(["inspect", uri]) == 0
+    page = capsys.readouterr().out
+    assert "seen        front: 2 images of 96 px along 0.8 m, surfaces within" in page
+    assert "not fit     front: rendered 10.0 times as large as it was learnt" in page
+    assert "not fit     back: never fitted" in page and "none found" not in page
+    render = ["render", "clear", "--scene", uri, "--out", out, "--scale", "0.05", "--frames", "0"]
+    assert main([*render, "--no-sheet"]) == 0
+    left_out = "left out: front_left, front_right, left, right, back"
+    assert f"note: {left_out}" in capsys.readouterr().err
+    assert read_manifest(Path(out))["camera"].to_pylist() == ["front"]
+    assert main([*render, "--no-sheet", "--cameras", "all"]) == 0
+    assert read_manifest(Path(out)).num_rows == 6
+    job = tmp_path / "job.yaml"
+    job.write_text(f"scenes: ['{uri}']\nrecipes: [clear]\nscale: 0.05\n")
+    assert main(["generate", str(job), "--out", f"{out}2", "--executor", "serial"]) == 0
+    assert set(read_manifest(Path(f"{out}2"))["camera"].to_pylist()) == {"front"}

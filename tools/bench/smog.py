@@ -82,8 +82,9 @@ def smog_error(recipe: Recipe, scene: Scene, view: TruthView) -> np.ndarray:
     fogged = frame_of(scene, camera, recipe)().rgb
     z = torch.from_numpy(np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0))
     rays, eye_z = camera.ray_directions(torch.float64), float(camera.centre[2])
-    tau = optical_depth(fog, z * rays.norm(dim=-1), eye_z, eye_z + z * rays[..., 2])
-    exact = blend_airlight(view.clean.double(), tau, fog).float()
+    lengths = rays.norm(dim=-1)
+    tau = optical_depth(fog, z * lengths, eye_z, eye_z + z * rays[..., 2])
+    exact = blend_airlight(view.clean.double(), tau, fog, rays[..., 2] / lengths).float()
     return (fogged - exact).abs().amax(-1).numpy() * 255
 
 
