@@ -28,8 +28,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from adapters.lidar_scene.image_views import View, read_image
-from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet
+from adapters.lidar_scene.image_views import View, draw_cover, read_image
+from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet, is_flat
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels, ground_points
 from adapters.raw_drive import BoxSample
 from adapters.world import join_gaussians
@@ -100,16 +100,15 @@ def close_parts(
         centre = view.camera.centre.numpy()
         boxes.sort(key=lambda box: -np.linalg.norm(box.world_from_box[:3, 3] - centre))
         drawn = _draw(parts, posed, view.camera)
-        photo = _read_photo(view, drawn.camera)
+        photo = _read_photo(view, drawn.camera, boxes)
         if photo is None:
             continue  # a problem of the scene already
         side_px, most = _CELL_PX, (max_gaussians - sum(map(len, parts))) // 2
         while True:
             cells = drawn.cells(side_px)
-            size = (cells.camera.width, cells.camera.height)
-            image = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-            discs = _discs(cells, image, ground, boxes)  # of a nearer box over those of a further
-            if len(discs.part) <= most or min(size) == 1:
+            # Of a nearer box after, and so over, those of a further one.
+            discs = _discs(cells, photo.resized(cells.camera), ground, boxes)
+            if len(discs.part) <= most or min(cells.is_open.shape) == 1:
                 break
             side_px *= 2
         if len(discs.part) > most:
@@ -276,19 +275,40 @@ def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Came
     )
 
 
-def _read_photo(view: View, camera: Camera) -> np.ndarray | None:
-    """The photo at the camera's size, RGB uint8 [H, W, 3], what it shows of the recording car
-    filled from around it; None if it cannot be decoded."""
+class _Photo(NamedTuple):
+    """One image at the cells, RGB uint8 [h, w, 3], what it shows of the recording car filled from
+    around it. still: without the moving objects too, filled alike."""
+
+    whole: np.ndarray
+    still: np.ndarray
+
+    def resized(self, camera: Camera) -> _Photo:
+        size = (camera.width, camera.height)
+        return _Photo(*(cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self))
+
+
+def _read_photo(view: View, camera: Camera, boxes: Sequence[_Box]) -> _Photo | None:
+    """The photo at about half the camera's size; None if it cannot be decoded."""
     wanted = camera.width / view.camera.width
     image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= wanted))
     if image is None:
         return None
-    size = (camera.width // _CELL_PX or 1, camera.height // _CELL_PX or 1)
+    small = camera.scaled(1 / _CELL_PX)
+    size = (small.width, small.height)
     image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     car = view.shows_car(*size)
-    if car.all() or not car.any():
+    cover = np.full(car.shape, np.inf, np.float32)
+    for box in boxes:
+        if box.part:
+            pose = small.camera_from_world.numpy() @ box.world_from_box
+            draw_cover(cover, small, pose, box.size_m)
+    return _Photo(_filled(image, car), _filled(image, car | np.isfinite(cover)))
+
+
+def _filled(image: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    if unknown.all() or not unknown.any():
         return image
-    return cv2.inpaint(image, car.astype(np.uint8), 3, cv2.INPAINT_TELEA)
+    return cv2.inpaint(image, unknown.astype(np.uint8), 3, cv2.INPAINT_TELEA)
 
 
 class _Discs(NamedTuple):
@@ -327,7 +347,7 @@ class _Discs(NamedTuple):
 
 
 def _discs(
-    cells: _Cells, image: np.ndarray, ground: _GroundMap | None, boxes: Sequence[_Box]
+    cells: _Cells, photo: _Photo, ground: _GroundMap | None, boxes: Sequence[_Box]
 ) -> _Discs:
     """A disc for each open cell, and for those where a vehicle's box is seen through."""
     centre = cells.camera.centre.numpy()
@@ -337,9 +357,12 @@ def _discs(
     over = (ground_depth - cells.depth) * -rays[..., 2]
     flat = (over < _ON_GROUND_M) & (cells.part == 0)
     holes = cells.is_open & ~cells.has_surface
+    flat |= is_flat(cells.semantic) & (cells.part == 0)
     there, semantic, on_ground = cells.depth * (1 + _BEHIND) + _BEHIND_M, cells.semantic, flat
+    # What a ray meets behind ground that leaks is ground.
+    there = np.where(flat & np.isfinite(ground_depth), np.maximum(there, ground_depth), there)
     if holes.any():
-        near = _nearest_surfaces(cells, image, holes)
+        near = _nearest_surfaces(cells, photo.whole, holes)
         around = cells.depth.ravel()[near]
         # What is around may be an object whose box ends there: the ground goes on beside it.
         down = flat.ravel()[near] | (cells.part.ravel()[near] > 0)
@@ -359,9 +382,15 @@ def _discs(
             close &= (part != box.part) | box.holds(centre + there[..., None] * rays)
     depth = np.clip(there[close], 0.2, _FURTHEST_M)
     points = centre + depth[:, None] * rays[close]
-    colours = image[close].astype(np.float32) / 255
+    colours = np.where(part[close][:, None] > 0, photo.whole[close], photo.still[close]) / 255
     return _Discs(
-        part[close], points, rays[close], depth, on_ground[close], semantic[close], colours
+        part[close],
+        points,
+        rays[close],
+        depth,
+        on_ground[close],
+        semantic[close],
+        colours.astype(np.float32),
     )
 
 

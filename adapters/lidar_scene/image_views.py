@@ -135,7 +135,7 @@ def _observe_one(
             if pose is None:
                 continue
             transform = transform @ pose
-            _draw_cover(cover, camera, transform, body.track.size_m)
+            draw_cover(cover, camera, transform, body.track.size_m)
         extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
         posed.append((body, store, extent, transform[:3, :3].copy(), transform[:3, 3].copy()))
     for body, _, extent, *pose in posed:
@@ -171,7 +171,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count(
 _CLIP_M = 0.05
 
 
-def _draw_cover(
+def draw_cover(
     cover: np.ndarray, camera: Camera, camera_from_box: np.ndarray, size_m: np.ndarray
 ) -> None:
     """Fill the outline of a moving object's box, a little grown, with its nearest depth.

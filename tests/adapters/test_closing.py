@@ -63,7 +63,7 @@ def test_the_road_before_the_car_is_closed_at_its_height_in_the_photos_colour(tm
     )
     # Of an image that is closed, nothing is closed again.
     (again,) = close_parts([closed], (), (), [view], points, max_gaussians=10**6)
-    assert len(again) - len(closed) < 0.02 * len(new)
+    assert len(again) - len(closed) < 0.05 * len(new)
 
 
 def test_the_hole_in_a_moving_object_is_of_the_object(tmp_path):
