@@ -19,8 +19,9 @@ from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
 from recipes.errors import RecipeError
-from recipes.schema import Recipe
+from recipes.schema import Recipe, Sensor
 
+LENS, NOISE = "lens blur", "sensor noise"  # the last passes of all
 BARE = "bare surface"  # the pass that draws the scene without what lies on it
 
 
@@ -34,7 +35,7 @@ class Plan:
     it; empty where they show it. depth_buffer: written as depth. shows_first: these images show
     what a ray meets first, such as water, not the scene under it. finds_boxes: labels or instance
     images need the depth of the solid surfaces. recorded_exposure: cameras' colour maps apply to
-    the finished picture. steps: every pass considered, in order.
+    the finished picture. sensor, seed: of the recipe. steps: every pass considered, in order.
     """
 
     placed: Mapping[str, Placed]
@@ -48,6 +49,8 @@ class Plan:
     shows_first: bool
     finds_boxes: bool
     recorded_exposure: bool
+    sensor: Sensor
+    seed: int
     steps: tuple[Step, ...]
 
     @property
@@ -131,6 +134,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         shows_first=output.surface == "first",
         finds_boxes=finds_boxes,
         recorded_exposure=exposure.runs,
+        sensor=recipe.camera,
+        seed=recipe.seed,
         steps=_all_steps(recipe, scene, placed, buffers, bare_buffers, exposure),
     )
 
@@ -163,6 +168,8 @@ def _all_steps(
         Step(BARE, bool(bare), without),
         *of_effects(PICTURE),
         exposure,
+        Step(LENS, recipe.camera.psf_px > 0, f"camera.psf_px is {recipe.camera.psf_px:g}"),
+        Step(NOISE, recipe.camera.noise > 0, f"camera.noise is {recipe.camera.noise:g}"),
         Step("depth image", output.depth != "none", f"output.depth is {output.depth!r}"),
         Step("semantic image", output.semantic, _asked("semantic", recipe)),
         Step("instance image", output.instance, _asked("instance", recipe)),

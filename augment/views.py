@@ -16,10 +16,11 @@ from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
 from augment.jobs.layout import TRUST
 from augment.jobs.processes import choose_backend
-from augment.plan import BARE, Plan, ViewPlan, make_plan, plan_view
+from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
 from augment.render.buffers import AUTO, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import composite_sky, map_colors
 from augment.render.rasterize import rasterize
+from augment.render.sensor import add_noise, blur_lens
 from augment.scene import PosedGaussians, Scene
 from augment.timing import timed
 from augment.trust import trust_mask
@@ -74,6 +75,13 @@ def render_buffers(
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
             rgb = map_colors(rgb, color_map, backend=backend)
+    if plan.sensor.psf_px > 0:
+        with timed(LENS):
+            rgb = blur_lens(rgb, plan.sensor.psf_px)
+    if plan.sensor.noise > 0:
+        with timed(NOISE):
+            noise, seed = plan.sensor.noise, plan.seed
+            rgb = add_noise(rgb, noise, camera, seed=seed, scene=scene.name, backend=backend)
     with timed("depth of surfaces"):
         depth_m = _surface_depth(drawn.raster, plan, plan.image_buffers)
     return WeatheredBuffers(

@@ -196,6 +196,18 @@ class Render(Section):
     picture, are left out; 0 leaves out none."""
 
 
+class Sensor(Section):
+    """What the camera adds to what reaches it, after all weather; depth, classes, masks and labels
+    know nothing of it.
+    """
+
+    noise: Number = Field(default=0.0, ge=0, le=0.2)
+    """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
+    255."""
+    psf_px: Number = Field(default=0.0, ge=0, le=16)
+    """Sigma of the lens's blur, pixels of the rendered picture."""
+
+
 class Output(Section):
     """What is written for each image."""
 
@@ -256,6 +268,7 @@ class Recipe(Closed):
     style: Style | None = None
     quality: Quality = Quality()
     render: Render = Render()
+    camera: Sensor = Sensor()
     output: Output = Output()
 
     @model_validator(mode="after")
@@ -279,6 +292,7 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
+        left_out += [] if self.camera != Sensor() else ["camera"]
         left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
         left_out += [
             f"{path}.{name}"

@@ -83,7 +83,8 @@ class Snow(EffectModel):
     albedo: Unit = 0.85
     """Share of the light that the snow gives back."""
     grain: Unit = 0.5
-    """Unevenness of the size of the splats: 0 smooth, 1 coarse."""
+    """Unevenness of the snow from splat to splat, and near the camera from pixel to pixel: 0
+    smooth, 1 coarse."""
     sparkle: Unit = 0.0
     """How many crystals glint at the sun; 0 is none."""
     tracks: Literal["auto", "always", "never"] = "auto"

@@ -221,6 +221,59 @@ def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
 
 
+def test_long_narrow_tops_high_up_carry_nothing() -> None:
+    """A beam of half a metre is bare however long it is; a roof of two metres is not."""
+    beam, roof = sheet((4, 14), (-3.25, -2.75), 4.0), sheet((4, 14), (1, 3), 4.0)
+    cells = place(drive(GROUND, beam, roof)).ground
+    high = cells.centers_m[:, 2] > 3
+    assert not bool((high & (cells.centers_m[:, 1] < 0)).any())
+    assert float((cells.sizes_m[high] ** 2).sum()) > 5  # what of it the camera sees
+
+
+def test_what_is_too_narrow_for_snow_has_none_by_its_class() -> None:
+    top = sheet((6, 8), (-1, 1), 0.5, semantic=SemanticClass.POLE)
+    ground = sheet((-6, 20), (-8, 8), semantic=SemanticClass.ROAD)
+    cells = place(drive(ground, top)).ground
+    assert not bool((cells.centers_m[:, 2] > 0.4).any())
+
+
+def test_foliage_stands_over_the_ground_and_grass_does_not() -> None:
+    green = SemanticClass.VEGETATION
+    parts = [
+        sheet((-6, 20), (-8, 8), semantic=SemanticClass.ROAD),
+        sheet((5, 8), (-2, 2), 1.2, semantic=green),
+        sheet((5.5, 5.7), (-0.1, 0.1), 1.25, semantic=SemanticClass.OTHER),  # a crown's own noise
+        sheet((10, 13), (-2, 2), 0.2, semantic=green),
+    ]
+    cells = place(drive(*parts)).ground
+    crown = within(cells, (5.4, 7.6), (-1.6, 1.6)) & (cells.centers_m[:, 2] > 1)
+    grass = within(cells, (10.4, 12.6), (-1.6, 1.6)) & (cells.centers_m[:, 2] > 0.1)
+    assert bool(crown.any()) and bool((cells.semantic[crown] == green).all())
+    assert bool(grass.any()) and bool((cells.semantic[grass] == SemanticClass.TERRAIN).all())
+
+
+@pytest.mark.parametrize(("slope", "expected"), [(15.0, True), (45.0, False)])
+def test_vehicles_carry_snow_on_what_is_level_alone(slope: float, expected: bool) -> None:
+    """45 degrees are below the recipe's limit, which holds for roofs of houses."""
+    for semantic, carries in ((SemanticClass.VEHICLE, expected), (SemanticClass.BUILDING, True)):
+        ramp = sheet((5, 8), (-2, 2), slope_deg=slope, semantic=semantic)
+        cells = place(drive(ramp), PlacementSettings(cell_m=0.05)).ground
+        assert bool(within(cells, (5.5, 7.5), (-1.5, 1.5)).any()) == carries, semantic
+
+
+def test_slivers_and_shells_of_a_vehicle_carry_nothing() -> None:
+    """Strips of 15 cm at a door's height, and a gap in the roof that lies 20 cm deeper."""
+    car = box_car(size=(4.0, 1.8, 1.5))
+    shell = car.gaussians
+    gap = (shell.means[:, 0].abs() < 0.1) & (shell.means[:, 2] > 0.7)
+    lower = shell.means - 0.2 * torch.tensor([0.0, 0.0, 1.0]) * gap[:, None]
+    sill = sheet((-1.5, 1.5), (0.9, 1.05), 0.2)
+    parts = stack(dataclasses.replace(shell, means=lower), sill)
+    bed = place(drive(GROUND, actors=[dataclasses.replace(car, gaussians=parts)]))
+    z = bed.actors["car"].centers_m[:, 2]
+    assert float(z.min()) > 0.65 and float(z.max()) < 0.8
+
+
 def test_the_ground_is_buried_and_walls_are_not() -> None:
     platform, front = sheet((6, 8), (-1, 1), 0.6), wall(6, (-1, 1), (0, 0.6))
     scene = drive(GROUND, platform, front)

@@ -30,7 +30,7 @@ class SnowCells:
     surface relative to what is usual for its class nearby, 1 = usual; shadows that the recording
     holds show in it. tracks [C]: 0 to 1, how much of a wheel track it is. banks [C, 2]: level
     vector towards obstacles that stand beside the cell, 0 far from any to about 1 at their foot.
-    semantic [C]: class of the surface.
+    semantic [C]: class of the surface; VEGETATION is foliage, not grass.
 
     buried [B]: Gaussians of the part that are the surface, or lie close beneath it.
     buried_by [B, 5]: cells over each of them, at its middle and at 1.5 standard deviations along

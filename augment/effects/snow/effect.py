@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from augment.boxes import NOT_COUNTED, PlacedBoxes
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import (
+    PICTURE,
     SCENE,
     Active,
     Drawn,
@@ -28,24 +30,30 @@ from augment.effects.effect import (
     skipped,
 )
 from augment.effects.lidar.beam import Echoes
+from augment.effects.snow.kernels import FARTHEST_M
 from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.lidar import meet_snow
 from augment.effects.snow.light import illumination_of
 from augment.effects.snow.near_camera import SIZE_M, Layer, SnowLayers
+from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snow import PlacedSnow, placed_in_snow, placement_settings, snow_pixels
 from augment.effects.snow.support import share_support, support_of
 from augment.ground import check_metric_and_level
 from augment.jobs.box_tables import BoxTable, share_of_pixels
 from augment.memo import memo_of
-from augment.render.buffers import OVERLAY
+from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
+from augment.render.constants import RasterSettings
+from augment.render.fog import optical_depth_of_arrays
 from augment.scene import Gaussians, Scene
 from augment.timing import timed
 from recipes.schema import Recipe
 from recipes.snow import Snow
 
 LAID, PER_PIXEL = PASSES = ("snow: placement and layer", "snow: light per pixel")
+GRAIN = "snow: grain"
 SHOWN = 0.5  # share of a pixel that is snow where the mask says so
 _CHUNK_M = 8.0  # side of the squares that snow is bounded in
+_BESIDE_M = 0.3  # of a vehicle's box: snow that still lies on it
 
 
 class SnowEffect(Effect):
@@ -79,7 +87,8 @@ class SnowEffect(Effect):
             if snow is not None:
                 nothing = "depth" if snow.depth_m == 0 else "coverage"
                 reason = f"the snow has no {nothing}, so it changes nothing"
-            return Placed(None, skipped(PASSES, reason, SCENE))
+            steps = (*skipped(PASSES, reason, SCENE), Step(GRAIN, False, reason, PICTURE))
+            return Placed(None, steps)
         check_metric_and_level(scene)
         reason = (
             f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, "
@@ -94,9 +103,11 @@ class SnowEffect(Effect):
         steps = (
             Step(LAID, True, reason, SCENE),
             Step(PER_PIXEL, snow.shading == "per_pixel", shading, SCENE),
+            Step(GRAIN, snow.grain > 0, f"grain is {snow.grain:g}", PICTURE),
         )
         seed = recipe.seed if snow.seed is None else snow.seed
-        return Placed(PlacedSnow(snow, seed, level_z_m), steps, frozenset({OVERLAY}))
+        buffers = {OVERLAY, EXPECTED_DEPTH} if snow.grain > 0 else {OVERLAY}
+        return Placed(PlacedSnow(snow, seed, level_z_m), steps, frozenset(buffers))
 
     def prepare(self, own: Active) -> SnowLayers:
         return snow_layers_of(own.scene, own.data, own.light, backend=own.backend)
@@ -113,7 +124,7 @@ class SnowEffect(Effect):
         owners = owners_seen(boxes, sight.poses, sight.cameras, sight.near_m)
         if not owners:
             why = "neither snow nor what it buries can be in view"
-            return InView(False, dict.fromkeys(PASSES, why))
+            return InView(False, dict.fromkeys((*PASSES, GRAIN), why))
         lit = any(_is_lit_per_pixel(layers.layer_on(own.scene, n)) for n in owners)
         why = {} if lit else {PER_PIXEL: "no snow that is lit per pixel can be in view"}
         return InView(skipped=why, owners=frozenset(owners - {0}), seen=frozenset(owners))
@@ -124,6 +135,21 @@ class SnowEffect(Effect):
                 own.scene, camera, layers.parts, own.seen, backend=own.backend
             )
         return replace(layers, parts=parts)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        snow, depth = drawn.raster.overlay, drawn.raster.expected_depth
+        if own.data.snow.grain == 0 or camera.is_orthographic or snow is None or depth is None:
+            return drawn
+        layers = own.prepared
+        hidden = list(drawn.masks.values())  # water lies before the snow beneath it
+        with timed(GRAIN):
+            rgb = add_grain(
+                *(drawn.rgb, depth, snow, torch.stack(hidden).any(0) if hidden else None),
+                *(camera, layers.grain, layers.sun, _carriers(own, camera)),
+                extinction_per_m=_extinction_about(own, camera),
+                backend=own.backend,
+            )
+        return replace(drawn, rgb=rgb)
 
     def mask_of(self, own: Active, drawn: Drawn) -> Bool[Tensor, "H W"] | None:
         overlay = drawn.raster.overlay
@@ -145,6 +171,35 @@ class SnowEffect(Effect):
 
     def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
         meet_snow(echoes, own.scene, own.data, echoes.source, frame_ns)
+
+
+def _carriers(own: Active, camera: Camera) -> list[Carrier]:
+    """The vehicles close to the camera that snow lies on."""
+    found = list[Carrier]()
+    for number in sorted(own.seen - {0}):
+        actor = own.scene.actors[number - 1]
+        pose = actor.track.pose_at(camera.timestamp_ns)
+        half = np.array(actor.size_m) / 2 + _BESIDE_M
+        if pose is None or not np.isfinite(half).all():
+            continue
+        if float((pose[:3, 3] - camera.centre).norm()) > FARTHEST_M + np.linalg.norm(half):
+            continue
+        high = half + np.array([0, 0, 2 * own.data.snow.depth_m])
+        # What lies lower is the snow that the vehicle stands in.
+        low = np.array([-half[0], -half[1], -half[2] / 3])
+        found.append(Carrier(np.linalg.inv(pose.double().numpy()), low, high))
+    return found
+
+
+def _extinction_about(own: Active, camera: Camera) -> float:
+    """Of the fog that earlier effects put into the scene, at the camera, 1/metre."""
+    layers = LayerRenderer((), own.scene.sky, None, False, RasterSettings(), own.backend)
+    for other in own.earlier:
+        layers = other.effect.edit_scene(other, layers, camera)
+    if layers.fog is None:
+        return 0.0
+    eye_z_m = np.array([float(camera.centre[2])])
+    return float(optical_depth_of_arrays(layers.fog, np.ones(1), eye_z_m, eye_z_m)[0])
 
 
 def _is_seen(view: EffectView) -> bool:
@@ -191,8 +246,6 @@ def _bound_layer(layer: Layer, own: Gaussians, owner: int) -> Bounds:
     buried = (layer.opacities.numpy() == 0) & (own.opacities.numpy() > 0)
     everywhere = np.ones(len(layer.gaussians), bool)
     snow = bound_chunks(layer.gaussians, everywhere, _CHUNK_M, owner)
-    # Close to a camera discs are split: their parts lie within one standard deviation.
-    snow = replace(snow, halves=snow.halves + snow.longest[:, None])
     bounds = [snow, bound_chunks(own, buried, _CHUNK_M, owner)]
     if layer.crystals is not None:
         places = layer.crystals.places_m.numpy().astype(np.float64)

@@ -8,7 +8,7 @@ can lean, over the cell's border, upright discs close the wall below it.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -16,6 +16,7 @@ from numba import prange
 from augment.effects.snow.cells import OPEN_EDGE
 from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.render.sh import SH_C0
+from augment.semantics import SemanticClass
 
 # ---- Noise ---------------------------------------------------------------------------------------
 
@@ -216,6 +217,7 @@ class Cells(NamedTuple):
     light: np.ndarray
     tracks: np.ndarray
     banks: np.ndarray
+    semantic: np.ndarray
 
 
 class Depths(NamedTuple):
@@ -364,131 +366,107 @@ def bury(buried, buried_by, heights, opacities):
             opacities[buried[b]] = 0
 
 
-# ---- Near discs split into finer ones, as `near_camera.split_discs` defines it -------------------
+# ---- Grain of near snow, as `relief.add_grain` defines it ----------------------------------------
 
-REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
-FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
-MAX_SPLITS = 3  # of a disc, along each of its sides
-MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
-TEXEL_M = 0.01  # of the table of noise that the grain follows
-COARSER = 0.37  # how fast the table is read a second time, turned: for clods
-CRUMB, CLOD = 0.6, 0.4  # shares of the two
+FARTHEST_M = 12.0  # from the camera; beyond half of it grain fades
+MIN_SNOW = 0.02  # share of a pixel
+GRAINS = 4  # octaves
+COARSEST_TEXEL_M, FINER = 0.016, 0.47  # of the noise's table, whose features are five texels wide
+SHOWN_AT = 2.5  # half of that: features of two pixels begin to show, those of four do
+TURN_COS, TURN_SIN = 0.8, 0.6  # about the vertical, from one octave to the next
+MIN_FALL = 0.05  # sine of the angle that a level surface is seen at, for a pixel's size on it
+MOST_GRAIN = 0.35  # of the brightness
+
+
+class GrainView(NamedTuple):
+    """What grain is seen by, float64. lens: fx, fy, cx, cy. pose [3, 4]: world_from_camera. sun:
+    level unit vector towards it. shift [3]: of the noise, metres. carriers [K, 18]: those of
+    `relief.Carrier`, rotation by rows, translation, low, high. relief: brightness per slope;
+    mottle: per noise. extinction: per metre.
+    """
+
+    lens: np.ndarray
+    pose: np.ndarray
+    sun: np.ndarray
+    shift: np.ndarray
+    carriers: np.ndarray
+    relief: float
+    mottle: float
+    extinction: float
 
 
 @kernel
-def count_splits(near, means, scales, pose, limits, finest, splits):
-    """Into how many discs along each side the near discs [D] are split, uint8 [D]; 0 where one
-    stays whole.
-
-    pose: camera_from_part, float64 [3, 4]. limits: lowest and highest x / z, then y / z. finest:
-    standard deviation of a disc over its distance, that splitting stops at.
-    """
-    for k in prange(len(splits)):
-        i = near[k]
-        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        right = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-        down = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-        away = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        distance = math.sqrt(right * right + down * down + away * away)
-        splits[k] = 0
-        if away <= 0.0 or distance >= FARTHEST_M:
-            continue
-        if not (limits[0] * away <= right <= limits[1] * away):
-            continue
-        if not (limits[2] * away <= down <= limits[3] * away):
-            continue
-        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        count = min(math.floor(side / (finest * distance) + 0.5), MAX_SPLITS)
-        splits[k] = count if count > 1 else 0
+def add_grain(rgb, depth, snow, hidden, view, noise):
+    """Grain on the snow of rgb [H, W, 3], in place; hidden: bool [H, W], or [0, 0] for nowhere."""
+    for i in prange(rgb.shape[0]):
+        _grain_row(np.int64(i), rgb, depth, snow, hidden, view, noise)
 
 
 @inner()
-def _grain(x, y, z, shift, noise):
-    """The noise that the grain follows, at a place in metres: two scales of one table."""
-    mask, texel = noise.shape[0] - 1, 1.0 / TEXEL_M
-    u, v = x + 0.7 * z + shift[0], y + 0.7 * z + shift[1]
-    crumb = noise[np.int64(math.floor(u * texel)) & mask, np.int64(math.floor(v * texel)) & mask]
-    u, v = (0.8 * u - 0.6 * v) * COARSER * texel, (0.6 * u + 0.8 * v) * COARSER * texel
-    clod = noise[np.int64(math.floor(u)) & mask, np.int64(math.floor(v)) & mask]
-    return CRUMB * crumb + CLOD * clod
+def _grain_row(i, rgb, depth, snow, hidden, view, noise):
+    lens, pose, carriers = view.lens, view.pose, view.carriers
+    down = (i + 0.5 - lens[3]) / lens[1]
+    for j in range(rgb.shape[1]):
+        z = np.float64(depth[i, j])
+        if not (snow[i, j] > MIN_SNOW and z > 0.0 and z < FARTHEST_M):
+            continue
+        if hidden.size > 0 and hidden[i, j]:
+            continue
+        across = (j + 0.5 - lens[2]) / lens[0]
+        rx = across * pose[0, 0] + down * pose[0, 1] + pose[0, 2]
+        ry = across * pose[1, 0] + down * pose[1, 1] + pose[1, 2]
+        rz = across * pose[2, 0] + down * pose[2, 1] + pose[2, 2]
+        length = math.sqrt(rx * rx + ry * ry + rz * rz)
+        far = z * length
+        fade = min(2.0 * (1.0 - far / FARTHEST_M), 1.0)
+        if fade <= 0.0:
+            continue
+        x, y, height = z * rx + pose[0, 3], z * ry + pose[1, 3], z * rz + pose[2, 3]
+        du, dv = view.sun[0], view.sun[1]
+        for k in range(carriers.shape[0]):
+            c = carriers[k]
+            px = c[0] * x + c[1] * y + c[2] * height + c[9]
+            py = c[3] * x + c[4] * y + c[5] * height + c[10]
+            pz = c[6] * x + c[7] * y + c[8] * height + c[11]
+            if c[12] <= px <= c[15] and c[13] <= py <= c[16] and c[14] <= pz <= c[17]:
+                x, y, height = px, py, pz
+                du, dv = c[0] * du + c[1] * dv, c[3] * du + c[4] * dv
+                break
+        pixel_m = far / lens[0] / math.sqrt(max(abs(rz) / length, MIN_FALL))
+        x, y, height = x + view.shift[0], y + view.shift[1], height + view.shift[2]
+        bright = _grain_at(x, y, height, du, dv, pixel_m, view.relief, view.mottle, noise)
+        factor = 1.0 + fade * snow[i, j] * math.exp(-view.extinction * far) * bright
+        for channel in range(3):
+            rgb[i, j, channel] = np.float32(factor * rgb[i, j, channel])
 
 
-class CloseView(NamedTuple):
-    """What near discs are split by; float64 arrays, or tensors. eye: the camera's centre; sun: its
-    level direction times half a step in metres, in the part's frame. shift: see `_grain`. relief:
-    brightness per fall of the noise towards the sun; mottle: per noise. finest: as for
-    count_splits.
+@inner()
+def _grain_at(x, y, z, dx, dy, pixel_m, relief, mottle, noise):
+    """Change of brightness at a place, metres, of a pixel's size; (dx, dy): level, to the sun.
+
+    The noise and its rise along that way are interpolated between the eight texels about the place.
     """
-
-    eye: Any
-    sun: Any
-    shift: Any
-    relief: float
-    mottle: float
-    finest: float
-
-
-class Discs(NamedTuple):
-    """A part's Gaussians, sh [S, 1, 3]; slopes: [S, 3] or empty."""
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    sh: np.ndarray
-    slopes: np.ndarray
-
-
-@kernel
-def split(chosen, splits, firsts, view, noise, discs, fine):
-    """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on."""
-    eye, sun, shift = view.eye, view.sun, view.shift
-    relief, mottle, finest = view.relief, view.mottle, view.finest
-    means, quats, scales, sh, slopes = (
-        discs.means,
-        discs.quats,
-        discs.scales,
-        discs.sh,
-        discs.slopes,
-    )
-    fine_means, fine_quats, fine_scales = fine.means, fine.quats, fine.scales
-    fine_sh, fine_slopes = fine.sh, fine.slopes
-    for c in prange(len(chosen)):
-        i, n = chosen[c], np.int64(splits[c])
-        w, x = np.float64(quats[i, 0]), np.float64(quats[i, 1])
-        y, z = np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        ux, uy, uz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)
-        vx, vy, vz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)
-        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
-        fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
-        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        fade *= min(
-            max(2.0 * side / (finest * far) - 3.0, 0.0), 1.0
-        )  # 0 where discs grow whole again
-        wide, deep = REACH * np.float64(scales[i, 0]), REACH * np.float64(scales[i, 1])
-        along, across = wide / SPREAD, deep / SPREAD
-        s = firsts[c]
-        for j in range(n):
-            p = ((j + 0.5) / n - 0.5) * along
-            for k in range(n):
-                q = ((k + 0.5) / n - 0.5) * across
-                px, py, pz = mx + p * ux + q * vx, my + p * uy + q * vy, mz + p * uz + q * vz
-                fine_means[s, 0], fine_means[s, 1] = np.float32(px), np.float32(py)
-                fine_means[s, 2] = np.float32(pz)
-                for axis in range(4):
-                    fine_quats[s, axis] = quats[i, axis]
-                fine_scales[s, 0], fine_scales[s, 1] = np.float32(wide / n), np.float32(deep / n)
-                fine_scales[s, 2] = scales[i, 2]
-                behind = _grain(px - sun[0], py - sun[1], pz, shift, noise)
-                sunward = _grain(px + sun[0], py + sun[1], pz, shift, noise)
-                bright = relief * (behind - sunward) + 0.5 * mottle * (behind + sunward)
-                factor = 1.0 + fade * bright
-                for channel in range(3):
-                    color = 0.5 + SH_C0 * np.float64(sh[i, 0, channel])
-                    fine_sh[s, 0, channel] = np.float32((factor * color - 0.5) / SH_C0)
-                    if len(slopes) > 0:
-                        fine_slopes[s, channel] = np.float32(factor * slopes[i, channel])
-                s += 1
+    mask, bright, texel = noise.shape[0] - 1, 0.0, COARSEST_TEXEL_M
+    for _ in range(GRAINS):
+        shown = min(SHOWN_AT * texel / pixel_m - 1.0, 1.0)
+        if shown <= 0.0:
+            break
+        u, v, w = x / texel, y / texel, z / texel
+        i, j, k = math.floor(u), math.floor(v), math.floor(w)
+        u, v, w = u - i, v - j, w - k
+        i, j, k = np.int64(i) & mask, np.int64(j) & mask, np.int64(k) & mask
+        i1, j1, k1 = (i + 1) & mask, (j + 1) & mask, (k + 1) & mask
+        a = noise[k, j, i] + w * (noise[k1, j, i] - noise[k, j, i])
+        b = noise[k, j, i1] + w * (noise[k1, j, i1] - noise[k, j, i1])
+        c = noise[k, j1, i] + w * (noise[k1, j1, i] - noise[k, j1, i])
+        d = noise[k, j1, i1] + w * (noise[k1, j1, i1] - noise[k, j1, i1])
+        value = (a + u * (b - a)) * (1.0 - v) + (c + u * (d - c)) * v
+        along = ((b - a) * (1.0 - v) + (d - c) * v) * dx + ((c - a) * (1.0 - u) + (d - b) * u) * dy
+        bright += shown * (mottle * value - relief * along)
+        x, y = TURN_COS * x - TURN_SIN * y, TURN_SIN * x + TURN_COS * y
+        dx, dy = TURN_COS * dx - TURN_SIN * dy, TURN_SIN * dx + TURN_COS * dy
+        texel *= FINER
+    return min(max(bright, -MOST_GRAIN), MOST_GRAIN)
 
 
 # ---- The snow's depth, as `layer.heights_of` defines it ------------------------------------------
@@ -499,6 +477,11 @@ CRUMBLED = 0.8  # of the mottling noise, by which a track's sides are uneven
 WATER_MARGIN_M, WATER_RIM_M = 0.005, 0.02  # bare above the water, and thinner above that
 SHELTER = 0.4  # what the foot of an obstacle adds to the noise of the patches, which it keeps
 PILED, SCOURED = 0.8, 0.4  # by wind that blows at an obstacle, and off one
+# Through foliage most snow falls: what is left lies where this noise exceeds a threshold, which is
+# about a third of it, in flecks that the two finest octaves of the patches make.
+FOLIAGE = int(SemanticClass.VEGETATION)
+FOLIAGE_COARSE, FOLIAGE_FINE, FOLIAGE_ABOVE = 0.6, 0.8, 0.42
+FOLIAGE_SHARE, FOLIAGE_MOST_M = 0.3, 0.04  # of the depth, and most of it
 STEEPEST = 1.4  # of the logarithm of the drift: within four times the depth, or a quarter of it
 
 
@@ -537,6 +520,17 @@ def _field(x, y, size, turns, amplitudes, lengths, seeds):
 
 
 @inner()
+def _is_fleck(x, y, turns, seeds):
+    """Whether snow lies on foliage at a place; turns, seeds: of octaves, the last two count."""
+    total = 0.0
+    for back in range(2):
+        k = len(seeds) - 2 + back
+        u, v = turns[k, 0, 0] * x + turns[k, 0, 1] * y, turns[k, 1, 0] * x + turns[k, 1, 1] * y
+        total += (FOLIAGE_FINE if back else FOLIAGE_COARSE) * _noise(u, v, seeds[k])
+    return total > FOLIAGE_ABOVE
+
+
+@inner()
 def _pillow(t):
     t = min(max(t, 0.0), 1.0)
     return math.sqrt(t * (2.0 - t))
@@ -551,7 +545,7 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
     is not worked out.
     """
     centers, sizes, edges = cells.centers, cells.sizes, cells.edges
-    tracks, banks = cells.tracks, cells.banks
+    tracks, banks, semantic = cells.tracks, cells.banks, cells.semantic
     heights, mottle, draws = depths.heights, depths.mottle, depths.draws
     everywhere = numbers.threshold <= -1e9
     for i in prange(len(sizes)):
@@ -567,6 +561,8 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
             bx, by = np.float64(banks[i, 0]), np.float64(banks[i, 1])
             above = _field(x, y, 0.0, patches[0], patches[1], patches[2], patches[3])
             above += SHELTER * math.sqrt(bx * bx + by * by) - numbers.threshold
+        if semantic[i] == FOLIAGE and not _is_fleck(x, y, patches[0], patches[3]):
+            continue
         if not (room > 0.0 and above > 0.0):
             continue
         at_wind = banks[i, 0] * numbers.wind_x + banks[i, 1] * numbers.wind_y
@@ -574,6 +570,8 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
         drift = _field(x, y, size, drifts[0], drifts[1], drifts[2], drifts[3])
         drift = math.exp(min(max(drift, -STEEPEST), STEEPEST)) * piled
         full = numbers.depth_m * drift * _pillow(edges[i] / numbers.radius_m)
+        if semantic[i] == FOLIAGE:
+            full = min(FOLIAGE_SHARE * full, FOLIAGE_MOST_M)
         h = BARE_M + max(full - BARE_M, 0.0) * min(above / numbers.rim, 1.0)
         mottled = _field(x, y, size, mottling[0], mottling[1], mottling[2], mottling[3])
         track = np.float64(tracks[i])

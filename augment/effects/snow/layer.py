@@ -6,6 +6,7 @@ h = depth * drift(x, y) * shoulder(edge), less in wheel tracks, and 0 between pa
 
 - drift = exp(noise), whose median is 1, times what the wind piles up before obstacles.
 - shoulder: at an open edge the layer is rounded like a pillow, a quarter of a circle.
+- foliage: about a third of it carries a thin share of the depth, in flecks; the rest falls through.
 - patches: thin snow leaves bare what the noise holds lowest; a share of coverage
   (1 - exp(-depth / 4 mm)) is covered. What fell lies on that share, so it is never thinner than
   a few millimetres there.
@@ -27,7 +28,8 @@ from augment.effects.snow import kernels
 from augment.effects.snow.cells import EDGE_CAP_M, SnowCells, SnowSupport
 from augment.effects.snow.kernels import Cells, Depths, Splats
 from augment.effects.snow.light import Illumination
-from augment.effects.snow.near_camera import Grain, Layer, SnowLayers, crystals_of
+from augment.effects.snow.near_camera import Layer, SnowLayers, crystals_of
+from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
@@ -263,6 +265,9 @@ def heights_of(cells: SnowCells, profile: Profile) -> np.ndarray:
     log_drift = field_of(profile.drifts, x_m, y_m, sizes_m)
     log_drift = np.clip(log_drift, -kernels.STEEPEST, kernels.STEEPEST)
     full = n.depth_m * np.exp(log_drift) * piled * _pillow(edge_m / n.radius_m)
+    foliage = cells.semantic.numpy() == kernels.FOLIAGE
+    thin = np.minimum(kernels.FOLIAGE_SHARE * full, kernels.FOLIAGE_MOST_M)
+    full = np.where(foliage, thin, full)
 
     shelter = kernels.SHELTER * np.hypot(banks[:, 0], banks[:, 1])
     above = field_of(profile.patches, x_m, y_m) + shelter - n.threshold
@@ -272,7 +277,18 @@ def heights_of(cells: SnowCells, profile: Profile) -> np.ndarray:
     h = np.maximum(h * (1 - n.pressed * np.clip(tracks, 0, 1)), np.minimum(h, kernels.FILM_M))
     room = z_m - n.floor_z_m
     h = kernels.BARE_M + (h - kernels.BARE_M) * np.clip(room / kernels.WATER_RIM_M, 0, 1)
-    return np.where((above > 0) & (room > 0), h, 0.0)
+    lies = (above > 0) & (room > 0) & (~foliage | _flecks(profile.patches, x_m, y_m))
+    return np.where(lies, h, 0.0)
+
+
+def _flecks(patches: Octaves, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """bool [N]: whether snow lies on foliage at points [N], float64."""
+    shares, total = (kernels.FOLIAGE_COARSE, kernels.FOLIAGE_FINE), np.zeros(len(x_m))
+    for share, ((a, b), (c, d)), seed in zip(
+        shares, patches.turns[-2:], patches.seeds[-2:], strict=True
+    ):
+        total += share * gradient_noise(a * x_m + b * y_m, c * x_m + d * y_m, seed)
+    return total > kernels.FOLIAGE_ABOVE
 
 
 def _pillow(t: np.ndarray) -> np.ndarray:
@@ -405,6 +421,7 @@ def arrays_of(cells: SnowCells) -> Cells:
         c.light,
         c.tracks,
         c.banks,
+        c.semantic,
     )
     return Cells(*_arrays(*columns))
 

@@ -673,6 +673,51 @@ def _pixels(line: np.ndarray, corner: np.ndarray, cell_m: float) -> np.ndarray:
     return np.round(pixels * 2**_SHIFT).astype(np.int32)[:, None]
 
 
+# ---- Foliage: of trees, bushes and hedges, through which snow falls ------------------------------
+
+# Too narrow for snow, whatever a reconstruction makes of them.
+BARE_CLASSES = (
+    SemanticClass.POLE,
+    SemanticClass.SIGN,
+    SemanticClass.PEDESTRIAN,
+    SemanticClass.TWO_WHEELER,
+)
+FOLIAGE_M = 0.6  # over the nearest ground: what is lower is grass, which snow closes over
+_CLUMP_M = 0.6  # within which the most frequent class counts
+_GROUND_CLASSES = (
+    SemanticClass.ROAD,
+    SemanticClass.LANE_MARKING,
+    SemanticClass.SIDEWALK,
+    SemanticClass.TERRAIN,
+)
+
+
+def foliage_apart(surface: Surface, classes: np.ndarray) -> np.ndarray:
+    """The classes [H, W] of a surface's cells, with VEGETATION where most of what is about them is
+    vegetation and stands over the ground nearest to it, and TERRAIN for other vegetation.
+    """
+    cell, can_carry = surface.map.cell_m, surface.can_carry
+    green = can_carry & (classes == SemanticClass.VEGETATION)
+    if not green.any():
+        return classes
+    side = 2 * max(1, round(_CLUMP_M / cell / 2)) + 1
+    around = np.ones((side, side), np.uint8)
+    ground = can_carry & np.isin(classes, _GROUND_CLASSES)  # in specks it is a crown's own noise
+    ground = cv2.morphologyEx(ground.astype(np.uint8), cv2.MORPH_OPEN, around) > 0
+    is_high = can_carry
+    if ground.any():
+        _, nearest = cv2.distanceTransformWithLabels(
+            (~ground).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        heights = np.zeros(int(nearest.max()) + 1, np.float32)
+        heights[nearest[ground]] = surface.height_m[ground]
+        is_high = can_carry & (surface.height_m - heights[nearest] > FOLIAGE_M)
+    share, of = (cv2.blur(part.astype(np.float32), around.shape) for part in (green, can_carry))
+    foliage = is_high & (share > 0.5 * of) & (classes != SemanticClass.VEHICLE)
+    rest = np.where(green & ~is_high, np.int16(SemanticClass.TERRAIN), classes)
+    return np.where(foliage, np.int16(SemanticClass.VEGETATION), rest)
+
+
 # ---- The support of a scene ----------------------------------------------------------------------
 
 _SQUARE_CELLS = 1024  # on a side of what is drawn at once, about
@@ -799,7 +844,13 @@ class _Ground:
         """The cells of one window of a level; None where it has none."""
         square = _with_margin(self._plan, *level_and_window)
         view, classes, lies, filled = self._draw(square)
-        surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
+        surface = find_surface(
+            view,
+            lies,
+            max_slope_deg=self._settings.max_slope_deg,
+            on_vehicles=lies & (classes == SemanticClass.VEHICLE),
+        )
+        classes = foliage_apart(surface, classes)
         seen = self._seen(surface, square, filled)
         rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
         if not len(rows):
@@ -862,7 +913,7 @@ class _Ground:
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
         ids = view.ids[is_ground]
         classes[is_ground] = self._classes[ids if chosen is None else chosen[ids]]
-        lies = is_ground & ~view.is_thin
+        lies = is_ground & ~view.is_thin & ~np.isin(classes, BARE_CLASSES)
         narrow = narrow_things(view, lies)
         view, filled = fill_holes(view, classes, lies, narrow, pixel_mask, self._path[:, :2])
         return view, classes, lies | filled, filled

@@ -36,6 +36,7 @@ STEP_M = 0.25  # lower steps do not break a layer: kerbs
 _AROUND_M = 0.4  # of a cell: steps are told by the heights within
 _NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: wires, arms of lamps
 _HIGH_M2 = 0.6  # smaller patches so high up are ledges, and what floats before walls
+_LINEAR = 0.85  # share of a patch that is high above what is beside it: wires, tops of fences
 _GAP_M = 0.6  # wider gaps may be deep
 _STANDS_OUT_M = 0.1  # of a surface, so that it is not bridged
 MIN_AREA_M2, MIN_CELLS = 0.05, 4  # smaller patches are specks
@@ -71,13 +72,16 @@ def find_surface(
     max_slope_deg: float,
     min_area_m2: float = MIN_AREA_M2,
     floor_m: float | None = None,
+    on_vehicles: np.ndarray,
 ) -> Surface:
     """The surface of a map, and where snow stays on it.
 
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
     within the map and are smaller than min_area_m2 or MIN_CELLS carry nothing. floor_m: how
-    high that lies which the map does not show; None for deep but in small gaps.
+    high that lies which the map does not show; None for deep but in small gaps. on_vehicles: bool
+    [H, W], where it is a vehicle's body, see `_vehicle_tops` and `_is_vehicle_top`.
     """
+    height_map = _vehicle_tops(height_map, on_vehicles)
     cell, covered = height_map.cell_m, height_map.covered.copy()
     shape = covered.shape
     smooth, fitted = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -97,6 +101,9 @@ def find_surface(
     steep = np.hypot(slopes[..., 0], slopes[..., 1]) > math.tan(limit)
     can_carry = good & may_carry & ~_is_narrow(fitted, covered & may_carry, floor, cell)
     can_carry &= ~(steep & (rises > _highest_step(limit, cell)))
+    can_carry &= ~on_vehicles | _is_vehicle_top(
+        fitted, covered, can_carry & on_vehicles, limit, cell
+    )
     step = max(STEP_M, math.tan(limit) * cell)
     sides = _compare(fitted, lowest, covered, can_carry, step)
     least = max(MIN_CELLS, math.ceil(min_area_m2 / cell**2))
@@ -205,7 +212,8 @@ def _specks(
     can_carry: np.ndarray, sides: np.ndarray, is_high: np.ndarray, least: int, least_high: int
 ) -> np.ndarray:
     """bool [H, W]: cells in patches of fewer than `least` linked cells that end within the grid;
-    of fewer than `least_high` where all of them are high above something beside.
+    of fewer than `least_high` where all of them are high above something beside. Also patches that
+    are high above it nearly everywhere, whatever their length: they are nowhere wide.
 
     cv2 finds patches of pixels; links become pixels between those of the cells.
     """
@@ -220,9 +228,53 @@ def _specks(
     labels = labels.astype(np.int64)
     sizes = np.bincount(labels.ravel(), minlength=count)
     low = np.bincount(labels[can_carry & ~is_high], minlength=count)
+    is_linear = low <= (1 - _LINEAR) * sizes
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         sizes[border] = least_high  # it may go on outside
-    return sizes[labels] < np.where(low > 0, least, least_high)[labels]
+    return (is_linear | (sizes < np.where(low > 0, least, least_high)))[labels]
+
+
+# ---- Vehicles: a reconstruction leaves shells, tufts and slivers on their sides ------------------
+
+VEHICLE_MAX_SLOPE_DEG = 38.0  # wind screens carry snow, side and rear windows do not
+_SHELL_M = 0.3  # narrower dips in a roof or bonnet are gaps between shells
+_BODY_M = 0.1  # standard deviation of the blur that slopes of bodies are measured by
+_SLIVER_M = 0.3  # narrower strips are sills, mirrors and the rims of doors
+
+
+def _vehicle_tops(height_map: HeightMap, on_vehicles: np.ndarray) -> HeightMap:
+    """The map with a vehicle's height everywhere at the top of what surrounds it closely."""
+    covered = on_vehicles & height_map.covered
+    if not covered.any():
+        return height_map
+    tops = np.where(covered, height_map.height_m, np.float32(-1e6))
+    tops = cv2.morphologyEx(tops, cv2.MORPH_CLOSE, _disc(_SHELL_M, height_map.cell_m))
+    tops = np.where(covered, tops, height_map.height_m)
+    return dataclasses.replace(height_map, height_m=tops)
+
+
+def _is_vehicle_top(
+    height: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, limit: float, cell: float
+) -> np.ndarray:
+    """bool [H, W]: cells of vehicles that can carry snow which lie on a roof or bonnet: level, well
+    inside its rim, and no sliver. A step blurred by sigma is as steep as h / (sigma sqrt(2 pi)), so
+    that the rim of a door is told from the roof's curvature.
+    """
+    if not can_carry.any():
+        return can_carry
+    sigma = max(_BODY_M / cell, 0.5)
+    weights = covered.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), sigma)
+    mean = cv2.GaussianBlur(height * weights, (0, 0), sigma) / np.maximum(total, np.float32(1e-6))
+    steepest = math.tan(min(limit, math.radians(VEHICLE_MAX_SLOPE_DEG)))
+    level = can_carry & (np.hypot(*_gradient(mean)) <= steepest * cell)
+    return cv2.morphologyEx(level.astype(np.uint8), cv2.MORPH_OPEN, _disc(_SLIVER_M, cell)) > 0
+
+
+def _disc(width_m: float, cell: float) -> np.ndarray:
+    """A round structuring element, of one cell at least."""
+    side = 2 * round(width_m / cell / 2) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
 def _fill_pockets(
@@ -429,7 +481,7 @@ MOVES_M = 0.5  # an actor that goes less far is parked
 DRIVEN_MAX_SLOPE_DEG = 25.0  # drivers clear their windows, and what is steeper slides off
 _BOTTOM_M = 0.25  # of the box: there are wheels, and the shadow on the road
 _MARGIN_M = 0.3  # beyond the box: mirrors, and boxes that are too small
-_PATCH_M2 = 0.02
+_PATCH_M2 = 0.15
 _GROUND = tuple(SemanticClass[n] for n in ("ROAD", "LANE_MARKING", "SIDEWALK", "TERRAIN"))
 
 
@@ -489,7 +541,12 @@ def find_actor_cells(
     body_only[[0, -1]] = body_only[:, [0, -1]] = False  # an edge all round, even of what is cut off
     view = dataclasses.replace(view, alpha=np.where(body_only, view.alpha, np.float32(0)))
     surface = find_surface(
-        view, body_only, max_slope_deg=limit, min_area_m2=_PATCH_M2, floor_m=float(bottom)
+        view,
+        body_only,
+        max_slope_deg=limit,
+        min_area_m2=_PATCH_M2,
+        floor_m=float(bottom),
+        on_vehicles=body_only,
     )
     rows, columns = np.nonzero(surface.can_carry)
     if len(rows) * cell**2 < MIN_ACTOR_AREA_M2:
