@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pandaset_folder
-import pytest
 import torch
 from test_image_views import camera
 
@@ -14,10 +13,10 @@ from adapters.lidar_scene.image_views import View
 from adapters.lidar_scene.split import PointSet, join_tracks
 from adapters.pandaset import open_pandaset
 from adapters.raw_drive import BoxSample
-from augment.metrics.openings import measure_openings
-from augment.scene import Gaussians, Scene
+from augment.render.buffers import ALPHA
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians
 from augment.semantics import SemanticClass as Class
-from augment.sky import ConstantSky
 
 GREY, RED = (90, 90, 90), (200, 30, 30)
 HEIGHT_M = 1.5  # of the camera, over the road
@@ -116,22 +115,7 @@ def test_a_raw_scene_has_no_openings_below_the_horizon(tmp_path):
     scene = open_pandaset(str(root), {"voxel_m": "0.1", "image_scale": "1", "sky_size": "8"})
     for frame in scene.frames:
         for own in frame.cameras.values():
-            found = measure_openings(scene, own)
-            assert found.pixels > 0.4 * own.width * own.height
-            assert found.no_surface < 0.002 and found.leaking < 0.03, (frame.index, own.name, found)
-
-
-def test_openings_are_pixels_below_the_horizon_without_a_surface():
-    background, _ = road(6.0)
-    scene = Scene("road", "", background, (), ConstantSky(torch.zeros(3)), ())
-    cam = camera()
-    found = measure_openings(scene, cam)
-    # The road begins 6 m away: at 1.5 / 6 of the focal length below the horizon.
-    rows = (np.arange(cam.height) + 0.5 - cam.cy) / cam.fy
-    expected = (rows > HEIGHT_M / 6.0).sum() / (rows > 0).sum()
-    assert found.no_surface == pytest.approx(expected, abs=0.06)
-    assert found.leaking >= found.no_surface
-    below = torch.arange(cam.height)[:, None].expand(-1, cam.width) > cam.cy + cam.fy / 6
-    assert measure_openings(scene, cam, below).no_surface < 0.1  # beyond its end
-    nothing = torch.ones(cam.height, cam.width, dtype=torch.bool)
-    assert measure_openings(scene, cam, nothing) == (0, 0.0, 0.0)
+            alpha = rasterize(scene.parts_for(own), own, buffers=(ALPHA,)).alpha
+            alpha = alpha[own.ray_directions()[..., 2] < 0]
+            assert (alpha < 0.5).float().mean() < 0.002, (frame.index, own.name)
+            assert (alpha < 0.98).float().mean() < 0.03, (frame.index, own.name)
