@@ -43,7 +43,7 @@ MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog 
 # 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
 MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
 HORIZON_RAD = math.radians(1.5)  # roads slope, and poses are off by as much
-MAX_MAGNIFICATION = 1.5  # splats narrower than a learnt pixel become needles above
+MAX_MAGNIFICATION = 1.5  # nothing finer was learnt; thin splats become needles
 MAX_DISTANCE_M = 2.0  # half a lane and more: the sides of parked cars appear that nobody has seen
 MAX_ANGLE_RAD = math.radians(15)  # a quarter of a camera 60 degrees wide looks past what it saw
 
@@ -159,7 +159,8 @@ def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
         return None
     return (
         f"rendered {scale / learnt_scale:.1f} times as large as it was learnt (limit "
-        f"{MAX_MAGNIFICATION:g}): thin splats show as needles; render smaller, or fit larger"
+        f"{MAX_MAGNIFICATION:g}): nothing finer was learnt, and thin splats may show as "
+        f"needles; render smaller, or fit larger"
     )
 
 

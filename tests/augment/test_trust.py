@@ -268,3 +268,15 @@ def test_extremes_give_figures_and_no_nan():
     assert "frame 0 cannot be drawn" in broken.problems[0]
     no_up = dataclasses.replace(scene, has_known_gravity=False)
     assert judge_view(no_up, camera, 0).ground_open is None
+
+
+@pytest.mark.long
+def test_masks_do_not_depend_on_workers_or_order(tmp_path):
+    """The graph cut's colours begin at random: in every thread and process alike."""
+    drive = recorded(open_street(), tmp_path)
+    masks = []
+    for name, options in {"one": {}, "two": {"workers": 2}, "late": {"frames": [1]}}.items():
+        run(tmp_path / name, drive, small_recipe(trust=True), **options)
+        rows = read_manifest(tmp_path / name).to_pylist()
+        masks.append({r["frame"]: (tmp_path / name / r["trust_path"]).read_bytes() for r in rows})
+    assert masks[0] == masks[1] and masks[2] == {1: masks[0][1]}
