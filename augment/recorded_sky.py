@@ -150,13 +150,13 @@ def _sweep(scene: Scene, frame: Frame) -> np.ndarray | None:
         return None
     if sweep is None:
         return None
-    points = sweep.points_m - np.asarray(scene.world_origin_m)
+    points = (sweep.points_m - np.asarray(scene.world_origin_m)).astype(np.float32)
     return points[np.isfinite(points).all(1)]
 
 
 def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Pixels with a return."""
-    pose = camera.camera_from_world.numpy()
+    pose = camera.camera_from_world.numpy().astype(np.float32)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     local = local[local[:, 2] > 0.5]
     u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx)
@@ -169,7 +169,7 @@ def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _top_rad(points: np.ndarray, camera: Camera) -> float:
     """The highest elevation of returns that are not close, a few stray ones left out."""
-    offset = points - camera.centre.numpy()
+    offset = points - camera.centre.numpy().astype(np.float32)
     distance_m = np.hypot(offset[:, 0], offset[:, 1])
     far = distance_m > _TOP_FROM_M
     if not far.any():

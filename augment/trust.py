@@ -38,12 +38,12 @@ from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
 
 SKY_FROM_M = 200.0  # a surface this far fades in any fog and casts no pane
-MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through what lets by more
+MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine through
 MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog is 20/255 and shows
 # 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
 MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
 HORIZON_RAD = math.radians(1.5)  # roads slope, and poses are off by as much
-MAX_MAGNIFICATION = 1.5  # splats narrower than a learnt pixel become needles above
+MAX_MAGNIFICATION = 1.5  # nothing finer was learnt; thin splats become needles
 MAX_DISTANCE_M = 2.0  # half a lane and more: the sides of parked cars appear that nobody has seen
 MAX_ANGLE_RAD = math.radians(15)  # a quarter of a camera 60 degrees wide looks past what it saw
 
@@ -159,7 +159,8 @@ def magnified_sentence(learnt_scale: float | None, scale: float) -> str | None:
         return None
     return (
         f"rendered {scale / learnt_scale:.1f} times as large as it was learnt (limit "
-        f"{MAX_MAGNIFICATION:g}): thin splats show as needles; render smaller, or fit larger"
+        f"{MAX_MAGNIFICATION:g}): nothing finer was learnt, and thin splats may show as "
+        f"needles; render smaller, or fit larger"
     )
 
 
@@ -421,9 +422,10 @@ def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarr
 class ViewTrust:
     """Shares of one judged view, 0 to 1. sky_covered: of the sky, what has a surface nearer than
     SKY_FROM_M; None where the sky is unknown or absent. ground_open, ground_leaks: of what lies
-    below the horizon, the recording car left out, what has no surface, and what lets by more than
-    MAX_TRANSMITTANCE; None where nothing lies there or up is unknown. own_car: of all pixels.
-    reach_m: distance within which 95 % of the surfaces lie; None without any.
+    below the horizon, the recording car left out, what has no surface, and what lets more than
+    MAX_TRANSMITTANCE of the light through; None where nothing lies there or up is unknown.
+    own_car: of all pixels. reach_m: distance within which 95 % of the surfaces lie; None without
+    any.
     """
 
     frame: int
@@ -547,9 +549,12 @@ def _judge_camera(
     )
     middles = [held[(2 * k + 1) * len(held) // (2 * count)] for k in range(count)] if held else []
     drawn = {} if is_unfitted else {f.index: f.cameras[name] for f in middles}
-    views = tuple(
-        judge_view(scene, _small(camera), index, backend=backend) for index, camera in drawn.items()
-    )
+    views, failed = list[ViewTrust](), list[str]()
+    for index, camera in drawn.items():
+        try:
+            views.append(judge_view(scene, _small(camera), index, backend=backend))
+        except Exception as error:  # as in a job: one bad frame is named, and the others go on
+            failed.append(f"frame {index} cannot be drawn: {error}")
     centres = [view.camera.centre for view in own]
     steps = [float((b - a).norm()) for a, b in itertools.pairwise(centres)]
     found = CameraTrust(
@@ -559,10 +564,10 @@ def _judge_camera(
         seen_path_m=sum(steps, 0.0),
         nearest=farthest,
         away=away,
-        views=views,
+        views=tuple(views),
         problems=(),
     )
-    problems = _problems(found, is_unfitted, len(held))
+    problems = failed + _problems(found, is_unfitted, len(held))
     if farthest is not None and scale is not None and not is_unfitted:
         magnified = magnified_sentence(1 / farthest.magnification, 1.0)
         problems += [] if magnified is None else [magnified]
@@ -599,8 +604,8 @@ def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
     open_too = worst is not None and leaks is not None and leaks[1] < 2 * worst[1]
     if leaks is not None and leaks[1] > MAX_GROUND_OPEN and not open_too:
         found.append(
-            f"{_percent(leaks[1])} of the ground lets by more than "
-            f"{_percent(MAX_TRANSMITTANCE)} of the light behind it{_where(own, leaks)}"
+            f"{_percent(leaks[1])} of the ground lets more than {_percent(MAX_TRANSMITTANCE)} of "
+            f"the light behind it through{_where(own, leaks)}"
         )
     covered = _worst(own.views, "sky_covered")
     if covered is not None and covered[1] > MAX_SKY_COVERED:

@@ -153,7 +153,7 @@ class Weather(Closed):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("exposure", "transmittance_stop", "radius_clip_px")
+    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px")
     knobs = (
         Knob(
             "scale",
@@ -173,6 +173,9 @@ class Render(Section):
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
 
+    base: Literal["splats", "recorded"] = "splats"
+    """splats draws the scene; recorded keeps each camera's recorded image as the picture and takes
+    only the weather from the scene: at recorded poses, with a scale of at most 1."""
     scale: Number = Field(default=1.0, gt=0, le=4)
     """Resolution relative to the cameras'."""
     near_m: Number = Field(default=0.01, gt=0, le=100)
@@ -194,6 +197,18 @@ class Render(Section):
     radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
     """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
     picture, are left out; 0 leaves out none."""
+
+
+class Sensor(Section):
+    """What the camera adds to what reaches it, after all weather; depth, classes, masks and labels
+    know nothing of it.
+    """
+
+    noise: Number = Field(default=0.0, ge=0, le=0.2)
+    """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
+    255."""
+    psf_px: Number = Field(default=0.0, ge=0, le=16)
+    """Sigma of the lens's blur, pixels of the rendered picture."""
 
 
 class Output(Section):
@@ -256,6 +271,7 @@ class Recipe(Closed):
     style: Style | None = None
     quality: Quality = Quality()
     render: Render = Render()
+    camera: Sensor = Sensor()
     output: Output = Output()
 
     @model_validator(mode="after")
@@ -279,6 +295,7 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
+        left_out += [] if self.camera != Sensor() else ["camera"]
         left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
         left_out += [
             f"{path}.{name}"

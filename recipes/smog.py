@@ -18,7 +18,7 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
-    later_fields = ("overcast",)
+    later_fields = ("overcast", "scatter")
     meant_by = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
@@ -59,6 +59,9 @@ class Smog(EffectModel):
     """How much brighter airlight is above the horizon, and darker towards the road: 0 is one colour
     in all directions, 0.5 what light scattered in thick fog over asphalt comes to, 1 an overcast
     sky, whose zenith has three times the horizon's luminance."""
+    scatter: Number = Field(default=0.0, ge=0, le=4)
+    """Forward scatter, which blurs what stands deep in fog: 1 for all that droplets of 20 um
+    diffract, 0 for none, as of the finer particles of smog and haze."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:

@@ -47,7 +47,7 @@ from tools.output import print_note
 EVALUATIONS = 10
 CHECKPOINT_S = 120.0
 RESERVE = 0.05  # of the time, for evaluations and checkpoints
-VERSION = 2
+VERSION = 3
 PLAN_FILE, REPORT_FILE = "fit.json", "report.json"
 _STATES = "state-*.safetensors"
 _STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"

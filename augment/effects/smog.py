@@ -17,24 +17,27 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
+from augment.base_photo import RECORDED
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
-from augment.effects.effect import Active, Effect, EffectView, Placed, Step, skipped
+from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
 from augment.jobs.box_tables import BoxTable
-from augment.render.buffers import EXPECTED_DEPTH
+from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
+from augment.render.scatter import scatter_forward
 from augment.scene import Scene
+from augment.timing import timed
 from recipes.schema import Recipe, Smog
 from recipes.smog import KOSCHMIEDER
 
 # ---- The effect ----------------------------------------------------------------------------------
 
 PER_GAUSSIAN, ON_BUFFERS = "smog per Gaussian", "smog on buffers"
-ELEVATION, SKY = "airlight by elevation", "sky"
+ELEVATION, SKY, SCATTER = "airlight by elevation", "sky", "forward scatter"
 DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is inverted
 
 
@@ -42,11 +45,13 @@ DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is i
 class PlacedSmog:
     """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat.
     is_common: whether the mean of the cameras' exposures gives its colour in all of them.
+    scatter: strength of the forward scatter.
     """
 
     fog: Fog
     on_buffers: bool
     is_common: bool = False
+    scatter: float = 0.0
 
 
 class SmogEffect(Effect):
@@ -69,12 +74,16 @@ class SmogEffect(Effect):
         smog = self.of(recipe)
         fog, reason = _in_heights(smog, scene)
         if fog is None:
-            return Placed(None, skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason))
+            nothing = skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
+            return Placed(None, (*nothing, *skipped((SCATTER,), reason, PICTURE)))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
-        on_buffers = smog.model == "deferred"
+        on_photo = recipe.render.base == RECORDED
+        on_buffers = on_photo or smog.model == "deferred"
         other = "weather.smog.model chooses the other way"
+        if on_photo:
+            other = "render.base is 'recorded': the photo's pixels are faded by their depth"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
@@ -83,15 +92,31 @@ class SmogEffect(Effect):
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
             Step(ELEVATION, fog.overcast > 0, f"weather.smog.overcast is {fog.overcast:g}"),
             sky,
+            Step(SCATTER, smog.scatter > 0, f"weather.smog.scatter is {smog.scatter:g}", PICTURE),
         )
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.overcast > 0 else set[str]()
-        return Placed(PlacedSmog(fog, on_buffers, is_common), steps, frozenset(buffers))
+        if smog.scatter > 0:
+            buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
+        data = PlacedSmog(fog, on_buffers, is_common, smog.scatter)
+        return Placed(data, steps, frozenset(buffers))
 
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
         fog, common = own.data.fog, own.scene.common_color_map
         if own.data.is_common and common is not None:
             fog = before_map(fog, own.scene.color_map(camera), common)
         return replace(layers, fog=fog, fog_on_buffers=own.data.on_buffers)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        if own.data.scatter == 0:
+            return drawn
+        alpha, depth = drawn.raster.alpha, drawn.raster.median_depth
+        assert alpha is not None and depth is not None
+        fog, strength = own.data.fog, own.data.scatter
+        with timed(SCATTER):
+            rgb = scatter_forward(
+                drawn.rgb, alpha, depth, camera, fog, strength, backend=own.backend
+            )
+        return replace(drawn, rgb=rgb)
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView

@@ -29,6 +29,7 @@ from augment.jobs.worker import Renderer, default_renderer
 from augment.memo import memo_of
 from augment.metrics.image import flip
 from augment.scene import Scene
+from recipes.fields import replaced
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
 
 # ---- One picture for the sake of its time and its errors, at the size of its reference -----------
@@ -234,6 +235,7 @@ class Bench:
 
     def _trial(self, view: View, settings: Settings) -> Trial:
         recipe = resolved_recipe(self.recipe, settings)
+        recipe = replaced(recipe, "camera.noise", 0.0)  # of another size it is other noise
         if self.cameras is not None and self.renderer is None:
             # Else pictures would find it for the scene's own cameras.
             share_effects(Sharing(self.scene, [recipe], self.cameras, backend=self.backend))

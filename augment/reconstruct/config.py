@@ -15,13 +15,16 @@ class LossWeights:
     """Loss of one view = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 (mean over weighted pixels)
     + depth * mean |1/ED - 1/z| over the pixels with a depth prior (1/m)
     + surface * mean (1 - alpha) over the same pixels, so that ground and walls have no holes
-    + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count).
+    + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count)
+    + ground * mean (1 - alpha) over those below the horizon that are no sky (likewise): weather
+    fills what is left open there with what lies infinitely far away.
     """
 
     d_ssim: float = 0.2
     depth: float = 2.0
     surface: float = 0.05
-    sky: float = 0.05
+    sky: float = 0.15
+    ground: float = 0.2
 
 
 class FitConfig(BaseModel):

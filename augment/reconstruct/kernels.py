@@ -565,6 +565,45 @@ def _three(array, at):
     return np.float64(array[at]), np.float64(array[at + U(1)]), np.float64(array[at + U(2)])
 
 
+# ---- Numba kernel: what one view can tell of where splats are
+
+_NEAR_M = np.float32(0.2)
+_BEYOND = np.float32(0.15)  # of the image's size: centres this far outside still reach into it
+_SKY_PX = 2  # pixels of sky around a splat's centre: masks are good to one
+
+
+@kernel
+def sight(means, pose, intrinsics, sky, px_per_m, seen, in_sky):
+    """Brings up to date, for a part's splats, the most pixels per metre that a view has there, and
+    counts views that they are inside of, and those whose sky they lie in.
+
+    means float32 [N, 3]. pose: camera_from_part, float32 [4, 4]. intrinsics: fx, fy, cx, cy. sky:
+    bool [H, W]. px_per_m float32 [N], seen, in_sky int32 [N].
+    """
+    height, width = sky.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    left, right = -_BEYOND * width, (1 + _BEYOND) * width
+    top, bottom = -_BEYOND * height, (1 + _BEYOND) * height
+    for i in prange(means.shape[0]):
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if not depth > _NEAR_M:
+            continue
+        u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
+        v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
+        if not (left < u < right and top < v < bottom):
+            continue
+        px_per_m[i] = max(px_per_m[i], fx / depth)
+        column, row = math.floor(u), math.floor(v)
+        if not (0 <= column < width and 0 <= row < height):
+            continue
+        seen[i] += 1
+        up, down = max(row - _SKY_PX, 0), min(row + _SKY_PX, height - 1)
+        before, after = max(column - _SKY_PX, 0), min(column + _SKY_PX, width - 1)
+        if sky[row, column] and sky[up, column] and sky[down, column]:
+            in_sky[i] += sky[row, before] and sky[row, after]
+
+
 # ---- Adam on the splats that a view touched, in the arrays that the rasteriser reads -------------
 # Values are kept activated: a step on the logarithm of a scale multiplies it, a step on the logit
 # of an opacity divides its odds, quaternions are turned along the sphere and normalised. Kingma &
@@ -613,6 +652,7 @@ class AdamState(NamedTuple):
     sh_v: np.ndarray
     age: np.ndarray
     grads: np.ndarray
+    smallest: np.ndarray
 
 
 @kernel
@@ -627,7 +667,7 @@ def update_splats(
     `bias_corrections` gives them, flat. state: AdamState.
     """
     rows, ids, counts = gradients.rows, gradients.ids, gradients.counts
-    age, grads = state.age, state.grads
+    age, grads, smallest = state.age, state.grads, state.smallest
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
         count, total = sizes[part]
@@ -657,7 +697,7 @@ def update_splats(
                 first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
                 _update_geometry(
                     (means, quats, scales, opacities), splat, rows, row,
-                    basis[U(_FUNCTIONS * LANES) + lane], rates, (first, second),
+                    basis[U(_FUNCTIONS * LANES) + lane], rates, smallest[one], (first, second),
                     (state.geometry_m, state.geometry_v), one * U(GEOMETRY), work,
                 )  # fmt: skip
                 _update_sh(
@@ -704,7 +744,7 @@ def _adam8(g, rates, first, second, m, m_at, v, v_at):
 
 
 @inner()
-def _update_geometry(splats, splat, rows, row, pixel_m, rates, bias, moments, at, work):
+def _update_geometry(splats, splat, rows, row, pixel_m, rates, smallest, bias, moments, at, work):
     means, quats, scales, opacities = splats
     (first, second), (m, v) = bias, moments
     one = np.float32(1)
@@ -717,6 +757,7 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, bias, moments, at
     v8.store(work, U(8), factors)
     for i in range(U(3)):
         means[U(3) * splat + i] -= pixel_m * work[i]
+    least = max(smallest, rates[R_SMALLEST])
     norm = np.float32(0)
     for i in range(U(4)):
         q = quats[U(4) * splat + i] - work[U(G_QUAT) + i]
@@ -727,7 +768,7 @@ def _update_geometry(splats, splat, rows, row, pixel_m, rates, bias, moments, at
         quats[U(4) * splat + i] *= norm
     for i in range(U(3)):
         s = scales[U(3) * splat + i] * work[U(G_SCALE) + i]
-        scales[U(3) * splat + i] = min(max(s, rates[R_SMALLEST]), rates[R_LARGEST])
+        scales[U(3) * splat + i] = min(max(s, least), rates[R_LARGEST])
     odds = (one - o) / o * work[U(G_OPACITY)]
     opacities[splat] = min(max(one / (one + odds), _FAINTEST), _FULLEST)
 

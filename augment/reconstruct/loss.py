@@ -2,7 +2,7 @@
 
     picture = color_map(rgb + (1 - alpha) sky(direction))
     total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + surface (1 - alpha)
-            + sky alpha
+            + sky alpha + ground (1 - alpha)
 
 each a weighted mean as `LossWeights` says. A test holds it to its torch definition. SSIM is that of
 3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of sigma 1.5, zeros
@@ -191,9 +191,11 @@ def view_loss(
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
         depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
         surface = _compare_surface(alpha, view, weights, buffers)
+        ground = _compare_ground(alpha, view, weights, buffers)
         d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
     total += weights.depth * depth + weights.surface * surface + weights.sky * sky
+    total += weights.ground * ground
     return ViewLoss(
         total=total, l1=l1, ssim=ssim, depth=depth, sky=sky, d_rgb=buffers.d_rgb,
         d_alpha=buffers.d_alpha, d_expected_depth=buffers.d_expected_depth, d_color_map=d_color_map,
@@ -251,6 +253,21 @@ def _compare_surface(
     buffers.d_alpha.reshape(-1)[pixels] -= share
     transmittance = (1 - alpha.reshape(-1)[pixels]) * view.depth_weight
     return float(transmittance.sum(dtype=np.float64)) / weight_sum
+
+
+def _compare_ground(
+    alpha: np.ndarray, view: RecordedView, weights: LossWeights, buffers: ImageBuffers
+) -> float:
+    """Mean over the image of 1 - alpha below the horizon, where no sky is; its gradient to the
+    buffers.
+    """
+    camera = view.camera
+    right, down, ahead = camera.world_from_camera[2, :3].tolist()  # heights of the camera's axes
+    column = (np.arange(camera.width) + 0.5 - camera.cx) * (right / camera.fx)
+    row = (np.arange(camera.height) + 0.5 - camera.cy) * (down / camera.fy) + ahead
+    below = (column[None] < -row[:, None]) & ~view.sky
+    buffers.d_alpha -= below * np.float32(weights.ground / alpha.size)
+    return float(below.sum() - alpha[below].sum(dtype=np.float64)) / alpha.size
 
 
 def _compare_depth(

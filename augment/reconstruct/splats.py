@@ -30,7 +30,7 @@ class Splats:
     [N, K, 3]: Adam's moments. age: int32 [N], updates so far. grads: float32 [N, 3], since the
     last densification: sum of the image gradients' absolute size (pixels of the image's width and
     height normalised to [-1, 1]), count of the views that saw the splat, and largest radius seen
-    as a part of the image's larger side.
+    as a part of the image's larger side. smallest: float32 [N], metres, see `bound_sizes`.
     """
 
     starts: np.ndarray
@@ -46,6 +46,7 @@ class Splats:
     sh_v: np.ndarray
     age: np.ndarray
     grads: np.ndarray
+    smallest: np.ndarray
 
     def __len__(self) -> int:
         return len(self.means)
@@ -86,7 +87,7 @@ class Splats:
             semantic=semantic, geometry_m=np.zeros((total, GEOMETRY), np.float32),
             geometry_v=np.zeros((total, GEOMETRY), np.float32), sh_m=np.zeros_like(sh),
             sh_v=np.zeros_like(sh), age=np.zeros(total, np.int32),
-            grads=np.zeros((total, 3), np.float32),
+            grads=np.zeros((total, 3), np.float32), smallest=np.zeros(total, np.float32),
         )  # fmt: skip
 
     def gaussians(self, part: int) -> Gaussians:
@@ -189,12 +190,19 @@ def densify_due(growth: Growth, step: int, steps: int) -> bool:
     return growing and step > 0 and step % growth.every == 0
 
 
-def densify(splats: Splats, growth: Growth, *, max_splats: int, extent_m: float) -> Splats:
-    """One round: removes the faint and the unusable, then doubles the best others.
+def densify(
+    splats: Splats,
+    growth: Growth,
+    *,
+    max_splats: int,
+    extent_m: float,
+    refuted: np.ndarray | None = None,
+) -> Splats:
+    """One round: removes the faint, the refuted and the unusable, then doubles the best others.
 
-    If all splats are faint, only unusable ones go: a scene is never emptied. extent_m: how far the
-    scene reaches, against which absurd sizes show. The result's arrays are its own, part after
-    part, children next to their parents, grads zero.
+    If none would be left, only unusable ones go: a scene is never emptied. extent_m: how far the
+    scene reaches, against which absurd sizes show. refuted: bool [N], see `Sightings`. The result's
+    arrays are its own, part after part, children next to their parents, grads zero.
 
     Raises:
         SceneError: no splat is usable any more.
@@ -206,6 +214,8 @@ def densify(splats: Splats, growth: Growth, *, max_splats: int, extent_m: float)
             f"diverged; lower its learning rates, or begin again from an earlier checkpoint"
         )
     keep = good & (splats.opacities >= growth.prune_opacity)
+    if refuted is not None:
+        keep &= ~refuted
     if not keep.any():
         keep = good
     kept = int(keep.sum())
@@ -224,6 +234,7 @@ def densify(splats: Splats, growth: Growth, *, max_splats: int, extent_m: float)
     # equal splats at one place would otherwise stay together for long.
     rest(grown, first + 1)
     _split(grown, first[large[chosen]])
+    bound_sizes(grown)
     return grown
 
 
@@ -271,6 +282,62 @@ def _split(splats: Splats, first: np.ndarray) -> None:
     splats.means[first + 1] -= offset
     splats.scales[first] = splats.scales[first + 1] = scales / shrink
     rest(splats, first)
+
+
+# ---- What the recorded images can tell of a splat: how small it may be, and that it is not there -
+
+# Of the low-pass filter of Mip-Splatting (Yu et al. 2024, eq. 9; s^2 = 0.2 as there), in pixels of
+# the view that resolves a splat best.
+FILTER_PX = float(np.sqrt(0.2))
+MIN_IN_SKY = 2  # views whose sky a splat must lie in ...
+REFUTED_PART = 0.25  # ... and of those that it is inside of: others may hide it behind a wall
+
+
+class Sightings:
+    """Of N splats, over views: float32 the most pixels per metre that one of them has there, int32
+    the number of views that they are inside of, and of those whose sky they lie in.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.px_per_m = np.zeros(count, np.float32)
+        self.seen = np.zeros(count, np.int32)
+        self.in_sky = np.zeros(count, np.int32)
+
+    def add(
+        self,
+        splats: Splats,
+        part: int,
+        world_from_part: np.ndarray,
+        camera: Camera,
+        sky: np.ndarray,
+    ) -> None:
+        """One view of one part. world_from_part: float64 [4, 4]. sky: bool [H, W]."""
+        own = slice(int(splats.starts[part]), int(splats.starts[part + 1]))
+        pose = camera.camera_from_world.numpy() @ world_from_part
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        with kernel_threads():
+            kernels.sight(
+                splats.means[own], pose.astype(np.float32), intrinsics, sky,
+                self.px_per_m[own], self.seen[own], self.in_sky[own],
+            )  # fmt: skip
+
+    @property
+    def refuted(self) -> np.ndarray:
+        """bool [N]: who lies before the sky of several images. The sky is infinitely far away:
+        nothing can be there, however well it fits another image.
+        """
+        return (self.in_sky >= MIN_IN_SKY) & (self.in_sky >= REFUTED_PART * self.seen)
+
+
+def bound_sizes(splats: Splats) -> None:
+    """No axis is thinner than `smallest`, in place.
+
+    Mip-Splatting adds the filter to what it learns and dims it by the ratio of volumes. Here what
+    is learnt is the filtered size itself, bounded from below: the same sizes, but flat splats on
+    measured surfaces may be opaque, which that ratio forbids. The scene holds them as they are
+    learnt, so that no frame pays for a filter.
+    """
+    np.maximum(splats.scales, splats.smallest[:, None], out=splats.scales)
 
 
 # ---- Step sizes of one update, as the kernel takes them ------------------------------------------

@@ -34,12 +34,16 @@ from augment.reconstruct.loss import (
 )
 from augment.reconstruct.splats import (
     CORRECTIONS,
+    FILTER_PX,
     ColorAdam,
     DenseAdam,
+    Sightings,
     Splats,
+    bound_sizes,
     decayed,
     densify,
     densify_due,
+    rebuild,
     splat_rates,
 )
 from augment.reconstruct.view import ViewKey, ViewSource
@@ -557,6 +561,10 @@ class Trainer:
         self.actor_poses = ActorPoses(scene.actors)
         self.camera_poses = CameraPoses(source)
         self._extent_m = _extent(source)
+        self._skies = {key: np.packbits(source.load(key).sky) for key in source.train}
+        kept = ~self._look(with_actors=True)
+        self.splats = rebuild(self.splats, np.flatnonzero(kept | ~kept.any()))
+        bound_sizes(self.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
     def run_step(self) -> StepRecord:
@@ -734,8 +742,27 @@ class Trainer:
         config, growth = self._config, self._tuning.growth
         if config.densify != "none" and densify_due(growth, self.step, self._steps):
             self.splats = densify(
-                self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m
-            )
+                self.splats, growth, max_splats=config.max_splats, extent_m=self._extent_m,
+                refuted=self._look(with_actors=False),
+            )  # fmt: skip
+
+    def _look(self, *, with_actors: bool) -> np.ndarray:
+        """Brings the least sizes up to date by all training views, of actors where asked for (they
+        hardly change: children inherit them). Returns which splats the sky refutes, bool [N]: of
+        the background alone, since boxes say that actors are there.
+        """
+        found = Sightings(len(self.splats))
+        for key, bits in self._skies.items():
+            camera = self.camera_poses.corrected(self._source.camera(key))
+            count = camera.height * camera.width
+            sky = np.unpackbits(bits, count=count).view(np.bool_)
+            sky = sky.reshape(camera.height, camera.width)
+            parts = self._posed(camera) if with_actors else _PosedParts([0], np.eye(4)[None])
+            for part, pose in zip(parts.numbers, parts.poses, strict=True):
+                found.add(self.splats, part, pose, camera, sky)
+        shown = found.px_per_m > 0
+        self.splats.smallest[shown] = FILTER_PX / found.px_per_m[shown]
+        return found.refuted & (self.splats.part_of == 0)
 
 
 @dataclass(frozen=True, eq=False)

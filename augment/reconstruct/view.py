@@ -24,7 +24,7 @@ class RecordedView:
 
     camera: at the training resolution, H x W. rgb: uint8 [H, W, 3].
     weight: float32 [H, W], how much a pixel counts; 0 where it must not be learnt from.
-    sky: bool [H, W], pixels that surely show sky: opacity is pulled to 0 there.
+    sky: bool [H, W], pixels that show sky: opacity is pulled to 0 there.
     depth_pixels: int32 [M], flat indices (row W + column), increasing; depth_m: float32 [M], z of
     the depth prior there; depth_weight: float32 [M], how much each is trusted.
     """

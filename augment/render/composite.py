@@ -95,7 +95,8 @@ def add_elevation(
     with kernel_threads(ROWS):
         composite_kernels.add_elevation(
             rgb.detach().numpy(), alpha.detach().contiguous().numpy(),
-            depth.detach().contiguous().numpy(), *(np.asarray(n, np.float32) for n in numbers),
+            depth.detach().contiguous().numpy(),
+            *(np.ascontiguousarray(n, np.float32) for n in numbers),
         )  # fmt: skip
     return rgb
 

@@ -49,23 +49,42 @@ def sky_picture(sky: int = 200, wall: int = 60) -> np.ndarray:
 def test_sky_lies_above_walls_that_end_below_the_lidars_view(tmp_path):
     scene = wall_scene(tmp_path, top_m=8.0)
     camera = scene.frame(0).cameras["front"]
-    # The low wall ends at 1.4 degrees, the high one at 18: the LiDAR looks up to 15.
-    mask = sky_mask(scene, camera, sky_picture(), NO_RETURNS, np.radians(15))
-    assert mask[:50, 90:].all()  # over the low wall, right of the middle
-    assert not mask[54:].any() and not mask[:, :80].any()
-    # A LiDAR that looks up to 40 degrees would have seen the high wall's end too.
-    mask = sky_mask(scene, camera, sky_picture(), NO_RETURNS, np.radians(40))
-    assert mask[:20, :70].all() and mask[:50, 90:].all()
-    assert not mask[30:, :80].any()  # the wall itself is as bright here, but it is drawn
+    # The low wall ends at 1.4 degrees, the high one at 18, row 27: the LiDAR looks up to 15, or to
+    # 40, where it would have seen the high wall's end too.
+    rgb = sky_picture()
+    rgb[27:58, :80] = 150
+    for top_deg in (15, 40):
+        mask = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(top_deg))
+        assert mask[:50, 90:].all() and mask[:20, :70].all()
+        assert not mask[58:].any() and not mask[29:, :78].any()
+
+
+def test_the_picture_tells_how_high_a_wall_goes(tmp_path):
+    """The LiDAR ends at 4 m; the image shows 7 m of wall, with a window that is as bright as the
+    sky, and a pole before the sky."""
+    scene = wall_scene(tmp_path, top_m=4.0)
+    camera = scene.frame(0).cameras["front"]
+    rgb = sky_picture()
+    rgb[32:58, :80] = 110
+    rgb[42:48, 20:30] = 200
+    rgb[:50, 120] = 60
+    mask = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(10))
+    assert not mask[34:, :78].any()
+    assert mask[:28, :110].all() and mask[:50, 90:110].all()
+    assert not mask[:50, 120].any() and mask[10:40, 130:].all()
+    again = sky_mask(scene, camera, rgb, NO_RETURNS, np.radians(10))
+    assert np.array_equal(mask, again)
 
 
 def test_a_return_above_the_scene_is_no_sky(tmp_path):
     scene = wall_scene(tmp_path, top_m=2.0)
     camera = scene.frame(0).cameras["front"]
     wire = np.array([20 * 160 + x for x in range(160)])
-    mask = sky_mask(scene, camera, sky_picture(), wire, np.radians(15))
-    assert not mask[18:23].any() and mask[:15, 10:150].all()
-    assert not mask[23:].any()  # what hangs from a wire is not known
+    rgb = sky_picture()
+    rgb[20] = 90
+    mask = sky_mask(scene, camera, rgb, wire, np.radians(15))
+    assert not mask[19:22].any()
+    assert mask[:18, 10:150].all() and mask[24:50, 10:150].all()
 
 
 def test_the_picture_has_to_agree():

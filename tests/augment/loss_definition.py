@@ -90,6 +90,8 @@ def reference_loss(
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
     total = total + weights.depth * depth + weights.sky * sky
     total = total + weights.surface * _transparency(alpha, view)
+    below = (view.camera.ray_directions(dtype)[..., 2] < 0) & ~torch.from_numpy(view.sky)
+    total = total + weights.ground * ((1 - alpha) * below).sum() / alpha.numel()
     return ReferenceLoss(total=total, l1=l1, ssim=ssim, depth=depth, sky=sky)
 
 

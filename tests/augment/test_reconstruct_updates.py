@@ -21,6 +21,7 @@ from augment.reconstruct.splats import (
     GEOMETRY,
     ColorAdam,
     DenseAdam,
+    Sightings,
     Splats,
     densify,
     densify_due,
@@ -173,7 +174,7 @@ def test_a_perfect_picture_has_ssim_1_and_no_gradient():
     view = arguments["view"]
     arguments["rgb"] = view.rgb / np.float32(255)
     arguments |= {"alpha": np.ones((20, 30), np.float32), "color_map": IDENTITY_MAP}
-    arguments["weights"] = LossWeights(depth=0.0, sky=0.0)
+    arguments["weights"] = LossWeights(depth=0.0, sky=0.0, ground=0.0)
     loss = view_loss(**arguments)
     assert loss.ssim == pytest.approx(1, abs=1e-6) and loss.l1 < 1e-7
     # L1 has a kink here, so a rounding error of 1e-8 decides its sign: one pixel's worth at most.
@@ -197,8 +198,23 @@ def test_surfaces_are_pulled_to_be_opaque():
     np.testing.assert_allclose(change, expected, atol=1e-8)
 
 
-def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
+def test_what_lies_below_the_horizon_is_pulled_to_be_opaque():
     arguments = case(24, 33, seed=6)
+    view = arguments["view"]
+    level = dataclasses.replace(camera_ahead(33, 24, 20.0), name="front")
+    arguments = with_view(arguments, camera=level)
+    with_it, without = (
+        view_loss(**{**arguments, "weights": LossWeights(ground=weight)}) for weight in (0.3, 0.0)
+    )
+    below = ~view.sky & (np.arange(24)[:, None] + 0.5 > level.cy)
+    through = (1 - arguments["alpha"])[below].sum() / below.size
+    assert with_it.total - without.total == pytest.approx(0.3 * through, rel=1e-5)
+    change = with_it.d_alpha - without.d_alpha
+    np.testing.assert_allclose(change, np.where(below, -0.3 / below.size, 0), atol=1e-8)
+
+
+def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
+    arguments = case(24, 33, seed=6) | {"weights": dataclasses.replace(WEIGHTS, ground=0.0)}
     view = arguments["view"]
     other = view.rgb.copy()
     other[view.weight == 0] = 255 - other[view.weight == 0]
@@ -513,7 +529,7 @@ def test_what_is_not_touched_or_not_learnt_yet_keeps_its_bits():
     apply_update(splats, update)
     touched = np.zeros(len(splats), bool)
     touched[splats.starts[1] + update.touched[1]] = True
-    for name in before.keys() - {"starts", "semantic"}:
+    for name in before.keys() - {"starts", "semantic", "smallest"}:
         changed = getattr(splats, name) != before[name]
         assert not changed[~touched].any() and changed[touched].any(), name
         if name.startswith("sh"):
@@ -555,6 +571,19 @@ def test_values_are_clamped():
     assert (splats.opacities[at][~rises] == np.float32(1e-4)).all()
     for array in splats.arrays().values():
         assert np.isfinite(array).all()
+
+
+def test_no_splat_gets_smaller_than_images_resolve():
+    splats = some_splats()
+    splats.smallest[::2] = 0.03
+    rates = dataclasses.replace(FASTER, scales=5.0)
+    update = random_update(splats, 0, present=BOTH[:1])
+    at, g = update.touched[0], update.gradients[0]
+    for _ in range(4):
+        apply_update(splats, update, rates)
+    shrinks = (g[:, G_SCALE : G_SCALE + 3] > 0).all(1)
+    least = np.where(at % 2 == 0, np.float32(0.03), np.float32(1e-3))[shrinks]
+    assert (splats.scales[at][shrinks] == least[:, None]).all() and shrinks.any()
 
 
 def test_same_bits_for_any_number_of_threads():
@@ -652,6 +681,7 @@ def splats_of(*counts: int, opacity: float | None = None, seed: int = 0) -> Spla
         sh_v=normal(4, 3) ** 2,
         age=rng.integers(1, 1000, total).astype(np.int32),
         grads=np.zeros((total, 3), np.float32),
+        smallest=np.zeros(total, np.float32),
     )
 
 
@@ -765,6 +795,56 @@ def test_faint_and_unusable_ones_are_removed() -> None:
     grown = round_of(splats)
     assert same(grown, rebuild(splats, np.arange(10, 50)))
     assert grown.starts.tolist() == [0, 20, 20, 32, 40]
+
+
+def test_children_are_no_smaller_than_images_resolve() -> None:
+    splats = pulled(splats_of(*PARTS), [3, 35], radius=0.2)
+    splats.smallest[:] = 0.9 * splats.scales.min(1)
+    grown = round_of(splats, fraction=0.1)
+    assert len(grown) == 52
+    assert (grown.scales >= grown.smallest[:, None]).all()
+    assert (grown.scales.min(1) == grown.smallest).sum() == 4
+
+
+def test_the_refuted_are_removed() -> None:
+    splats = splats_of(*PARTS)
+    refuted = np.arange(50) % 7 == 0
+    grown = densify(splats, Growth(), max_splats=60, extent_m=GROWN_EXTENT_M, refuted=refuted)
+    assert same(grown, rebuild(splats, np.flatnonzero(~refuted)))
+
+
+# --- what views tell of splats ---
+
+
+def test_the_view_that_sees_a_splat_best_bounds_its_size() -> None:
+    """Splats 4 m and 40 m ahead, one behind the cameras, one beside all views."""
+    splats = splats_of(2, 2)
+    splats.means[:] = [[4, 0, 0], [40, 1, 0], [-5, 0, 0], [4, 50, 0]]
+    found = Sightings(4)
+    sky = np.zeros((48, 64), np.bool_)
+    shift = np.eye(4)
+    shift[0, 3] = 2.0  # the second part's frame lies 2 m ahead: its splats are behind all the same
+    for x, focal in ((0.0, 40.0), (2.0, 40.0), (1.0, 50.0)):
+        camera = camera_ahead(64, 48, focal, position=(x, 0.0, 0.0))
+        found.add(splats, 0, np.eye(4), camera, sky)
+        found.add(splats, 1, shift, camera, sky)
+    np.testing.assert_allclose(found.px_per_m, [40 / 2, 50 / 39, 0, 0], rtol=1e-6)
+    assert found.seen.tolist() == [3, 3, 0, 0] and not found.refuted.any()
+
+
+def test_the_sky_of_several_images_refutes_what_lies_before_it() -> None:
+    """A post in front of the sky for three of four views, hidden by a wall from the last; one that
+    a single view has before its sky; one at the sky's very edge."""
+    splats = splats_of(3)
+    splats.means[:] = [[10, 1, 2], [10, -3, 2], [10, 3, 0.1]]
+    found = Sightings(3)
+    for sky_above, columns in ((24, 64), (24, 32), (24, 32), (0, 64)):
+        sky = np.zeros((48, 64), np.bool_)
+        sky[:sky_above, :columns] = True
+        found.add(splats, 0, np.eye(4), camera_ahead(64, 48, 40.0), sky)
+    assert found.seen.tolist() == [4, 4, 4]
+    assert found.in_sky.tolist() == [3, 1, 0]
+    assert found.refuted.tolist() == [True, False, False]
 
 
 def test_a_part_may_become_empty_but_not_the_scene() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from augment.jobs.layout import item_paths
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.recorded_sky import elevation_rad, find_sky
-from augment.scene import Gaussians, Scene
+from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky
 from augment.trust import (
     MAX_MAGNIFICATION,
@@ -79,7 +80,7 @@ def recorded(scene: Scene, folder: Path) -> Scene:
 def test_a_street_has_no_hole_and_its_sky_is_unknown():
     trust = judge_scene(open_street(), cameras=["front", "left"])
     assert all(view.ground_open == 0 for own in trust.cameras for view in own.views)
-    assert all("lets by more than 2 %" in text for text in trust.problems)  # it is a coarse one
+    assert all("lets more than 2 %" in text for text in trust.problems)  # it is a coarse one
     assert trust.unknown == ("whether the sky is empty: no recorded image tells where it is",)
     assert [own.seen_images for own in trust.cameras] == [2, 2]
 
@@ -261,5 +262,21 @@ def test_extremes_give_figures_and_no_nan():
         view = judge_view(scene, camera, 0)
         assert 0 <= view.ground_open <= view.ground_leaks <= 1
         assert trust_mask(scene, camera).shape == (30, 40)
+    lost = Track(torch.tensor([0]), torch.full((1, 4, 4), math.nan, dtype=torch.float64))
+    actor = Actor("a", "car", background, lost, (4.0, 2.0, 1.5))
+    broken = judge_scene(dataclasses.replace(scene, actors=(actor,)))
+    assert "frame 0 cannot be drawn" in broken.problems[0]
     no_up = dataclasses.replace(scene, has_known_gravity=False)
     assert judge_view(no_up, camera, 0).ground_open is None
+
+
+@pytest.mark.long
+def test_masks_do_not_depend_on_workers_or_order(tmp_path):
+    """The graph cut's colours begin at random: in every thread and process alike."""
+    drive = recorded(open_street(), tmp_path)
+    masks = []
+    for name, options in {"one": {}, "two": {"workers": 2}, "late": {"frames": [1]}}.items():
+        run(tmp_path / name, drive, small_recipe(trust=True), **options)
+        rows = read_manifest(tmp_path / name).to_pylist()
+        masks.append({r["frame"]: (tmp_path / name / r["trust_path"]).read_bytes() for r in rows})
+    assert masks[0] == masks[1] and masks[2] == {1: masks[0][1]}
