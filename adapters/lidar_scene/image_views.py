@@ -35,12 +35,23 @@ _REDUCED = {
 @dataclass(frozen=True, eq=False)
 class View:
     """A recorded image. used_rows: the part of its rows, from the top, that does not show the
-    recording car. frame: for messages."""
+    recording car; own_car: its pixels, bool [h, w] at any size, where they are known. frame: for
+    messages."""
 
     camera: Camera
     path: Path
     frame: int
     used_rows: float = 1.0
+    own_car: np.ndarray | None = None
+
+    def shows_car(self, width: int, height: int) -> np.ndarray:
+        """The pixels of the recording car in the image at another size, bool [height, width]."""
+        shown = np.zeros((height, width), np.bool_)
+        if self.own_car is not None:
+            mask = self.own_car.astype(np.uint8)
+            shown = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        shown[int(self.used_rows * height) :] = True
+        return shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +135,15 @@ def _observe_one(
             if pose is None:
                 continue
             transform = transform @ pose
-            _draw_cover(cover, camera, transform, body.track.size_m)
+            draw_cover(cover, camera, transform, body.track.size_m)
         extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
         posed.append((body, store, extent, transform[:3, :3].copy(), transform[:3, 3].copy()))
     for body, _, extent, *pose in posed:
         s = body.surfels
         kernels.draw_depth(s.centres, s.normals, s.major, extent, *pose, *intrinsics, depth)
     levels, sizes = _pyramid(image)
+    car = view.shows_car(camera.width, camera.height)
+    cover[car] = nothing[car] = 0  # it stands before all else
     for body, store, extent, *pose in posed:
         kernels.observe(
             body.surfels.centres, body.surfels.normals, extent, *pose, *intrinsics,
@@ -138,7 +151,6 @@ def _observe_one(
             camera_number, *store,
         )  # fmt: skip
     free = np.isinf(depth) & np.isinf(cover)
-    free[int(view.used_rows * camera.height) :] = False
     sky.add(camera, free, levels, sizes)
 
 
@@ -159,7 +171,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count(
 _CLIP_M = 0.05
 
 
-def _draw_cover(
+def draw_cover(
     cover: np.ndarray, camera: Camera, camera_from_box: np.ndarray, size_m: np.ndarray
 ) -> None:
     """Fill the outline of a moving object's box, a little grown, with its nearest depth.

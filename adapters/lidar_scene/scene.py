@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,7 +11,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from adapters.lidar_scene.image_views import Body, View, observe_views
+from adapters.lidar_scene.closing import close_parts
+from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
 from adapters.lidar_scene.kernels import SkyGatherer
 from adapters.lidar_scene.split import (
     ObjectTrack,
@@ -30,7 +32,8 @@ from adapters.lidar_scene.surfels import (
     surfels_from_points,
     thin_points,
 )
-from adapters.raw_drive import DriveOptions, RawDrive
+from adapters.raw_drive import BoxSample, DriveOptions, RawDrive, TimedBoxes
+from adapters.training_views.masks import find_ego_mask, moving_frames
 from adapters.world import join_gaussians
 from augment.cameras import Frame
 from augment.errors import AdapterError
@@ -43,6 +46,8 @@ logger = logging.getLogger(__name__)
 # under and behind what hides it, up to so many metres.
 _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
+_MASK_SCALE = 0.25  # of images in which the recording car is looked for
+_MEASURED_PART = 0.9  # of max_gaussians, at most, is for what was measured; the rest closes it
 _MIN_POINTS = 8  # that surfaces are sought in
 _TRIAL = 3.0  # voxels of the trial in units of those asked for
 _REACHES_M = (8.0, 16.0)
@@ -58,6 +63,24 @@ def views_of(
         View(frame.cameras[name], Path(path), frame.index, used_rows.get(name, 1.0))
         for frame in frames
         for name, path in frame.image_paths.items()
+    )
+
+
+def with_own_car(views: Sequence[View]) -> tuple[View, ...]:
+    """The images with what they show of the recording car, where it moved enough to be told."""
+    by_camera: dict[str, list[View]] = {}
+    for view in views:
+        by_camera.setdefault(view.camera.name, []).append(view)
+    masks = {}
+    for name, own in by_camera.items():
+        moving = [own[i] for i in moving_frames([view.camera for view in own])]
+        images = [read_image(view.path, _MASK_SCALE) for view in moving]
+        there = [i for i, image in enumerate(images) if image is not None]
+        cameras = [moving[i].camera for i in there]
+        masks[name] = find_ego_mask(cameras, [images[i] for i in there])
+    return tuple(
+        dataclasses.replace(view, own_car=mask) if (mask := masks[view.camera.name]).any() else view
+        for view in views
     )
 
 
@@ -81,11 +104,12 @@ def build_lidar_scene(
     if ground is None:
         ground = measure_from_classes(background.points, background.semantic, path)
     paths = [path, *(_path_in(track, path, times_ns) for track in tracks)]
-    sampled = _sample_all([background, *actors], paths, options)
+    measured = options.max_gaussians * (1 if added else _MEASURED_PART)
+    sampled = _sample_all([background, *actors], paths, options.voxel_m, int(measured))
     surfels = [surfels_from_points(p.points, e, semantic=p.semantic) for p, e in sampled]
     bodies = [Body(*pair) for pair in zip(surfels, [None, *tracks], strict=True)]
     sky = SkyGatherer(options.sky_size, math.radians(drive.lidar_top_deg))
-    views = views_of(drive.used, drive.used_rows)
+    views = with_own_car(views_of(drive.used, drive.used_rows))
     seen, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
     parts = [
         _gaussians(*thing, found, *colours)
@@ -93,6 +117,15 @@ def build_lidar_scene(
     ]
     if added is not None:
         parts[0] = join_gaussians([parts[0], added])
+    elif any(map(len, parts)):
+        parts = close_parts(
+            parts,
+            tracks,
+            _still_boxes(drive),
+            views,
+            sampled[0][0],
+            max_gaussians=options.max_gaussians,
+        )
     if not any(map(len, parts)):
         raise AdapterError(
             f"{drive.source}: none of the points that were measured is in any image; check that "
@@ -117,6 +150,18 @@ def build_lidar_scene(
         has_metric_scale=drive.has_metric_scale,
         problems=(*drive.problems, *faults),
     )
+
+
+def _still_boxes(drive: RawDrive) -> list[BoxSample]:
+    """One labelled box of each object that does not move."""
+    found: dict[str, BoxSample | None] = {sample.object_id: None for sample in drive.boxes}
+    for frame in drive.used:
+        for sample, _ in TimedBoxes(
+            frame.index, drive.labels.boxes(frame.index), frame.timestamp_ns
+        ).samples(drive.world_origin_m):
+            if sample is not None:
+                found.setdefault(sample.object_id, sample)
+    return [sample for sample in found.values() if sample is not None]
 
 
 def without_points(tracks: Sequence[ObjectTrack], scene: Scene) -> tuple[str, ...]:
@@ -150,10 +195,11 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
 
 
 def _sample_all(
-    things: Sequence[PointSet], paths: Sequence[np.ndarray], options: DriveOptions
+    things: Sequence[PointSet], paths: Sequence[np.ndarray], finest_m: float, most: int
 ) -> list[tuple[PointSet, np.ndarray]]:
-    """Every thing thinned and its gaps filled with one voxel size, the smallest that respects
-    max_gaussians. things: the world first. paths: the driven path in each one's frame."""
+    """Every thing thinned and its gaps filled with one voxel size, the smallest from finest_m on
+    that gives so many points at most. things: the world first. paths: the driven path in each
+    one's frame."""
 
     def sample(voxel_m: float) -> tuple[list[tuple[PointSet, np.ndarray]], int]:
         sampled = [
@@ -165,14 +211,14 @@ def _sample_all(
         return sampled, count
 
     # A coarse trial tells what the fine one needs: on surfaces the count goes with the square.
-    _, trial = sample(_TRIAL * options.voxel_m)
-    needed = 1.01 * _TRIAL * (trial / options.max_gaussians) ** 0.5
-    voxel_m = options.voxel_m * max(1.0, needed)
+    _, trial = sample(_TRIAL * finest_m)
+    needed = 1.01 * _TRIAL * (trial / most) ** 0.5
+    voxel_m = finest_m * max(1.0, needed)
     while True:
         sampled, count = sample(voxel_m)
-        if count <= options.max_gaussians:
+        if count <= most:
             return sampled
-        voxel_m *= max(1.02, (count / options.max_gaussians) ** 0.55)
+        voxel_m *= max(1.02, (count / most) ** 0.55)
 
 
 def _sample(

@@ -311,7 +311,7 @@ def gaussians_from_surfels(
     second = np.cross(surfels.normals, surfels.major)
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
     sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
-    sigma[is_flat(semantic)] = _GROUND_SIGMA_PER_SPACING
+    sigma[is_flat(semantic)] = max(_GROUND_SIGMA_PER_SPACING, shape.sigma_per_spacing)
     tangent = surfels.spacing * sigma[:, None]
     thin = np.maximum(tangent.min(axis=1) * _THICKNESS, _MIN_THICKNESS_M)
     scales = np.concatenate([tangent, thin[:, None]], axis=1).astype(np.float32)
@@ -362,6 +362,7 @@ _MAX_GAP_M = {
 _MAX_OTHER_GAP_M = 0.25
 CELL_M = 0.25
 CLOSE_M = 3.0  # holes up to twice this wide are filled
+BESIDE_M = 8.0  # from the path: filled whatever is around
 REACH_M = 60.0  # from the path
 _RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3  # to settle across half the widest hole
 _STEEP = 0.35  # height over distance that ground can have from one cell to the next
@@ -475,12 +476,24 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     radius = round(CLOSE_M / CELL_M)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     inside = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    inside |= _beside(path, origin, shape)
     heights = _spread(heights, seen)
     voxel_m = voxel_m * _SPARSER
     new = _candidates(heights, inside, origin, path, voxel_m)
     distance, nearest = cKDTree(ground[:, :2]).query(new[:, :2], workers=-1)
     missing = distance > 0.7 * edges_at(new, path, voxel_m=voxel_m)
     return PointSet(new[missing], classes[nearest[missing]])
+
+
+def _beside(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Cells within BESIDE_M of the path, bool [X, Y]: its car stood or drove there on something."""
+    cells = np.floor((path[:, :2] - origin) / CELL_M).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
+    away = np.ones(shape, np.uint8)
+    away[cells[:, 0], cells[:, 1]] = 0
+    if not len(cells):
+        return away == 0
+    return cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M < BESIDE_M
 
 
 def _height_grid(

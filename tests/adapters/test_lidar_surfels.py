@@ -233,13 +233,20 @@ def test_a_hole_in_the_ground_is_filled_on_its_slope():
     np.testing.assert_allclose(new.points[:, 2], 0.05 * new.points[:, 0], atol=0.02)
 
 
-def test_ground_does_not_grow_outwards_nor_over_wide_holes():
+def test_ground_does_not_grow_outwards_nor_over_wide_holes_aside():
     wide = sloping_ground(CLOSE_M + 1.5)
-    new = fill_ground(wide, np.zeros((1, 3)), voxel_m=0.2)
+    new = fill_ground(wide, np.array([[0.0, 30, 0]]), voxel_m=0.2)
     assert len(new) == 0 or np.hypot(new.points[:, 0], new.points[:, 1]).min() > 1.0
     assert len(new) == 0 or np.abs(new.points[:, :2]).max() < 12.3
     some = point_set(plane((0, 1, 0)), Class.BUILDING)  # no ground at all
     assert len(fill_ground(some, np.zeros((1, 3)), voxel_m=0.1)) == 0
+
+
+def test_ground_goes_on_under_and_beside_the_car_however_wide_the_hole():
+    new = fill_ground(sloping_ground(6.0), np.zeros((1, 3)), voxel_m=0.2)
+    assert len(new) > np.pi * 6.0**2 / 0.4**2 * 0.8
+    # Relaxed for smaller holes: in the widest, the slope is a little flatter than around.
+    np.testing.assert_allclose(new.points[:, 2], 0.05 * new.points[:, 0], atol=0.1)
 
 
 def test_without_classes_low_points_are_ground():

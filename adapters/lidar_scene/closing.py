@@ -1,0 +1,495 @@
+"""What images show below the horizon and no LiDAR return stands for, closed with opaque splats.
+
+A LiDAR sees neither the road beside its own car nor much of dark paint and glass, and between its
+returns splats leak. What nothing covers is the sky's, and so flat fog and a hollow in a flood. One
+recorded image after another is compared with what has been drawn so far: where light comes through
+below the horizon, a disc in the photo's colour is put
+
+    behind a surface that leaks       a little further than it, of its class and object;
+    into a labelled box               where the ray passes through it: paint and glass; of vehicles
+                                      also where they are looked through, from roof to sill;
+    on the ground                     where the surface around is ground;
+    else as far as what is around     of the surfaces nearest in place and colour, and never below
+                                      the ground.
+
+"Around" takes place and colour together (as a joint bilateral filter does), so that a depth ends
+where the photo has an edge.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from adapters.lidar_scene.image_views import View, draw_cover, read_image
+from adapters.lidar_scene.split import SKIN_M, ObjectTrack, PointSet, is_flat
+from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels, ground_points
+from adapters.raw_drive import BoxSample
+from adapters.world import join_gaussians
+from augment.cameras import Camera
+from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians
+from augment.semantics import SemanticClass, class_of_label
+from augment.view_images import SURFACE_ALPHA
+
+_WIDTH = 480  # columns of the images that are drawn
+_CELL_PX = 2  # of those, from one new disc to the next
+_IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # that images are decoded at
+_STEP_M = 1.2  # images are taken that far apart on the way
+_MIN_FRAMES, _FRAMES_PART = 4, 1 / 3  # and no more frames than these
+_TRANSMITTANCE = 0.02  # of a closed pixel, at most
+_BEHIND, _BEHIND_M = 0.002, 0.02  # of its depth, and metres, that a disc lies behind what leaks
+_NEIGHBOURS, _FAR_QUANTILE = 16, 0.75
+_CELLS_PER_LAB = 1.0  # a difference in colour (CIELAB) as a distance in the image
+_SQUARE_M = 0.5  # of the map of the ground
+_ON_GROUND_M = 0.2
+_FURTHEST_M = 300.0
+_STRETCH = 20.0  # of a disc on the ground that is seen at a slant
+_SOLID = 0.4  # part of a box's narrower side that a ray must pass to meet what is in it
+_SKIN = 0.15  # how deep in a box, as part of the ray's way through it, paint and glass lie
+_NEAREST_M, _FURTHEST_BOX_M = 0.1, 40.0  # depths of boxes that are looked into
+_NEAR_BOX_M = 0.15  # labelled boxes are good to that
+_MIN_OWN = 8  # cells that show an object's surface
+_SMOOTH = 9  # cells
+_SILL_M = 0.25  # of a vehicle, above the ground
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+# Discs on a grid of their own pitch let 2 % through at most, between four of them.
+_SHAPE = SplatShape(sigma_per_spacing=0.8, opacity=0.99)
+
+
+def close_parts(
+    parts: Sequence[Gaussians],
+    tracks: Sequence[ObjectTrack],
+    still: Sequence[BoxSample],
+    views: Sequence[View],
+    points: PointSet,
+    *,
+    max_gaussians: int,
+) -> list[Gaussians]:
+    """The Gaussians of the world and of each track's object, with discs added until few pixels of
+    the images are open below the horizon.
+
+    parts: the world's, then those of the tracks, in their frames. still: boxes of objects that are
+    part of the world. points: of the world, the ground among them. max_gaussians: of all parts;
+    where they come near it, discs are larger and fewer."""
+    parts = list(parts)
+    ground = _GroundMap.of(points)
+    standing = [
+        _Box(0, box.world_from_box, np.asarray(box.size_m), class_of_label(box.label))
+        for box in still
+    ]
+    for view in _spread_views(views):
+        posed = {0: np.eye(4)}
+        for number, track in enumerate(tracks, start=1):
+            pose = track.motion.pose_at(view.camera.timestamp_ns)
+            if pose is not None:
+                posed[number] = pose
+        boxes = standing + [
+            _Box(n, pose, tracks[n - 1].size_m, class_of_label(tracks[n - 1].label))
+            for n, pose in posed.items()
+            if n
+        ]
+        centre = view.camera.centre.numpy()
+        boxes.sort(key=lambda box: -np.linalg.norm(box.world_from_box[:3, 3] - centre))
+        drawn = _draw(parts, posed, view.camera)
+        photo = _read_photo(view, drawn.camera, boxes)
+        if photo is None:
+            continue  # a problem of the scene already
+        side_px, most = _CELL_PX, (max_gaussians - sum(map(len, parts))) // 2
+        while True:
+            cells = drawn.cells(side_px)
+            # Of a nearer box after, and so over, those of a further one.
+            discs = _discs(cells, photo.resized(cells.camera), ground, boxes)
+            if len(discs.part) <= most or min(cells.is_open.shape) == 1:
+                break
+            side_px *= 2
+        if len(discs.part) > most:
+            break
+        for number in np.unique(discs.part):
+            own = discs.select(discs.part == number)
+            new = own.gaussians(cells.camera, posed[int(number)])
+            parts[number] = join_gaussians([parts[number], new])
+    return parts
+
+
+def _spread_views(views: Sequence[View]) -> list[View]:
+    """Those of frames _STEP_M apart, the first and the last among them."""
+    by_frame: dict[int, list[View]] = {}
+    for view in views:
+        by_frame.setdefault(view.frame, []).append(view)
+    frames = list(by_frame.values())
+    chosen, last = [], None
+    for number, own in enumerate(frames):
+        centre = own[0].camera.centre.numpy()
+        if last is None or np.linalg.norm(centre - last) >= _STEP_M or number == len(frames) - 1:
+            chosen.append(own)
+            last = centre
+    count = min(len(chosen), max(_MIN_FRAMES, round(_FRAMES_PART * len(frames))))
+    places = np.linspace(0, len(chosen) - 1, count).round().astype(int)
+    return [view for place in places for view in chosen[place]]
+
+
+@dataclass(frozen=True, eq=False)
+class _GroundMap:
+    """The ground in squares seen from above: of each the height, float64 [X, Y], and class, int16
+    [X, Y], of the nearest that holds ground. corner: of the first, float64 [2]."""
+
+    corner: np.ndarray
+    heights: np.ndarray
+    semantic: np.ndarray
+
+    @staticmethod
+    def of(points: PointSet) -> _GroundMap | None:
+        """None without ground."""
+        flat = ground_points(points) if len(points) else np.zeros(0, np.bool_)
+        if not flat.any():
+            return None
+        xyz = points.points[flat].astype(np.float64)
+        corner = xyz[:, :2].min(axis=0)
+        i, j = np.floor((xyz[:, :2] - corner) / _SQUARE_M).astype(np.int64).T
+        shape = (i.max() + 1, j.max() + 1)
+        heights, semantic = np.zeros(shape), np.zeros(shape, np.int16)
+        count = np.zeros(shape)
+        np.add.at(heights, (i, j), xyz[:, 2])
+        np.add.at(count, (i, j), 1)
+        semantic[i, j] = points.semantic[flat]
+        heights /= np.maximum(count, 1)
+        seen = count > 0
+        return _GroundMap(corner, _from_nearest(heights, seen), _from_nearest(semantic, seen))
+
+    def square(self, xy: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Indices of the squares nearest to places [..., 2]."""
+        index = np.floor((xy - self.corner) / _SQUARE_M).astype(np.int64)
+        index = np.clip(index, 0, np.array(self.heights.shape) - 1)
+        return index[..., 0], index[..., 1]
+
+
+def _from_nearest(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The image [H, W] with each unknown pixel's value from the known one nearest to it."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    values = np.zeros(labels.max() + 1, image.dtype)
+    values[labels[known]] = image[known]
+    return values[labels]
+
+
+def _meet_ground(
+    ground: _GroundMap | None, centre: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How often each ray [..., 3] goes from the centre to the ground, _FURTHEST_M at most, infinite
+    without ground; and the class there. The height at the place that was found last is taken for
+    the next, which settles on roads."""
+    shape = rays.shape[:-1]
+    if ground is None:
+        return np.full(shape, np.inf), np.zeros(shape, np.int16)
+    times = np.zeros(shape)
+    down = np.maximum(-rays[..., 2], 1e-9)
+    for _ in range(5):
+        square = ground.square(centre[:2] + times[..., None] * rays[..., :2])
+        times = np.clip((centre[2] - ground.heights[square]) / down, 0.1, _FURTHEST_M)
+    return times, ground.semantic[square]
+
+
+class _Cells(NamedTuple):
+    """A view drawn, by square cells of pixels: of each what its most open pixel has.
+
+    camera: whose pixels are the cells. is_open: bool [h, w], light comes through below the horizon.
+    has_surface: bool [h, w]. depth: float64 [h, w]. part, semantic: of the splat that counts most,
+    int [h, w]."""
+
+    camera: Camera
+    is_open: np.ndarray
+    has_surface: np.ndarray
+    depth: np.ndarray
+    part: np.ndarray
+    semantic: np.ndarray
+
+
+class _Drawn(NamedTuple):
+    """A view drawn: alpha, depth [H, W], float32; part, semantic: of the splat that counts most,
+    int [H, W], at pixels with a surface."""
+
+    camera: Camera
+    alpha: np.ndarray
+    depth: np.ndarray
+    part: np.ndarray
+    semantic: np.ndarray
+
+    def cells(self, side_px: int) -> _Cells:
+        camera = self.camera
+        rows, columns = -(-camera.height // side_px), -(-camera.width // side_px)
+        small = dataclasses.replace(
+            camera, width=columns, height=rows,
+            fx=camera.fx / side_px, fy=camera.fy / side_px,
+            cx=camera.cx / side_px, cy=camera.cy / side_px,
+        )  # fmt: skip
+
+        def blocks(image: np.ndarray) -> np.ndarray:
+            """[h, w, side_px^2]; those at the border repeat its pixels."""
+            beyond = ((0, rows * side_px - camera.height), (0, columns * side_px - camera.width))
+            padded = np.pad(image, beyond, mode="edge")
+            split = padded.reshape(rows, side_px, columns, side_px).swapaxes(1, 2)
+            return split.reshape(rows, columns, -1)
+
+        most_open = blocks(self.alpha).argmin(2)[..., None]
+        alpha, depth, part, semantic = (
+            np.take_along_axis(blocks(image), most_open, 2)[..., 0] for image in self[1:]
+        )
+        # Half a cell above the horizon counts: splats there are seen from lower cameras too.
+        below = small.ray_directions().numpy()[..., 2] < 0.5 / small.fy
+        return _Cells(
+            small,
+            (alpha < 1 - _TRANSMITTANCE) & below,
+            alpha >= SURFACE_ALPHA,
+            depth.astype(np.float64),
+            part,
+            semantic,
+        )
+
+
+def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Camera) -> _Drawn:
+    camera = camera.scaled(min(1.0, _WIDTH / camera.width))
+    drawn = [
+        PosedGaussians(parts[n], torch.from_numpy(pose) if n else None, instance_id=n)
+        for n, pose in posed.items()
+    ]
+    raster = rasterize(drawn, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+    assert raster.alpha is not None and raster.median_depth is not None
+    assert raster.splat_ids is not None
+    ids = raster.splat_ids.numpy().clip(0)
+    # One more than there are: of an image in which nothing stands.
+    part = np.append(np.repeat(list(posed), [len(parts[n]) for n in posed]), 0)
+    classes = [parts[n].semantic.numpy() for n in posed if len(parts[n])]
+    semantic = np.concatenate([*classes, np.zeros(1, np.int16)])
+    return _Drawn(
+        camera, raster.alpha.numpy(), raster.median_depth.numpy(), part[ids], semantic[ids]
+    )
+
+
+class _Photo(NamedTuple):
+    """One image at the cells, RGB uint8 [h, w, 3], what it shows of the recording car filled from
+    around it. still: without the moving objects too, filled alike."""
+
+    whole: np.ndarray
+    still: np.ndarray
+
+    def resized(self, camera: Camera) -> _Photo:
+        size = (camera.width, camera.height)
+        return _Photo(*(cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self))
+
+
+def _read_photo(view: View, camera: Camera, boxes: Sequence[_Box]) -> _Photo | None:
+    """The photo at about half the camera's size; None if it cannot be decoded."""
+    wanted = camera.width / view.camera.width
+    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= wanted))
+    if image is None:
+        return None
+    small = camera.scaled(1 / _CELL_PX)
+    size = (small.width, small.height)
+    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    car = view.shows_car(*size)
+    cover = np.full(car.shape, np.inf, np.float32)
+    for box in boxes:
+        if box.part:
+            pose = small.camera_from_world.numpy() @ box.world_from_box
+            draw_cover(cover, small, pose, box.size_m)
+    return _Photo(_filled(image, car), _filled(image, car | np.isfinite(cover)))
+
+
+def _filled(image: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    if unknown.all() or not unknown.any():
+        return image
+    return cv2.inpaint(image, unknown.astype(np.uint8), 3, cv2.INPAINT_TELEA)
+
+
+class _Discs(NamedTuple):
+    """New discs, M of them. part: of whom. points, rays: float64 [M, 3], world, the rays with unit
+    z in the camera; depth [M]. lies: bool [M], on the ground. semantic: int16 [M]. colours: float32
+    [M, 3]."""
+
+    part: np.ndarray
+    points: np.ndarray
+    rays: np.ndarray
+    depth: np.ndarray
+    lies: np.ndarray
+    semantic: np.ndarray
+    colours: np.ndarray
+
+    def select(self, keep: np.ndarray) -> _Discs:
+        return _Discs(*(column[keep] for column in self))
+
+    def gaussians(self, camera: Camera, world_from_part: np.ndarray) -> Gaussians:
+        """Level on the ground, else facing the camera; as large as one of its pixels."""
+        lengths = np.linalg.norm(self.rays, axis=1, keepdims=True)
+        up = np.array([0.0, 0.0, 1.0])
+        normals = np.where(self.lies[:, None], up, self.rays / lengths)
+        aside = np.cross(self.rays, up)
+        aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+        along = np.cross(normals, aside)
+        pitch = self.depth / camera.fx
+        slant = np.minimum(lengths[:, 0] / np.maximum(np.abs(self.rays[:, 2]), 1e-9), _STRETCH)
+        spacing = np.stack([pitch * np.where(self.lies, slant, 1.0), pitch], 1)
+        turn = world_from_part[:3, :3]
+        local = (self.points - world_from_part[:3, 3]) @ turn
+        floats = [a.astype(np.float32) for a in (local, normals @ turn, along @ turn, spacing)]
+        count = len(local)
+        surfels = Surfels(*floats, np.zeros(count, np.bool_), np.zeros((count, 0), np.int64))
+        return gaussians_from_surfels(surfels, self.colours, self.semantic, _SHAPE)
+
+
+def _discs(
+    cells: _Cells, photo: _Photo, ground: _GroundMap | None, boxes: Sequence[_Box]
+) -> _Discs:
+    """A disc for each open cell, and for those where a vehicle's box is seen through."""
+    centre = cells.camera.centre.numpy()
+    rays = cells.camera.ray_directions(torch.float64).numpy()
+    ground_depth, ground_class = _meet_ground(ground, centre, rays)
+    # Heights over the ground further along the ray: over a road, the same.
+    over = (ground_depth - cells.depth) * -rays[..., 2]
+    flat = (over < _ON_GROUND_M) & (cells.part == 0)
+    holes = cells.is_open & ~cells.has_surface
+    flat |= is_flat(cells.semantic) & (cells.part == 0)
+    there, semantic, on_ground = cells.depth * (1 + _BEHIND) + _BEHIND_M, cells.semantic, flat
+    # What a ray meets behind ground that leaks is ground.
+    there = np.where(flat & np.isfinite(ground_depth), np.maximum(there, ground_depth), there)
+    if holes.any():
+        near = _nearest_surfaces(cells, photo.whole, holes)
+        around = cells.depth.ravel()[near]
+        # What is around may be an object whose box ends there: the ground goes on beside it.
+        down = flat.ravel()[near] | (cells.part.ravel()[near] > 0)
+        down |= around >= ground_depth[holes]
+        down &= np.isfinite(ground_depth[holes])
+        there[holes] = np.where(down, ground_depth[holes], around)
+        semantic[holes] = np.where(down, ground_class[holes], semantic.ravel()[near])
+        on_ground[holes] = down
+    part = np.where(holes, 0, cells.part)
+    close = cells.is_open.copy()
+    for box in boxes:
+        window, inside, depth = _fill_box(box, cells, centre, rays, ground_depth, over, there)
+        part[window][inside], there[window][inside] = box.part, depth[inside]
+        semantic[window][inside], on_ground[window][inside] = box.semantic, False
+        close[window] |= inside
+        if box.part:  # beside a silhouette, what is behind may count as the object's
+            close &= (part != box.part) | box.holds(centre + there[..., None] * rays)
+    depth = np.clip(there[close], 0.2, _FURTHEST_M)
+    points = centre + depth[:, None] * rays[close]
+    colours = np.where(part[close][:, None] > 0, photo.whole[close], photo.still[close]) / 255
+    return _Discs(
+        part[close],
+        points,
+        rays[close],
+        depth,
+        on_ground[close],
+        semantic[close],
+        colours.astype(np.float32),
+    )
+
+
+def _nearest_surfaces(cells: _Cells, image: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Of the cells with a surface that are nearest to each hole in place and colour, that at the
+    far side of their depths, as flat indices: a near object is the less likely to go on."""
+    known = np.flatnonzero(cells.has_surface & (cells.depth < _FURTHEST_M))
+    if not len(known):
+        return np.flatnonzero(holes)  # themselves, at no depth
+    lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    rows, columns = np.mgrid[: holes.shape[0], : holes.shape[1]]
+    places = np.dstack([rows, columns, lab * np.float32(_CELLS_PER_LAB)])
+    tree = cKDTree(places.reshape(-1, 5)[known])
+    k = min(_NEIGHBOURS, len(known))
+    index = tree.query(places[holes], k=[*range(1, k + 1)], workers=-1)[1]
+    order = np.argsort(cells.depth.ravel()[known][index], axis=1, kind="stable")
+    chosen = order[:, min(int(_FAR_QUANTILE * k), k - 1)]
+    return known[np.take_along_axis(index, chosen[:, None], 1)[:, 0]]
+
+
+class _Box(NamedTuple):
+    """A labelled box. part: whose discs are its own, 0 for an object that stands. world_from_box:
+    float64 [4, 4]. size_m: [3]. semantic: its class."""
+
+    part: int
+    world_from_box: np.ndarray
+    size_m: np.ndarray
+    semantic: SemanticClass
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [..., 3] lie in it or within a skin's breadth, bool [...]."""
+        local = (points - self.world_from_box[:3, 3]) @ self.world_from_box[:3, :3]
+        return (np.abs(local) <= self.size_m / 2 + SKIN_M).all(axis=-1)
+
+    def window(self, camera: Camera) -> tuple[slice, slice] | None:
+        """Rows and columns of the image that may show it; None where none does."""
+        corners = _CORNERS * self.size_m @ self.world_from_box[:3, :3].T
+        pose = camera.camera_from_world.numpy()
+        x, y, z = ((corners + self.world_from_box[:3, 3]) @ pose[:3, :3].T + pose[:3, 3]).T
+        if z.max() < _NEAREST_M or z.min() > _FURTHEST_BOX_M:
+            return None
+        if z.min() < _NEAREST_M:
+            return slice(0, camera.height), slice(0, camera.width)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        left, right = np.clip([u.min(), u.max() + 1], 0, camera.width).astype(int)
+        top, bottom = np.clip([v.min(), v.max() + 1], 0, camera.height).astype(int)
+        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+
+def _fill_box(
+    box: _Box,
+    cells: _Cells,
+    centre: np.ndarray,
+    rays: np.ndarray,
+    ground_depth: np.ndarray,
+    over: np.ndarray,
+    there: np.ndarray,
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+    """Cells that show what is in the box and have no surface of it: their window in the image,
+    which of it they are, and their depths.
+
+    A vehicle has no holes: below the highest of its surface in a column of cells it goes on to the
+    sill, as far behind the box's side as the nearest of it. Of all else open cells are closed."""
+    nothing = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0))
+    window = box.window(cells.camera)
+    if window is None:
+        return nothing
+    rotation = box.world_from_box[:3, :3]
+    origin = (centre - box.world_from_box[:3, 3]) @ rotation
+    local = rays[window] @ rotation
+    local = np.where(np.abs(local) < 1e-9, 1e-9, local)
+    ends = np.stack([(side * box.size_m / 2 - origin) / local for side in (-1, 1)])
+    enter = ends.min(0).max(-1)
+    leave = np.minimum(ends.max(0).min(-1), ground_depth[window])
+    lengths = np.linalg.norm(rays[window], axis=-1)
+    solid = (leave - enter) * lengths > _SOLID * min(box.size_m[:2])
+    solid &= enter > _NEAREST_M
+    depth, has_surface = cells.depth[window], cells.has_surface[window]
+    holes = cells.is_open[window] & ~has_surface
+    own = has_surface & (depth > enter - _NEAR_BOX_M) & (depth < leave + _NEAR_BOX_M)
+    own &= over[window] > _ON_GROUND_M
+    of_it = np.isin(cells.semantic[window], (box.semantic, SemanticClass.UNKNOWN))
+    own &= (cells.part[window] == box.part) & of_it
+    guess = there[window]
+    within = (guess >= enter) & (guess <= leave)
+    guess = np.where(within, guess, enter + _SKIN * (leave - enter))
+    inside = solid & holes
+    if box.semantic == SemanticClass.VEHICLE and own.sum() >= _MIN_OWN:
+        columns = np.flatnonzero(own.any(axis=0))
+        top = np.interp(np.arange(own.shape[1]), columns, own.argmax(axis=0)[columns])
+        body = solid & (np.arange(own.shape[0])[:, None] > top)
+        body[:, : columns[0]] = body[:, columns[-1] + 1 :] = False
+        body &= (ground_depth[window] - enter) * -rays[window][..., 2] > _SILL_M
+        occluded = has_surface & (depth < enter - _NEAR_BOX_M)
+        body &= ~own & ~occluded
+        # How far the surface lies behind the box's side: doors are as flat as that.
+        recess = np.clip(depth - enter, 0, max(float(np.median((depth - enter)[own])), 0))
+        recess = _from_nearest(recess, own).astype(np.float32)
+        smooth = cv2.blur(cv2.medianBlur(recess, 5), (_SMOOTH, _SMOOTH))
+        guess = np.where(body, np.minimum(enter + smooth, leave), guess)
+        inside = body
+    return window, inside, guess

@@ -1,0 +1,121 @@
+"""Raw scenes have no holes below the horizon: what is put there, of which class and whose."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pandaset_folder
+import torch
+from test_image_views import camera
+
+from adapters.lidar_scene.closing import close_parts
+from adapters.lidar_scene.image_views import View
+from adapters.lidar_scene.split import PointSet, join_tracks
+from adapters.pandaset import open_pandaset
+from adapters.raw_drive import BoxSample
+from augment.render.buffers import ALPHA
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians
+from augment.semantics import SemanticClass as Class
+
+GREY, RED = (90, 90, 90), (200, 30, 30)
+HEIGHT_M = 1.5  # of the camera, over the road
+
+
+def road(nearest_m: float) -> tuple[Gaussians, PointSet]:
+    """A level road 1.5 m below the camera, from a distance on, and its points."""
+    x, y = np.meshgrid(np.arange(nearest_m, 30, 0.2), np.arange(-15, 15, 0.2))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -HEIGHT_M)], 1).astype(np.float32)
+    classes = np.full(len(points), Class.ROAD, np.int16)
+    count = len(points)
+    gaussians = Gaussians(
+        means=torch.from_numpy(points),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        scales=torch.tensor([0.2, 0.2, 0.01]).repeat(count, 1),
+        opacities=torch.full((count,), 0.99),
+        sh=torch.zeros(count, 1, 3),
+        semantic=torch.from_numpy(classes),
+    )
+    return gaussians, PointSet(points, classes)
+
+
+def photo(path, colour) -> View:
+    cam = camera()
+    image = np.full((cam.height, cam.width, 3), colour, np.uint8)
+    cv2.imwrite(str(path), image[..., ::-1])
+    return View(cam, path, 0)
+
+
+def test_the_road_before_the_car_is_closed_at_its_height_in_the_photos_colour(tmp_path):
+    background, points = road(6.0)
+    view = photo(tmp_path / "a.png", RED)
+    (closed,) = close_parts([background], (), (), [view], points, max_gaussians=10**6)
+    new = closed.select(torch.arange(len(background), len(closed)))
+    assert len(new) > 50 and (new.semantic == Class.ROAD).all()
+    near = new.means[:, 0] < 20  # the horizon leaks too, and those discs hang above the ground
+    assert (new.means[near, 2] + HEIGHT_M).abs().max() < 0.1
+    before = new.means[:, 0] < 5
+    assert before.any()
+    colours = new.sh[before, 0] * 0.28209479 + 0.5
+    torch.testing.assert_close(
+        colours, torch.tensor(RED).expand_as(colours) / 255, atol=0.02, rtol=0
+    )
+    # Of an image that is closed, nothing is closed again.
+    (again,) = close_parts([closed], (), (), [view], points, max_gaussians=10**6)
+    assert len(again) - len(closed) < 0.05 * len(new)
+
+
+def test_the_hole_in_a_moving_object_is_of_the_object(tmp_path):
+    background, points = road(4.0)
+    pose = np.eye(4)
+    pose[:3, 3] = 6.5, 0, -HEIGHT_M + 0.9
+    sample = BoxSample("c", None, "Car", 0, 0, pose, np.array([3.0, 4.0, 1.6]))
+    keep = (np.abs(points.points[:, 1]) > 2.2) | (points.points[:, 0] < 5)
+    hollow = background.select(torch.from_numpy(keep))
+    world, car = close_parts(
+        [hollow, empty()],
+        join_tracks([sample]),
+        (),
+        [photo(tmp_path / "a.png", GREY)],
+        PointSet(points.points[keep], points.semantic[keep]),
+        max_gaussians=10**6,
+    )
+    assert len(car) >= 12 and (car.semantic == Class.VEHICLE).all()
+    assert (car.means.abs() <= torch.tensor([1.5, 2.0, 0.8]) + 0.1).all()
+    new = world.means[len(hollow) :]
+    in_box = (new - torch.tensor(pose[:3, 3]).float()).abs() < torch.tensor([1.2, 1.6, 0.5])
+    assert not in_box.all(1).any()
+
+
+def empty() -> Gaussians:
+    none = Gaussians.empty()
+    return Gaussians(
+        none.means,
+        none.quats,
+        none.scales,
+        none.opacities,
+        none.sh,
+        torch.zeros(0, dtype=torch.int16),
+    )
+
+
+def test_a_budget_makes_discs_larger_and_is_kept(tmp_path):
+    background, points = road(6.0)
+    most = len(background) + 60
+    view = photo(tmp_path / "a.png", RED)
+    (closed,) = close_parts([background], (), (), [view], points, max_gaussians=most)
+    assert len(background) < len(closed) <= most
+    new = closed.scales[len(background) :, 0]
+    (fine,) = close_parts([background], (), (), [view], points, max_gaussians=10**6)
+    assert new.median() > 1.5 * fine.scales[len(background) :, 0].median()
+
+
+def test_a_raw_scene_has_no_openings_below_the_horizon(tmp_path):
+    root = pandaset_folder.write_sequence(tmp_path / "002")
+    scene = open_pandaset(str(root), {"voxel_m": "0.1", "image_scale": "1", "sky_size": "8"})
+    for frame in scene.frames:
+        for own in frame.cameras.values():
+            alpha = rasterize(scene.parts_for(own), own, buffers=(ALPHA,)).alpha
+            alpha = alpha[own.ray_directions()[..., 2] < 0]
+            assert (alpha < 0.5).float().mean() < 0.002, (frame.index, own.name)
+            assert (alpha < 0.98).float().mean() < 0.03, (frame.index, own.name)
