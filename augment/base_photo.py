@@ -59,6 +59,7 @@ CLEAR_ALPHA, OPAQUE_ALPHA = 0.04, 0.96
 # Of the guided filter: its radius over the image's width, and the variance of display-encoded
 # colour that counts as an edge.
 RADIUS, EDGE = 1 / 320, 0.05**2
+WIDER = 4  # times as wide for the sky's share: splats of sky and of pale walls are told apart badly
 # Where nothing is rendered, rays that fall by more than this (metres a metre) see the road, no sky.
 LEVEL = 0.02
 MAX_CONDITION = 1e3  # of a colour map that is undone: 8 bits come back exactly
@@ -239,7 +240,7 @@ class Photo:
             share = 1 - alpha if level is None else 1 - alpha * (1 - level)
             if self.height_m is not None:
                 share = share.masked_fill(self.fall > LEVEL, 0.0)
-            rgb = mix(land, sky, self.sharpen(share))
+            rgb = mix(land, sky, self.sharpen(share, WIDER))
         if raster.overlay is None:
             return rgb
         assert raster.rgb is not None
@@ -300,9 +301,9 @@ class Photo:
             return rgb
         return map_colors(rgb, color_map, backend=self.backend).clamp_min(least)
 
-    def sharpen(self, values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Values of 0 to 1 whose edges move to the photo's."""
-        radius = max(2, round(RADIUS * self.camera.width))
+    def sharpen(self, values: Float[Tensor, "H W"], times: int = 1) -> Float[Tensor, "H W"]:
+        """Values of 0 to 1 whose edges move to the photo's. times: RADIUS."""
+        radius = max(2, round(RADIUS * times * self.camera.width))
         source = np.ascontiguousarray(values.detach().cpu().float().numpy())
         guide = cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)  # in colour it takes twice as long
         found = cv2.ximgproc.guidedFilter(guide, source, radius, EDGE * 255**2)
