@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -566,7 +567,7 @@ def test_grain_belongs_to_the_place_and_to_the_vehicle():
 def test_no_grain_where_nothing_shows_it():
     view = above()
     size, even = (view.height, view.width), torch.full((view.height, view.width, 3), 0.7)
-    for options in (
+    cases: list[dict[str, Any]] = [
         {"snow": torch.zeros(size)},
         {"hidden": torch.ones(size, dtype=torch.bool)},
         {"height_m": 0.0},
@@ -574,7 +575,8 @@ def test_no_grain_where_nothing_shows_it():
         {"height_m": math.nan},
         {"grain": Grain(0.0, 0.4, 5)},
         {"extinction_per_m": 1e6},
-    ):
+    ]
+    for options in cases:
         assert torch.equal(grained(view, **options), even), options
     level = Grain(1.0, 1.0, 5)
     for sun in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
