@@ -17,6 +17,9 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from augment.errors import AdapterError
 from augment.files.image_size import image_header
+from augment.files.recorded_images import ImageFault as ImageFault
+from augment.files.recorded_images import decode_image as decode_image
+from augment.files.recorded_images import is_whole_jpeg as is_whole_jpeg
 from recipes.errors import RecipeError
 from recipes.files import open_file
 from recipes.yaml_tree import read_plain
@@ -141,41 +144,6 @@ def array_of(value: object) -> np.ndarray | None:
         return np.array(value, np.float64)
     except (ValueError, OverflowError):
         return None
-
-
-def decode_image(path: Path, flags: int) -> np.ndarray | None:
-    """As cv2.imread, but of regular files only: a pipe would keep it waiting."""
-    try:
-        with open_file(path) as file:
-            data = np.frombuffer(file.read(_MAX_BYTES), np.uint8)
-    except OSError:
-        return None
-    return cv2.imdecode(data, flags) if len(data) else None
-
-
-class ImageFault(Exception):
-    """What is wrong with an image file, as the end of a sentence that starts with its path."""
-
-
-def is_whole_jpeg(path: Path) -> bool:
-    """Whether the file is a JPEG by its ends; no other kind is looked at further.
-
-    Raises:
-        ImageFault: missing, unreadable, or a JPEG that is cut short: decoders fill that with grey.
-    """
-    try:
-        with open_file(path) as file:
-            head = file.read(2)
-            size = file.seek(0, 2)
-            file.seek(max(0, size - 64))  # some cameras pad the file behind the end marker
-            tail = file.read()
-    except FileNotFoundError:
-        raise ImageFault("does not exist") from None
-    except OSError as error:
-        raise ImageFault(f"cannot be read ({error.strerror or error})") from None
-    if head == b"\xff\xd8" and b"\xff\xd9" not in tail:
-        raise ImageFault("is cut short")
-    return head == b"\xff\xd8"
 
 
 _IMAGE_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))

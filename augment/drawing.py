@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from augment.base_photo import Photo, blackened, mix
 from augment.cameras import Camera
-from augment.render.buffers import EXPECTED_DEPTH, RenderOutput
-from augment.render.composite import add_elevation
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
+from augment.render.composite import add_elevation, composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.fog import Fog, fog_raster
+from augment.render.fog import Fog, blend_airlight, fog_raster, sky_optical_depth
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
@@ -25,7 +26,7 @@ class LayerRenderer:
     """Draws the parts of a scene, all of them or those on one side of a level plane.
 
     fog: in front of parts and sky. fog_on_buffers: whether it is applied to finished layers, and
-    not blended per Gaussian.
+    not blended per Gaussian. photo: what cameras that took it see in place of the splats' colours.
     """
 
     parts: Sequence[PosedGaussians]
@@ -34,6 +35,7 @@ class LayerRenderer:
     fog_on_buffers: bool
     settings: RasterSettings
     backend: str
+    photo: Photo | None = None
 
     def without_fog(self) -> LayerRenderer:
         return replace(self, fog=None)
@@ -44,12 +46,21 @@ class LayerRenderer:
         clip: HeightClip | None,
         buffers: frozenset[str],
         pixel_mask: Bool[Tensor, "H W"] | None = None,
+        shown: Float[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """The layer's buffers, without sky; its colours are seen through the fog."""
+        """The layer's buffers, without sky; its colours are seen through the fog.
+
+        shown: how much of each pixel of a photo shows this layer; None for all of it.
+        """
         later = self.fog if self.fog_on_buffers else None
+        photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
+        parts = self.parts
+        if photo is not None:
+            buffers = buffers | photo.buffers_for(parts)
+            parts = blackened(parts) if shown is None else parts
         tilted = self.fog if self.fog is not None and self.fog.overcast > 0 else None
         raster = rasterize(
-            self.parts,
+            parts,
             camera,
             buffers=buffers | {EXPECTED_DEPTH} if later or tilted else buffers,
             settings=self.settings,
@@ -58,6 +69,9 @@ class LayerRenderer:
             pixel_mask=pixel_mask,
             backend=self.backend,
         )
+        if photo is not None:
+            with timed("photo"):
+                raster = photo.paint(raster, parts, camera, shown)
         if later is not None:
             with timed("smog on buffers"):
                 raster = replace(raster, rgb=fog_raster(raster, camera, later))
@@ -66,3 +80,53 @@ class LayerRenderer:
                 rgb = add_elevation(raster, camera, tilted, backend=self.backend)
                 raster = replace(raster, rgb=rgb)
         return raster
+
+    def draw_whole(
+        self, camera: Camera, buffers: frozenset[str]
+    ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
+        """The picture with its sky, not clamped, and the scene's buffers."""
+        if self.photo is not None:
+            return self._draw_on_photo(self.photo, camera, buffers)
+        with timed("rasterise"):
+            raster = self.draw(camera, None, buffers)
+        assert raster.rgb is not None and raster.alpha is not None
+        uniform = self.fog is not None and self.fog.scale_height_m is None  # hides the sky
+        with timed("airlight behind the splats" if uniform else "sky"):
+            return self.add_sky(raster.rgb, raster.alpha, camera), raster
+
+    def add_sky(
+        self, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], camera: Camera
+    ) -> Float[Tensor, "H W 3"]:
+        """A layer's colours before the sky, seen through the fog. camera: the view's, or a window
+        of it.
+        """
+        if self.photo is None:
+            return composite_sky(rgb, alpha, camera, self.sky, fog=self.fog, backend=self.backend)
+        sky = self.photo.sky_colors(camera)
+        if self.fog is not None:
+            slope = camera.ray_directions(rgb.dtype, rgb.device)[..., 2]
+            slope = slope / camera.ray_lengths(rgb.dtype, rgb.device)
+            tau = sky_optical_depth(self.fog, slope, float(camera.centre[2]))
+            sky = blend_airlight(sky, tau, self.fog, slope)
+        return rgb + (1 - alpha)[..., None] * sky
+
+    def _draw_on_photo(
+        self, photo: Photo, camera: Camera, buffers: frozenset[str]
+    ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
+        """The photo with what lies on the scene, through the smog up to each pixel's depth."""
+        requested = (buffers - {RGB}) | photo.buffers_for(self.parts) | {ALPHA}
+        if self.fog is not None:
+            requested = requested | {EXPECTED_DEPTH}
+        parts = blackened(self.parts)
+        with timed("rasterise"):
+            settings = replace(self.settings, sh_degree=0)  # black in all bands
+            raster = rasterize(
+                parts, camera, buffers=requested, settings=settings, backend=self.backend
+            )
+        with timed("photo"):
+            rgb = photo.clear_picture(raster, parts)
+        if self.fog is None:
+            return rgb, raster
+        with timed("smog on buffers"):
+            transmittance = photo.transmittance(raster, self.fog)
+            return mix(rgb, photo.airlight(self.fog), 1 - transmittance), raster

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from augment import effects
+from augment.base_photo import RECORDED, check_base
 from augment.bounds import actor_boxes, actor_poses, owners_seen
 from augment.cameras import Camera
 from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
@@ -35,7 +36,8 @@ class Plan:
     it; empty where they show it. depth_buffer: written as depth. shows_first: these images show
     what a ray meets first, such as water, not the scene under it. finds_boxes: labels or instance
     images need the depth of the solid surfaces. recorded_exposure: cameras' colour maps apply to
-    the finished picture. sensor, seed: of the recipe. steps: every pass considered, in order.
+    the finished picture. on_photo: the recorded image stays the picture, and the scene supplies the
+    weather. sensor, seed: of the recipe. steps: every pass considered, in order.
     """
 
     placed: Mapping[str, Placed]
@@ -49,6 +51,7 @@ class Plan:
     shows_first: bool
     finds_boxes: bool
     recorded_exposure: bool
+    on_photo: bool
     sensor: Sensor
     seed: int
     steps: tuple[Step, ...]
@@ -86,7 +89,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     """The passes that `recipe` requires of `scene`.
 
     Raises:
-        SceneError: the recipe needs a fact that the scene does not know (the road's height).
+        SceneError: the recipe needs what the scene does not have (the road's height, photos).
         RecipeError: the recipe's quality has still to choose its settings.
     """
     if recipe.quality.is_open:
@@ -95,6 +98,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
             f"(augment.jobs.quality)"
         )
+    check_base(recipe, scene)
     placed = dict[str, Placed]()
     for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
         placed[effect.name] = effect.place(recipe, scene, placed)
@@ -134,6 +138,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         shows_first=output.surface == "first",
         finds_boxes=finds_boxes,
         recorded_exposure=exposure.runs,
+        on_photo=recipe.render.base == RECORDED,
         sensor=recipe.camera,
         seed=recipe.seed,
         steps=_all_steps(recipe, scene, placed, buffers, bare_buffers, exposure),
@@ -164,6 +169,7 @@ def _all_steps(
     return (
         *of_effects(SCENE),
         Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
+        _photo_step(recipe),
         *drawing,
         Step(BARE, bool(bare), without),
         *of_effects(PICTURE),
@@ -179,6 +185,14 @@ def _all_steps(
 
 def _is_covered(listed: Iterable[Effect], placed: Mapping[str, Placed]) -> bool:
     return any(e.lies_on_scene and placed[e.name].data is not None for e in listed)
+
+
+def _photo_step(recipe: Recipe) -> Step:
+    base = recipe.render.base
+    why = f"render.base is {base!r}"
+    if base == RECORDED:
+        why += ": the recorded image is the picture, edges of the weather move to its own"
+    return Step("photo", base == RECORDED, why)
 
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:

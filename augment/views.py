@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment import effects
+from augment.base_photo import open_photo
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
@@ -18,7 +19,7 @@ from augment.jobs.layout import TRUST
 from augment.jobs.processes import choose_backend
 from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
 from augment.render.buffers import AUTO, EXPECTED_DEPTH, RenderOutput
-from augment.render.composite import composite_sky, map_colors
+from augment.render.composite import map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
 from augment.scene import PosedGaussians, Scene
@@ -64,13 +65,17 @@ def render_buffers(
         view = plan_view(plan, scene, camera, backend=backend)
     with timed("parts"):
         bare_parts = scene.parts_for(camera, view.actors)
-    layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend)
+    color_map = scene.color_map(camera) if plan.recorded_exposure else None
+    photo = None
+    if plan.on_photo:
+        with timed("photo"):
+            photo = open_photo(scene, camera, color_map, backend=backend)
+    layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for own in view.effects:
         layers = own.effect.edit_scene(own, layers, camera)
     drawn = _draw(view, layers, camera)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)
-    color_map = scene.color_map(camera) if plan.recorded_exposure else None
     rgb = drawn.rgb
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with timed("camera colour map"):
@@ -102,14 +107,7 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
         drawn = own.effect.draw(own, layers, camera, view.buffers)
         if drawn is not None:
             return drawn
-    with timed("rasterise"):
-        raster = layers.draw(camera, None, view.buffers)
-    assert raster.rgb is not None and raster.alpha is not None
-    fog, backend = layers.fog, layers.backend
-    uniform = fog is not None and fog.scale_height_m is None  # hides the sky
-    with timed("airlight behind the splats" if uniform else "sky"):
-        rgb = composite_sky(raster.rgb, raster.alpha, camera, layers.sky, fog=fog, backend=backend)
-    return Drawn(rgb, raster)
+    return Drawn(*layers.draw_whole(camera, view.buffers))
 
 
 def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:

@@ -153,7 +153,7 @@ class Weather(Closed):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("exposure", "transmittance_stop", "radius_clip_px")
+    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px")
     knobs = (
         Knob(
             "scale",
@@ -173,6 +173,9 @@ class Render(Section):
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
 
+    base: Literal["splats", "recorded"] = "splats"
+    """splats draws the scene; recorded keeps each camera's recorded image as the picture and takes
+    only the weather from the scene: at recorded poses, with a scale of at most 1."""
     scale: Number = Field(default=1.0, gt=0, le=4)
     """Resolution relative to the cameras'."""
     near_m: Number = Field(default=0.01, gt=0, le=100)

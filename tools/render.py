@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import shlex
 import signal
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator, Sequence
@@ -47,7 +48,7 @@ from recipes.fields import found
 from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
-from tools.drawing import draw_sheet, draw_video
+from tools.drawing import draw_sheet, draw_video, write_rgb
 from tools.export import mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
 from tools.output import compiling_noted, fill, print_images, print_note
@@ -109,18 +110,26 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
         )
         for_boxes = uses_boxes(recipe) and output.depth == "none"
         ids = output.semantic or output.instance
-        kernels = (*chosen, output.depth, ids, output.surface, for_boxes, recipe.lidar)
+        base = recipe.render.base
+        kernels = (*chosen, base, output.depth, ids, output.surface, for_boxes, recipe.lidar)
         if kernels not in seen:
             seen.add(kernels)
-            placed = make_plan(recipe, _warm_up_scene(0.0, with_labels=False)).placed.values()
-            level_z_m = next((p.water_level_z_m for p in placed if p.water_level_z_m), 0.0)
-            scene = _warm_up_scene(level_z_m, with_labels=output.labels)
-            render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
-            if recipe.lidar == "weather":
-                weathered_sweep(scene, recipe, 0, _one_return(level_z_m))
+            with tempfile.NamedTemporaryFile(suffix=".png") as photo:
+                write_rgb(Path(photo.name), np.zeros((SIZE, SIZE, 3), np.uint8))
+                _warm_recipe(recipe, photo.name, backend)
 
 
-def _warm_up_scene(level_z_m: float, *, with_labels: bool) -> Scene:
+def _warm_recipe(recipe: Recipe, photo: str, backend: str) -> None:
+    scene = _warm_up_scene(0.0, photo, with_labels=False)
+    placed = make_plan(recipe, scene).placed.values()
+    level_z_m = next((p.water_level_z_m for p in placed if p.water_level_z_m), 0.0)
+    scene = _warm_up_scene(level_z_m, photo, with_labels=recipe.output.labels)
+    render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
+    if recipe.lidar == "weather":
+        weathered_sweep(scene, recipe, 0, _one_return(level_z_m))
+
+
+def _warm_up_scene(level_z_m: float, photo: str, *, with_labels: bool) -> Scene:
     """A level road above a flood's surface, and a splat below it; the level counts from z = 0."""
     across = torch.arange(-ACROSS, ACROSS + 1) * SPACING_M
     x, y = torch.meshgrid(across + 4, across, indexing="ij")
@@ -135,7 +144,8 @@ def _warm_up_scene(level_z_m: float, *, with_labels: bool) -> Scene:
     )
     sky = CubemapSky(torch.zeros(6, 2, 2, 3))
     camera = _camera(level_z_m + 1.0)
-    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {camera.name: camera})
+    world_from_ego = torch.eye(4, dtype=torch.float64)
+    frame = Frame(0, 0, world_from_ego, {camera.name: camera}, {camera.name: photo})
     return Scene(
         "warm-up",
         "warm-up",

@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
-from adapters.plain_files import ImageFault, decode_image, is_whole_jpeg
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
 from adapters.training_views.masks import (
     find_ego_mask,
@@ -24,6 +22,7 @@ from adapters.training_views.masks import (
 )
 from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Scene
@@ -34,47 +33,6 @@ CACHE_BYTES = 1 << 30
 _MAX_POSITION_M = 1e6  # float32 has a resolution of 6 cm there
 _MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
-# JPEG decoders can leave out the finest parts of each 8x8 block, which costs far less.
-_REDUCED = {
-    8: cv2.IMREAD_REDUCED_COLOR_8,
-    4: cv2.IMREAD_REDUCED_COLOR_4,
-    2: cv2.IMREAD_REDUCED_COLOR_2,
-    1: cv2.IMREAD_COLOR,
-}
-
-
-def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
-    """The image of camera `full` at the size of camera `scaled`: RGB uint8 [H, W, 3].
-
-    Each pixel is the mean of the area it covers. Files may be any kind that OpenCV decodes; their
-    size may differ from the camera's by less than the reduction of the decoder (8 pixels at most).
-
-    Raises:
-        ImageFault: missing, cut short, not decodable, or not of the camera's size."""
-    is_jpeg = is_whole_jpeg(path)
-    step = 1
-    while is_jpeg and step < 8 and _can_be_reduced(full, scaled, 2 * step):
-        step *= 2
-    image = decode_image(path, _REDUCED[step])
-    if image is None:
-        raise ImageFault("cannot be decoded")
-    size = (-(-full.height // step), -(-full.width // step))
-    if image.shape[:2] != size:
-        height, width = image.shape[0] * step, image.shape[1] * step
-        about = "about " if step > 1 else ""
-        raise ImageFault(
-            f"is of {about}{width}x{height} pixels; its camera is of {full.width}x{full.height}"
-        )
-    if (scaled.height, scaled.width) != size:
-        image = cv2.resize(image, (scaled.width, scaled.height), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _can_be_reduced(full: Camera, scaled: Camera, step: int) -> bool:
-    """Whether 1/step of the size is not below the size asked for, and divides both sides: an odd
-    remainder would shift pixels."""
-    divides = full.width % step == 0 and full.height % step == 0
-    return divides and full.width // step >= scaled.width and full.height // step >= scaled.height
 
 
 def holdout_step(holdout: str) -> int | None:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from augment.base_photo import check_photos
 from augment.cameras import Camera, Frame
 from augment.dataset.samples import (
     BoxFrame,
@@ -67,7 +68,7 @@ class SceneDataset(Dataset):
     `WeatherDataset`; a live scene passes no sweeps on.
 
     Raises:
-        SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow.
+        SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow or base.
         RecipeError, StyleError: a file of the recipe's style cannot be used.
         BackendUnavailable: the backend.
         ValueError: the backend, or an unknown option.
@@ -103,6 +104,7 @@ class SceneDataset(Dataset):
         self._renderer = renderer or default_renderer()
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)
+        check_photos([self.recipe], scene.name, selection)
         self._items = [(frame, name) for frame, names in selection for name in names]
         share_effects(Sharing(scene, [self.recipe], backend=self._backend))
         self._memo = memo_of(scene).shared()

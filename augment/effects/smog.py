@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
+from augment.base_photo import RECORDED
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
@@ -78,8 +79,11 @@ class SmogEffect(Effect):
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
-        on_buffers = smog.model == "deferred"
+        on_photo = recipe.render.base == RECORDED
+        on_buffers = on_photo or smog.model == "deferred"
         other = "weather.smog.model chooses the other way"
+        if on_photo:
+            other = "render.base is 'recorded': the photo's pixels are faded by their depth"
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")

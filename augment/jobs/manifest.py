@@ -60,7 +60,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **{"frame": whole, "camera": text, "timestamp_ns": whole},
         **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
         **{"width": whole, "height": whole},
-        **dict.fromkeys(("surface", "lidar", "lidar_note", *words, "quality"), text),
+        **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *words, "quality"), text),
         **{"render_scale": pa.float64(), "settings": text, "trusted_fraction": pa.float64()},
     }
 
@@ -72,7 +72,7 @@ def later_columns() -> dict[str, str | None]:
     What old rows were rendered with is in their recipes, and not known here.
     """
     later = dict.fromkeys(name for name in leading_columns() if name not in _FIRST)
-    return {**later, "surface": "solid"}
+    return {**later, "base": "splats", "surface": "solid"}
 
 
 def weather_columns(table: pa.Table) -> list[str]:
@@ -569,6 +569,7 @@ def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
         chosen = {path: v for path, v in settings_of(recipe).items() if KNOBS[path].chosen}
         settings = json.dumps(chosen, separators=(",", ":"))
     return {
+        "base": recipe.render.base,
         "surface": recipe.output.surface,
         **recipe.columns(),
         "quality": words,

@@ -21,6 +21,7 @@ from typing import Any
 from tqdm import tqdm
 
 import augment
+from augment.base_photo import check_photos
 from augment.cameras import Frame
 from augment.effects import Sharing, share_effects
 from augment.errors import ClimateGSError, OutputError
@@ -199,7 +200,7 @@ def run_job(
     stderr. on_outcome: called after each image, from several threads, one at a time. An image that
     fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt finishes the images
     at hand, writes the manifest of what there is, and is raised again. Raises SceneError: the scene
-    cannot be opened, lacks a requested frame or camera, or cannot have the snow of a recipe;
+    cannot be opened, lacks a requested frame, camera or photo, or cannot have a recipe's snow;
     StyleError, RecipeError: a style or one of its files cannot be used; no file of a variant has
     been written or replaced then. OutputError: the folder cannot be written, is in use, or holds
     something else.
@@ -302,6 +303,8 @@ class _Run:
         self.backend = job.backend if renderer else choose_backend(job.backend, scene)
         self.index = SceneIndex.of(scene, job.camera_path)
         self.selection = select_frames(self.index, job.frames, job.cameras)
+        is_path = job.camera_path is not None
+        check_photos(job.recipes, scene.name, self.selection, is_path=is_path)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
         self.recipes = tuple(self._resolved(with_digest(r)) for r in job.recipes)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from adapters.plain_files import ImageFault
-from adapters.training_views.views import RecordedViews, holdout_step, read_scaled
+from adapters.training_views.views import RecordedViews, holdout_step
 from augment.errors import AdapterError
+from augment.files.recorded_images import read_scaled
 from augment.reconstruct.view import ViewKey
 
 

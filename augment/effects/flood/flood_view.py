@@ -43,7 +43,7 @@ from augment.effects.flood.water_plane import (
 )
 from augment.effects.flood.waves import wave_field
 from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, kernels_for
-from augment.render.composite import composite_sky, sky_behind
+from augment.render.composite import sky_behind
 from augment.render.constants import DEPTH_EPS
 from augment.render.fog import Fog, blend_airlight, sky_optical_depth
 from augment.render.layout import ABOVE, BELOW, HeightClip
@@ -79,22 +79,19 @@ def composite_water(
     camera: Camera,
     window: Window,
     color: Float[Tensor, "h w 3"],
-    sky: Sky,
-    fog: Fog | None,
-    *,
-    backend: str = CPU,
+    renderer: LayerRenderer,
 ) -> Float[Tensor, "H W 3"]:
     """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
 
-    color: of the window's pixels.
+    color: of the window's pixels. renderer: that drew the front.
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
     image, dry = rgb.clone(), _dry_rows(camera)
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
-        image[:dry] = composite_sky(rgb[:dry], alpha[:dry], above, sky, fog=fog, backend=backend)
-    if kernels_for(backend, rgb, alpha) == CPU:
+        image[:dry] = renderer.add_sky(rgb[:dry], alpha[:dry], above)
+    if kernels_for(renderer.backend, rgb, alpha) == CPU:
         if window.top < dry:  # rows that show both: what falls belongs to the water
             wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
             image[window.top : dry][wet] = rgb[window.top : dry][wet]
@@ -277,7 +274,7 @@ def render_flooded(
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
         with timed("sky"):
-            image = composite_sky(front.rgb, front.alpha, camera, sky, fog=fog, backend=backend)
+            image = renderer.add_sky(front.rgb, front.alpha, camera)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
@@ -289,7 +286,12 @@ def render_flooded(
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
     with timed("flood: bed"):
-        bed = _draw_bed(renderer, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
+        shown = None
+        if renderer.photo is not None:  # which shows of the bed what the front leaves free
+            shown = torch.zeros(bed_camera.height, bed_camera.width, device=device)
+            here, there = bed_window.overlap(front.alpha)
+            shown[there] = 1 - front.alpha[here]
+        bed = _draw_bed(renderer, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen, shown)
     with timed("flood: mirrored view"):
         mirror = _mirror_layer(renderer, camera, medium, window, seen)
     screen = None
@@ -312,7 +314,7 @@ def render_flooded(
             backend=backend,
         )
     with timed("flood: layers joined"):
-        image = composite_water(front, camera, window, color, sky, fog, backend=backend)
+        image = composite_water(front, camera, window, color, renderer)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
 
@@ -324,12 +326,13 @@ def _draw_bed(
     scene_buffers: frozenset[str],
     margins: Margins,
     seen: Bool[Tensor, "h w"],
+    shown: Float[Tensor, "rows columns"] | None,
 ) -> RenderOutput:
     """What lies below the surface; not what the front hides, nor, in a mere picture, the water."""
     reach = math.inf if scene_buffers else visible_depth_m(medium)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
     requested = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    return renderer.draw(camera, below, requested, margins.around(seen, margins))
+    return renderer.draw(camera, below, requested, margins.around(seen, margins), shown)
 
 
 def visible_depth_m(medium: FloodMedium) -> float:

@@ -368,10 +368,11 @@ def bury(buried, buried_by, heights, opacities):
 
 # ---- Grain of near snow, as `relief.add_grain` defines it ----------------------------------------
 
-FARTHEST_M = 12.0  # from the camera; beyond half of it grain fades
+FARTHEST_M = 9.0  # from the camera; beyond half of it grain fades
 MIN_SNOW = 0.02  # share of a pixel
-GRAINS = 4  # octaves
-COARSEST_TEXEL_M, FINER = 0.016, 0.47  # of the noise's table, whose features are five texels wide
+GRAINS = 3  # octaves
+GRAIN_SIDE = 64  # texels a side of the noise, repeated
+COARSEST_TEXEL_M, FINER = 0.013, 0.42  # of the noise's table, whose features are five texels wide
 SHOWN_AT = 2.5  # half of that: features of two pixels begin to show, those of four do
 TURN_COS, TURN_SIN = 0.8, 0.6  # about the vertical, from one octave to the next
 MIN_FALL = 0.05  # sine of the angle that a level surface is seen at, for a pixel's size on it
@@ -397,7 +398,9 @@ class GrainView(NamedTuple):
 
 @kernel
 def add_grain(rgb, depth, snow, hidden, view, noise):
-    """Grain on the snow of rgb [H, W, 3], in place; hidden: bool [H, W], or [0, 0] for nowhere."""
+    """Grain on the snow of rgb [H, W, 3], in place; hidden: bool [H, W], or [0, 0] for nowhere.
+    noise: cubic, flattened, z first.
+    """
     for i in prange(rgb.shape[0]):
         _grain_row(np.int64(i), rgb, depth, snow, hidden, view, noise)
 
@@ -435,9 +438,10 @@ def _grain_row(i, rgb, depth, snow, hidden, view, noise):
         pixel_m = far / lens[0] / math.sqrt(max(abs(rz) / length, MIN_FALL))
         x, y, height = x + view.shift[0], y + view.shift[1], height + view.shift[2]
         bright = _grain_at(x, y, height, du, dv, pixel_m, view.relief, view.mottle, noise)
-        factor = 1.0 + fade * snow[i, j] * math.exp(-view.extinction * far) * bright
+        clear = math.exp(-view.extinction * far) if view.extinction > 0.0 else 1.0
+        factor = np.float32(1.0 + fade * snow[i, j] * clear * bright)
         for channel in range(3):
-            rgb[i, j, channel] = np.float32(factor * rgb[i, j, channel])
+            rgb[i, j, channel] *= factor
 
 
 @inner()
@@ -446,20 +450,27 @@ def _grain_at(x, y, z, dx, dy, pixel_m, relief, mottle, noise):
 
     The noise and its rise along that way are interpolated between the eight texels about the place.
     """
-    mask, bright, texel = noise.shape[0] - 1, 0.0, COARSEST_TEXEL_M
+    side, mask, bright, texel = GRAIN_SIDE, GRAIN_SIDE - 1, 0.0, COARSEST_TEXEL_M
     for _ in range(GRAINS):
         shown = min(SHOWN_AT * texel / pixel_m - 1.0, 1.0)
         if shown <= 0.0:
             break
-        u, v, w = x / texel, y / texel, z / texel
+        per_m = 1.0 / texel
+        u, v, w = x * per_m, y * per_m, z * per_m
         i, j, k = math.floor(u), math.floor(v), math.floor(w)
         u, v, w = u - i, v - j, w - k
-        i, j, k = np.int64(i) & mask, np.int64(j) & mask, np.int64(k) & mask
-        i1, j1, k1 = (i + 1) & mask, (j + 1) & mask, (k + 1) & mask
-        a = noise[k, j, i] + w * (noise[k1, j, i] - noise[k, j, i])
-        b = noise[k, j, i1] + w * (noise[k1, j, i1] - noise[k, j, i1])
-        c = noise[k, j1, i] + w * (noise[k1, j1, i] - noise[k, j1, i])
-        d = noise[k, j1, i1] + w * (noise[k1, j1, i1] - noise[k, j1, i1])
+        # Unsigned and in one dimension: else every look asks whether it counts from the end.
+        i0, i1 = np.uint64(np.int64(i) & mask), np.uint64((np.int64(i) + 1) & mask)
+        j0, j1 = (
+            np.uint64(side * (np.int64(j) & mask)),
+            np.uint64(side * ((np.int64(j) + 1) & mask)),
+        )
+        k0 = np.uint64(side * side * (np.int64(k) & mask))
+        k1 = np.uint64(side * side * ((np.int64(k) + 1) & mask))
+        a = noise[k0 + j0 + i0] + w * (noise[k1 + j0 + i0] - noise[k0 + j0 + i0])
+        b = noise[k0 + j0 + i1] + w * (noise[k1 + j0 + i1] - noise[k0 + j0 + i1])
+        c = noise[k0 + j1 + i0] + w * (noise[k1 + j1 + i0] - noise[k0 + j1 + i0])
+        d = noise[k0 + j1 + i1] + w * (noise[k1 + j1 + i1] - noise[k0 + j1 + i1])
         value = (a + u * (b - a)) * (1.0 - v) + (c + u * (d - c)) * v
         along = ((b - a) * (1.0 - v) + (d - c) * v) * dx + ((c - a) * (1.0 - u) + (d - b) * u) * dy
         bright += shown * (mottle * value - relief * along)

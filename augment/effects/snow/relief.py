@@ -28,8 +28,7 @@ from augment.render.threads import kernel_threads
 
 # Brightness per slope of the relief towards the sun, at a clear day's contrast, and per deviation
 # of the noise in any light; both at the recipe's grain of 1.
-RELIEF, MOTTLE = 0.36, 0.035
-TABLE = 64  # texels a side of the noise, repeated
+RELIEF, MOTTLE = 0.42, 0.04
 _SMOOTH = 1.25  # texels: standard deviation of its blur
 _ROWS = 16  # image rows a thread takes at a time
 
@@ -84,7 +83,7 @@ def add_grain(
     with kernel_threads(_ROWS):
         kernels.add_grain(
             *(rgb.numpy(), depth_m.contiguous().numpy(), snow.contiguous().numpy(), bare),
-            *(view, noise_table()),
+            *(view, noise_table().reshape(-1)),
         )
     return rgb
 
@@ -127,7 +126,7 @@ def _add_grain(
 def _brightness(
     places: Tensor, steps: Tensor, rays: Tensor, far: Tensor, view: GrainView
 ) -> Tensor:
-    noise, mask = torch.from_numpy(noise_table()).to(places.device).double(), TABLE - 1
+    noise, mask = torch.from_numpy(noise_table()).to(places.device).double(), kernels.GRAIN_SIDE - 1
     places = places + torch.from_numpy(view.shift).to(places.device)
     (x, y, z), (dx, dy) = places.unbind(1), steps[:, :2].unbind(1)
     fall = rays[:, 2].abs() / rays.norm(dim=1)
@@ -136,7 +135,7 @@ def _brightness(
     cos, sin = kernels.TURN_COS, kernels.TURN_SIN
     for _ in range(kernels.GRAINS):
         shown = (kernels.SHOWN_AT * texel / pixel_m - 1).clamp(0, 1)
-        at = torch.stack([x, y, z]) / texel
+        at = torch.stack([x, y, z]) * (1 / texel)
         u, v, w = at - at.floor()
         i, j, k = at.floor().long() & mask
         i1, j1, k1 = (i + 1) & mask, (j + 1) & mask, (k + 1) & mask
@@ -188,8 +187,8 @@ def _view_of(
 
 @functools.cache
 def noise_table() -> np.ndarray:
-    """float32 [TABLE, TABLE, TABLE] of unit deviation, smooth over some texels; faces meet."""
-    white = np.random.Generator(np.random.PCG64(0)).standard_normal((TABLE, TABLE, TABLE))
+    """float32 [GRAIN_SIDE] * 3 of unit deviation, smooth over some texels, whose faces meet."""
+    white = np.random.Generator(np.random.PCG64(0)).standard_normal(3 * (kernels.GRAIN_SIDE,))
     smooth = ndimage.gaussian_filter(white, _SMOOTH, mode="wrap")
     return (smooth / smooth.std()).astype(np.float32)
 

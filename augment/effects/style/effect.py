@@ -94,7 +94,11 @@ class StyleEffect(Effect):
         if own.data.applied_to == "picture":
             return layers
         style = own.prepared
-        return replace(layers, parts=style.on(layers.parts, backend=own.backend), sky=style.sky)
+        photo = layers.photo
+        if photo is not None:
+            photo = replace(photo, style=style.on_photo)
+        parts = style.on(layers.parts, backend=own.backend)
+        return replace(layers, parts=parts, sky=style.sky, photo=photo)
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
         if own.data.applied_to != "picture":

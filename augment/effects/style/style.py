@@ -17,8 +17,10 @@ from jaxtyping import Float, Int16
 from pydantic import ValidationError, field_validator
 from torch import Tensor
 
+from augment.base_photo import PhotoStyle
 from augment.cameras import Camera
 from augment.effects.style.color_maps import (
+    LEVELS,
     StyleMaps,
     level_maps,
     map_rows,
@@ -260,6 +262,14 @@ class SceneStyle:
     ) -> tuple[PosedGaussians, ...]:
         """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
         return tuple(part if part.is_overlay else self._mapped(part, backend) for part in parts)
+
+    @cached_property
+    def on_photo(self) -> PhotoStyle:
+        """The maps for a photo of the scene."""
+        levels = None
+        if self.levels is not None:
+            levels = torch.nn.functional.pad(self.levels.float() / LEVELS, (1, 1))
+        return PhotoStyle(self.maps.splats, self.maps.sky, levels)
 
     @property
     def own_bytes(self) -> int:
