@@ -709,6 +709,7 @@ def foliage_apart(surface: Surface, classes: np.ndarray) -> np.ndarray:
         _, nearest = cv2.distanceTransformWithLabels(
             (~ground).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
         )
+        nearest = nearest.astype(np.int64)
         heights = np.zeros(int(nearest.max()) + 1, np.float32)
         heights[nearest[ground]] = surface.height_m[ground]
         is_high = can_carry & (surface.height_m - heights[nearest] > FOLIAGE_M)
