@@ -410,6 +410,7 @@ def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> Recipe:
         if style.get("applied_to") == "picture":
             style["per_region"] = False
     data["output"] = draw(outputs(data))
+    data.get("render", {}).pop("base", None)  # these scenes have no recorded images
     try:
         return Recipe.model_validate(data)
     except ValidationError:  # a rule between fields that is younger than this file

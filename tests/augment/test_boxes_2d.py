@@ -399,7 +399,7 @@ def a_sample(boxes: Boxes, frame: str = "world", weather: BoxWeather | None = No
     origins = {"ego": world_from_ego, "camera": world_from_camera, "world": torch.eye(4)}
     camera = {"name": "front", "width": WIDTH, "height": HEIGHT, "timestamp_ns": 0, "K": K}
     camera |= {"world_from_camera": world_from_camera, "world_from_ego": world_from_ego}
-    images = dict.fromkeys(("depth", "semantic", "instance", "water", "snow"))
+    images = dict.fromkeys(("depth", "semantic", "instance", "water", "snow", "trust"))
     return {
         "boxes": box_tensors(there, weather or {}, frame, origins[frame].numpy()),
         "camera": camera,

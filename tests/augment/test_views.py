@@ -210,7 +210,9 @@ def around(camera: Camera) -> list[Camera]:
 def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
-    active = tuple(dataclasses.replace(own, seen=(0, *actors)) for own in plan.active(scene))
+    active = tuple(
+        dataclasses.replace(own, seen=frozenset((0, *actors))) for own in plan.active(scene)
+    )
     return ViewPlan(actors, active, plan.buffers, plan.bare_buffers, plan.steps)
 
 

@@ -706,10 +706,10 @@ def foliage_apart(surface: Surface, classes: np.ndarray) -> np.ndarray:
     ground = cv2.morphologyEx(ground.astype(np.uint8), cv2.MORPH_OPEN, around) > 0
     is_high = can_carry
     if ground.any():
-        _, nearest = cv2.distanceTransformWithLabels(
+        _, labels = cv2.distanceTransformWithLabels(
             (~ground).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
         )
-        nearest = nearest.astype(np.int64)
+        nearest = np.array(labels, np.int64)
         heights = np.zeros(int(nearest.max()) + 1, np.float32)
         heights[nearest[ground]] = surface.height_m[ground]
         is_high = can_carry & (surface.height_m - heights[nearest] > FOLIAGE_M)
