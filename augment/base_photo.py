@@ -47,7 +47,7 @@ from augment.render.buffers import (
 )
 from augment.render.composite import map_colors
 from augment.render.cuda import runtime as gpu
-from augment.render.fog import MAX_EXPONENT, Fog, airlight_gain, optical_depth, sky_optical_depth
+from augment.render.fog import Fog, airlight_gain, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
@@ -342,7 +342,7 @@ class Photo:
         over_base_m = float(camera.centre[2]) - fog.base_z_m
         numbers = (
             *(lens, (-camera.world_from_camera[2, :3]).tolist()),
-            (fog.sigma_per_m, inverse_m, over_base_m, MAX_EXPONENT),
+            (fog.sigma_per_m, inverse_m, over_base_m),
             (self.height_m or 0.0, LEVEL),
         )
         arrays = [np.array(own, np.float32) for own in numbers]

@@ -15,12 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from augment.cameras import Camera, Frame
+from augment.files.recorded_images import decode_image
 from augment.memo import memo_of
 from augment.scene import Scene
-from recipes.files import open_file
 
 WORK_WIDTH = 256  # columns of the image that is cut: 0.1 s; finer lines than a twig's do not matter
-_MAX_BYTES = 1 << 28  # of an image file
 _MAX_SQUEEZE = 0.05  # of its sides' ratio: beyond it is another camera's
 _SMOOTH_LEVELS = 6.0  # of 255: standard deviation within 5x5 pixels; clouds pass, foliage does not
 _DARK_LEVELS = 70.0  # of 255: this much darker than the brightest tenth above the horizon is none
@@ -126,13 +125,7 @@ def elevation_rad(camera: Camera) -> Float[np.ndarray, "H W"]:
 
 def _read_image(path: Path, camera: Camera) -> np.ndarray | None:
     """RGB at the camera's size; None for what is no image of its proportions."""
-    try:
-        with open_file(path) as file:
-            data = np.frombuffer(file.read(_MAX_BYTES), np.uint8)
-        flags = cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
-        return None
+    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         return None
     height, width = image.shape[:2]

@@ -51,9 +51,7 @@ _GRID_WIDTH = 320  # columns of the points that are looked for in the views of t
 _DEPTH_WIDTH = 240  # and of these views' depths
 _SKY_POINT_M = 1e4
 _DEPTH_SHARE, _DEPTH_M = 0.05, 0.5  # a point so little behind what a view shows is seen by it
-_NUM_VIEWS = (
-    24  # that are asked, the nearest: what they have not seen, those farther away saw worse
-)
+_NUM_VIEWS = 24  # the nearest are asked: what they have not seen, those farther away saw worse
 _MIN_POINTS = 0.001  # of all: for fewer, a view's depths are not drawn
 
 

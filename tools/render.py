@@ -88,13 +88,26 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> None:
         process.join()
 
 
-def kernel_modules(recipes: Sequence[Recipe], backend: str = CPU) -> list[str]:
-    """How the names of modules begin that hold the kernels of scenes and recipes for the CPU."""
+def kernel_modules(
+    recipes: Sequence[Recipe], backend: str = CPU, *, of_street: bool = False
+) -> list[str]:
+    """How the names of modules begin that hold the recipes' kernels for the CPU. of_street: and
+    those that build the procedural street.
+    """
+    street = ["adapters.street"] if of_street else []
     if renders_on_gpu(backend):
-        return ["adapters"]
+        return street
     present = [e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)]
     folders = (type(effect).__module__.removesuffix(".effect") for effect in present)
-    return ["adapters", "augment.kernels", "augment.render", *folders]
+    pictures = (f"augment.render.{name}" for name in ("cpu", "composite_kernels"))
+    passes = ["augment.render.picture_kernels"] if any(map(_alters_picture, recipes)) else []
+    return [*street, "augment.kernels", *pictures, *passes, *folders]
+
+
+def _alters_picture(recipe: Recipe) -> bool:
+    """Whether its fog scatters or its camera adds noise, which are passes over the picture."""
+    smog = recipe.weather.smog
+    return recipe.camera.noise > 0 or (smog is not None and smog.scatter > 0)
 
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
@@ -313,7 +326,8 @@ def render_recipes(options: RenderOptions) -> int:
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
     on_gpu = renders_on_gpu(backend)
-    with compiling_noted(kernel_modules(tried, backend)):
+    of_street = options.scene.startswith("procedural:")
+    with compiling_noted(kernel_modules(tried, backend, of_street=of_street)):
         scene = open_scene(options.scene)
         if not on_gpu:
             warm_up(tried, backend)
@@ -446,7 +460,7 @@ def run_demo(out: Path, frames: int) -> int:
     uri = f"procedural:street?seed=3&frames={frames}"
     print_note(f"building {uri}")
     recipes = [load_recipe(name).resolve(0) for name in DEMO_RECIPES]
-    with compiling_noted(kernel_modules(recipes)):
+    with compiling_noted(kernel_modules(recipes, of_street=True)):
         scene = open_scene(uri)
         warm_up(recipes)
     ready = time.perf_counter()

@@ -49,6 +49,19 @@ def airlight_gain(slope, gains):
     return gains[first] + share * (gains[first + 1] - gains[first])
 
 
+@inner()
+def layered_way(distance, eye, up):
+    """Length of fog as dense as at its base with as much in it as a way of this length, which
+    begins `eye` scale heights above the base and climbs by `up` (see augment.render.fog).
+    """
+    half, one, x = np.float32(0.5), np.float32(1), abs(up)
+    # Below 0.01 the difference 1 - exp(-x) would lose two digits.
+    series = one - half * x * (one - x * np.float32(1 / 3))
+    mean = series if x < np.float32(0.01) else (one - math.exp(-x)) / x
+    lowest = eye + min(up, np.float32(0))
+    return distance * math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
+
+
 @kernel
 def add_elevation(rgb, alpha, depth, u, v, rise, medium, gains, varying):
     """rgb += alpha (1 - t) gain varying, in place: what elevation adds to the airlight.
@@ -58,23 +71,17 @@ def add_elevation(rgb, alpha, depth, u, v, rise, medium, gains, varying):
     1 / scale height (0 of uniform fog). All float32.
     """
     sigma, eye, per_height = medium[0], medium[1], medium[2]
-    half, one = np.float32(0.5), np.float32(1)
+    one = np.float32(1)
     for i in prange(alpha.shape[0]):
         for j in range(alpha.shape[1]):
             if alpha[i, j] > 0:
                 length = math.sqrt(u[j] * u[j] + v[i] * v[i] + one)
                 climb = u[j] * rise[0] + v[i] * rise[1] + rise[2]
-                tau = sigma * depth[i, j] * length
+                way = depth[i, j] * length
                 if per_height > 0:
-                    up = depth[i, j] * climb * per_height
-                    x = abs(up)
-                    # Below 0.01 the difference 1 - exp(-x) would lose two digits.
-                    series = one - half * x * (one - x * np.float32(1 / 3))
-                    mean = series if x < np.float32(0.01) else (one - math.exp(-x)) / x
-                    lowest = eye + min(up, np.float32(0))
-                    tau *= math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
+                    way = layered_way(way, eye, depth[i, j] * climb * per_height)
                 gain = airlight_gain(climb / length, gains)
-                gain *= alpha[i, j] * (one - math.exp(-tau))
+                gain *= alpha[i, j] * (one - math.exp(-sigma * way))
                 for c in range(U(3)):
                     rgb[i, j, c] += gain * varying[c]
 

@@ -7,7 +7,9 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.render.cpu.jit import inner, kernel
+from augment.render.composite_kernels import layered_way
+from augment.render.cpu.jit import kernel
+from augment.render.fog import MAX_EXPONENT
 
 
 @kernel
@@ -53,31 +55,19 @@ def add_faded(base, rgb, weight, out):
                 out[i, j, c] = base[i, j, c] + weight[i, j] * rgb[i, j, c]
 
 
-@inner
-def _layered(distance, a, b, ceiling):
-    """Length of even fog with as much in it as there is between heights a and b, in scale heights
-    above the base (see augment.render.fog).
-    """
-    one, apart = np.float32(1), abs(b - a)
-    mean = one - np.float32(0.5) * apart
-    if apart >= np.float32(1e-4):
-        mean = (one - math.exp(-apart)) / apart
-    return distance * math.exp(min(-min(a, b), ceiling)) * mean
-
-
 @kernel
 def transmittance(alpha, depth, lens, fall, fog, road, out):
     """T of a photo's pixels: augment.base_photo's `transmittance`.
 
     lens: 1 / fx, 1 / fy, cx, cy. fall: of the camera's axes [3]. fog: sigma, 1 / scale height (0
-    for uniform), the eye's height over the base, the greatest exponent. road: the camera's height
+    for uniform), the eye's height over the base. road: the camera's height
     above it (0 where unknown), and the least fall that sees it.
     """
     height, width = alpha.shape
     half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
-    sigma, inverse, ceiling = fog[0], fog[1], fog[3]
+    sigma, inverse = fog[0], fog[1]
     a = fog[2] * inverse
-    above = sigma * math.exp(min(-a, ceiling))
+    above = sigma * math.exp(min(-a, np.float32(MAX_EXPONENT)))
     for i in prange(height):
         v = (np.float32(i) + half - lens[3]) * lens[1]
         for j in range(width):
@@ -88,15 +78,14 @@ def transmittance(alpha, depth, lens, fall, fog, road, out):
             if share > zero:
                 distance = depth[i, j] * length
                 if inverse > zero:
-                    b = a - depth[i, j] * falls * inverse
-                    distance = _layered(distance, a, b, ceiling)
+                    distance = layered_way(distance, a, -depth[i, j] * falls * inverse)
                 seen = share * math.exp(-sigma * distance)
             if share < one:
                 behind = zero
                 if road[0] > zero and falls > road[1]:
                     distance = road[0] / falls * length
                     if inverse > zero:
-                        distance = _layered(distance, a, a - road[0] * inverse, ceiling)
+                        distance = layered_way(distance, a, -road[0] * inverse)
                     behind = math.exp(-sigma * distance)
                 elif inverse > zero and falls < zero:
                     behind = math.exp(-above / inverse * length / -falls)

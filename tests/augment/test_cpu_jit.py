@@ -75,6 +75,7 @@ def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch):
 
 
 def test_the_list_of_signatures_names_kernels_and_types():
+    assert read_signatures()
     for name, forms in read_signatures():
         importlib.import_module(name.partition(":")[0])
         assert KERNELS[name].py_func.__code__.co_argcount == len(forms), name
