@@ -107,7 +107,7 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
         drawn = own.effect.draw(own, layers, camera, view.buffers)
         if drawn is not None:
             return drawn
-    return Drawn(*layers.draw_whole(camera, view.buffers))
+    return Drawn(*layers.draw_whole(camera, view.buffers), layers)
 
 
 def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:
