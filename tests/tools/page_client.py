@@ -165,4 +165,4 @@ class PageClient:
         for name in ("position", "look_at", "up_direction", "fov"):
             word = name.title().replace("_", "")
             if kind == f"SetCamera{word}Message":
-                self.pose[name] = message[name]
+                (self.pose[name],) = (message[key] for key in message if key in (name, "position"))

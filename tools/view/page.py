@@ -46,7 +46,8 @@ LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera aro
 FRAME_S = 0.09  # what a picture may take while something moves
 FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
 MAX_NAME = 64
-_ERROR = "color:#c92a2a;overflow-wrap:anywhere;padding:0 0.7em"
+_TEXT = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
+_ERROR = f"color:#c92a2a;{_TEXT}"
 
 
 @dataclass(frozen=True)
@@ -474,15 +475,16 @@ class Page:
         self._tiers.content = text
 
     def show_saved(self, text: str, command: str) -> None:
-        self._saved.content = f"<p>{html.escape(text)}</p>"
+        self._saved.content = f'<p style="{_TEXT}">{html.escape(text)}</p>'
         self.show_command(command)
 
     def show_command(self, command: str) -> None:
         content = (
+            f'<div style="{_TEXT}">'
             '<textarea readonly rows="6" style="width:100%;font:11px monospace">'
             f"{html.escape(command)}</textarea>"
             '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.value)">'
-            "Copy command</button>"
+            "Copy command</button></div>"
         )
         if self._command.content != content:
             self._command.content = content

@@ -28,7 +28,7 @@ from recipes.fields import replaced
 from recipes.schema import Recipe
 
 FAR_M = 167.0  # the most that the page's depth can say
-BAR = 24  # grey of what a recorded camera does not show of the window
+BAR, BAR_M = 24, 0.05  # of what a recorded camera does not show: its grey; it hides all beyond
 MAX_DEPTH_M = 100.0  # the end of the colours of depth
 PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS = (
     "picture", "depth", "classes", "instances", "splat ids",
@@ -207,7 +207,7 @@ def in_window(shown: Shown, place: Place) -> Shown:
     rgb = cv2.copyMakeBorder(shown.rgb, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
     depth = shown.depth_m
     if depth is not None:
-        depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=0)
+        depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=BAR_M)
     return Shown(rgb, depth)
 
 

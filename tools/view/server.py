@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from adapters.base import open_scene
@@ -366,7 +367,8 @@ class Viewer:
         lines = ["| tier | size | ms | mean difference, of 255 |", "|---|---|---|---|"]
         for tier, (seconds, rgb) in pictures.items():
             height, width = rgb.shape[:2]
-            off = "" if rgb.shape != best.shape else f"{np.abs(rgb - best).mean():.2f}"
+            enlarged = cv2.resize(rgb, best.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+            off = f"{np.abs(enlarged - best).mean():.2f}"
             lines.append(f"| {tier} | {width} x {height} | {1000 * seconds:.0f} | {off} |")
         page.show_tiers("\n".join(lines))
 
