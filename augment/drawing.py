@@ -131,12 +131,12 @@ class LayerRenderer:
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
         """The photo with what lies on the scene, through the smog up to each pixel's depth."""
-        requested = (buffers - {RGB}) | photo.buffers_for(self.parts) | {ALPHA}
+        parts, own = photo.prepare(self.parts)
+        requested = (buffers - {RGB}) | own | {ALPHA}
         if self.fog is not None:
             requested = requested | {EXPECTED_DEPTH}
-        parts = blackened(self.parts)
         with timed("rasterise"):
-            settings = replace(self.settings, sh_degree=0)  # black in all bands
+            settings = replace(self.settings, sh_degree=0)  # one colour in all bands
             raster = rasterize(
                 parts, camera, buffers=requested, settings=settings, backend=self.backend
             )
