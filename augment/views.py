@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ def render_buffers(
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for own in view.effects:
         layers = own.effect.edit_scene(own, layers, camera)
-    drawn = _draw(view, layers, camera)
+    drawn = replace(_draw(view, layers, camera), layers=layers)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)
     rgb = drawn.rgb
@@ -112,13 +112,14 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
 
 def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:
     """Where each effect is what a pixel shows: the last one where there are several."""
-    masks = dict[str, Tensor]()
+    masks, opaque = dict[str, Tensor](), list[Tensor]()
     for own in reversed(view.effects):
         mask = own.effect.mask_of(own, drawn)
         if mask is not None and own.effect.mask is not None:
-            for later in masks.values():
+            for later in opaque:
                 mask = mask & ~later
             masks[own.effect.mask] = mask
+            opaque += [] if own.effect.is_see_through else [mask]
     return masks
 
 

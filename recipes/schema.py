@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
+from recipes.lens_drops import LensDrops
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.style import Style
@@ -209,6 +210,7 @@ class Sensor(Section):
     255."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
     """Sigma of the lens's blur, pixels of the rendered picture."""
+    lens_drops: LensDrops | None = None
 
 
 class Output(Section):
@@ -296,7 +298,8 @@ class Recipe(Closed):
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
         left_out += [] if self.camera != Sensor() else ["camera"]
-        left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
+        absent = (p for p, m in SECTIONS.items() if p not in present and not m.in_first_release)
+        left_out += [path for path in absent if path.partition(".")[0] not in left_out]
         left_out += [
             f"{path}.{name}"
             for path, section in sections.items()
@@ -371,6 +374,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.flood": Flood,
     "weather.snow": Snow,
     "style": Style,
+    "camera.lens_drops": LensDrops,
 }
 # By dotted path, those that save most first.
 KNOBS: dict[str, Knob] = {}
@@ -397,7 +401,7 @@ def remove_section(path: str) -> None:
 
 def _place(path: str) -> tuple[type[Closed], str]:
     holder, _, name = path.rpartition(".")
-    return {"weather": Weather, "": Recipe}[holder], name
+    return {"weather": Weather, "camera": Sensor, "": Recipe}[holder], name
 
 
 def _rebuild() -> None:
