@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ def render_buffers(
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for own in view.effects:
         layers = own.effect.edit_scene(own, layers, camera)
-    drawn = replace(_draw(view, layers, camera), layers=layers)
+    drawn = _draw(view, layers, camera)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)
     rgb = drawn.rgb
@@ -107,7 +107,7 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
         drawn = own.effect.draw(own, layers, camera, view.buffers)
         if drawn is not None:
             return drawn
-    return Drawn(*layers.draw_whole(camera, view.buffers))
+    return Drawn(*layers.draw_whole(camera, view.buffers), layers)
 
 
 def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:

@@ -138,15 +138,15 @@ class InView:
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A picture. rgb: display-encoded, not clamped, sky included. raster: buffers of the scene's
-    surfaces. masks: bool, by name. skipped: reasons by the passes that drawing found needless.
-    layers: that it was drawn from, with their sky and fog.
+    surfaces. layers: what was drawn, with its fog. masks: bool, by name. skipped: reasons by the
+    passes that drawing found needless.
     """
 
     rgb: Float[Tensor, "H W 3"]
     raster: RenderOutput
+    layers: LayerRenderer
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
-    layers: LayerRenderer | None = None
 
 
 @dataclass(frozen=True, eq=False)
