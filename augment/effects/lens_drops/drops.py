@@ -106,7 +106,8 @@ def _run(
     way *= (RUN_MPS * larger)[:, None]
     length = np.hypot(*way.T)
     across = np.stack([-way[:, 1], way[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
-    bend = np.sin(math.tau * (length / _MEANDER_TURN_M + units[:, 7])) - np.sin(math.tau * units[:, 7])
+    bend = np.sin(math.tau * (length / _MEANDER_TURN_M + units[:, 7]))
+    bend -= np.sin(math.tau * units[:, 7])
     return way + (_MEANDER_M * bend * np.minimum(length / _MEANDER_TURN_M, 1))[:, None] * across
 
 

@@ -173,7 +173,9 @@ def _drop_light(
     sines = of_cells(np.sin(drops.contact_rad))
     colors = _refracted(u, v, right / rims_m, down / rims_m, sines, surroundings)
     light = np.concatenate([colors * cover[:, None], cover[:, None]], 1).astype(np.float32)
-    shapes = [(rows.stop - rows.start, columns.stop - columns.start, 4) for rows, columns in windows]
+    shapes = [
+        (rows.stop - rows.start, columns.stop - columns.start, 4) for rows, columns in windows
+    ]
     pieces = np.split(light, np.cumsum(counts)[:-1])
     return [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
