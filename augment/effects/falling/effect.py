@@ -26,7 +26,7 @@ class RainEffect(Effect):
     """Rain in the air."""
 
     name, section, model, mask = "rain", "weather.rain", Rain, "rain"
-    hides: ClassVar[bool] = False
+    is_see_through: ClassVar[bool] = True
 
     def kernels(self, section: Rain) -> Any:
         return section.changes or None
