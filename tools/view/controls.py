@@ -84,11 +84,13 @@ class Control:
     @property
     def marks(self) -> tuple[tuple[float, str], ...]:
         """Values along a slider that is not linear, and words for them: every second decade."""
-        first, last = math.ceil(math.log10(self.least)), math.floor(math.log10(self.high) + 1e-9)
+        both = self.way == "both sides"
+        first = 0 if both else math.ceil(math.log10(self.least))
+        last = math.floor(math.log10(self.high) + 1e-9)
         values = [10.0**power for power in range(first, last + 1, 2)]
-        if self.way == "both sides":
+        if both:
             values = [*(-value for value in reversed(values) if value <= -self.low), 0.0, *values]
-        return tuple((value, f"{value:g}") for value in values)
+        return tuple((value, _brief(value)) for value in values)
 
     def value_at(self, way: float) -> float:
         """What a slider of this field stands for so far along its way, 0 to 1: three digits."""
@@ -117,6 +119,10 @@ class Control:
         else:
             way = (value - self.low) / (self.high - self.low)
         return min(max(way, 0.0), 1.0)
+
+
+def _brief(value: float) -> str:
+    return f"{value / 1e6:g}M" if abs(value) >= 1e6 else f"{value:g}"
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,8 @@ def _group(section: type[Section], *, optional: bool) -> Group:
     left_out = {"digest"} if is_effect else set[str]()
     leaves = [leaf for name, leaf in section.LEAVES.items() if name in fields.keys() - left_out]
     lists = [inner for inner in section.INNER.values() if inner.MAX_ITEMS is not None]
-    inner = [inner for inner in section.INNER.values() if inner.MAX_ITEMS is None]
+    sections = (inner for inner in section.INNER.values() if inner.MAX_ITEMS is None)
+    inner = [each for each in sections if each.PATH not in SECTIONS]  # effects have their own
     return Group(
         path=section.PATH,
         hint=" ".join((section.MODEL.__doc__ or "").split()),

@@ -508,7 +508,7 @@ class Page:
                 own = {"thickness": 2.0, "thickness_units": "screen"}
                 self._overlays["boxes"] = api.add_line_segments("/boxes", lines, colors, **own)
         if points is not None:
-            own = {"point_size": 0.03, "precision": "float32", "point_shading": "flat"}
+            own = {"point_size": 0.02, "precision": "float32", "point_shading": "flat"}
             self._overlays["lidar"] = api.add_point_cloud("/lidar", *points, **own)
         for name, camera in frame.cameras.items() if wish.frustums else ():
             if wish.pose is None and camera is self.recorded_camera(wish):
