@@ -291,7 +291,8 @@ def stored_records(
     places = np.linalg.solve(world_from_file[:3, :3], offsets.T)
     axes = [columns.index(name) for name in "xyz"]
     moved = (np.abs(places - out[changed][:, axes].T) > _STILL_M).any(0)
-    out[np.ix_(changed[moved], axes)] = places[:, moved].T
+    for axis, column in enumerate(axes):
+        out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
     return out.tobytes()
 

@@ -220,7 +220,8 @@ class Views:
         depth_m = depth_in_metres(images["depth"])
         counts = depth_m > 0
         for name in PASSING:
-            counts &= images[name] == 0 if name in images else True
+            if name in images:
+                counts &= images[name] == 0
         return View(
             DepthView(
                 self.camera(row),
