@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
+from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.style import Style
@@ -148,6 +149,7 @@ class Weather(Closed):
     smog: Smog | None = None
     flood: Flood | None = None
     snow: Snow | None = None
+    rain: Rain | None = None
 
 
 class Render(Section):
@@ -204,11 +206,15 @@ class Sensor(Section):
     know nothing of it.
     """
 
+    later_fields = ("exposure_ms",)
+
     noise: Number = Field(default=0.0, ge=0, le=0.2)
     """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
     255."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
     """Sigma of the lens's blur, pixels of the rendered picture."""
+    exposure_ms: Number = Field(default=5.0, gt=0, le=100)
+    """How long the shutter is open: falling drops and flakes streak for as long."""
 
 
 class Output(Section):
@@ -295,7 +301,10 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
-        left_out += [] if self.camera != Sensor() else ["camera"]
+        if self.camera == Sensor():
+            left_out.append("camera")
+        else:
+            sections["camera"] = self.camera
         left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
         left_out += [
             f"{path}.{name}"
@@ -370,6 +379,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.smog": Smog,
     "weather.flood": Flood,
     "weather.snow": Snow,
+    "weather.rain": Rain,
     "style": Style,
 }
 # By dotted path, those that save most first.

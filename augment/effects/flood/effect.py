@@ -116,7 +116,7 @@ class FloodEffect(Effect):
             return None
         why = "what stands before the water hides all of it"
         hidden = dict.fromkeys(PASSES if found.is_hidden else (), why)
-        return Drawn(found.rgb, found.scene, {"water": found.water}, hidden)
+        return Drawn(found.rgb, found.scene, layers, {"water": found.water}, hidden)
 
     def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
         if _is_under(own.data, camera):  # seen from below, the surface has no depth
