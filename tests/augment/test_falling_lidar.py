@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from augment import effects
+from augment.boxes import NOT_COUNTED, PlacedBoxes
+from augment.dataset import WeatherDataset
+from augment.effects.effect import EffectView
 from augment.effects.falling.lidar import (
     DROP_REFLECTANCE,
     Scatterers,
@@ -21,9 +27,19 @@ from augment.effects.falling.lidar import (
 )
 from augment.effects.lidar import ATTENUATED, LOST, PRECIPITATION, UNCHANGED
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
+from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import fog_echoes
+from augment.jobs.files import visibility
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import lidar_bytes
+from augment.labels import Boxes
+from augment.plan import make_plan
 from augment.render.fog import Fog
-from tests.lidar_sweeps import SENSOR_M, WORLD_ORIGIN_M, some_points, sweep_of
+from recipes.schema import Output, Rain, Recipe, Snow, Weather
+from tests.lidar_sweeps import SENSOR_M, WORLD_ORIGIN_M, some_points, street, sweep_of
+from tests.scenes import camera_ahead
+from tests.streets import LABELLED_STREET, open_street
 
 MODEL = LidarModel()
 
@@ -172,3 +188,113 @@ def test_precipitation_of_every_density_stays_finite() -> None:
         assert np.isfinite(echoes.ranges_m).all() and np.isfinite(echoes.gain).all()
         assert (found.columns["weather_code"][-2:] == UNCHANGED).all()
         assert np.isfinite(found.columns["intensity"][:-2]).all()
+
+
+# ---- By a recipe ---------------------------------------------------------------------------------
+
+
+def wet(rate_mm_h: float, **weather) -> Recipe:
+    fields = {"rain": Rain(rate_mm_h=rate_mm_h), **weather}
+    return Recipe(weather=Weather(**fields), output=Output(lidar="weather"))
+
+
+def test_a_recipes_rain_is_on_its_sweeps_and_at_rate_0_is_not() -> None:
+    sweep, scene = sweep_of(some_points(3000), 0.05, ring=np.arange(3000)), street()
+    out = weathered_sweep(scene, wet(100.0), 0, sweep)
+    again = weathered_sweep(scene, wet(100.0), 0, sweep)
+    assert lidar_bytes(out) == lidar_bytes(again)
+    codes = out.columns["weather_code"]
+    assert {ATTENUATED, LOST, PRECIPITATION} == set(codes.tolist())
+    np.testing.assert_array_equal(out.columns["ring"], sweep.columns["ring"])
+    other = weathered_sweep(scene, wet(100.0), 1, sweep)
+    assert lidar_bytes(other) != lidar_bytes(out)  # of each frame its own drops
+    dry = weathered_sweep(scene, wet(0.0), 0, sweep)
+    for name, column in sweep.columns.items():
+        np.testing.assert_array_equal(dry.columns[name], column)
+    assert not dry.columns["weather_code"].any()
+
+
+def test_auto_leaves_sweeps_as_recorded_unless_the_weather_has_surfaces() -> None:
+    rain_alone = Weather(rain=Rain(rate_mm_h=5.0))
+    assert Recipe(weather=rain_alone).lidar == "clean"
+    assert Recipe(weather=rain_alone).lidar_note("clean") is None
+    on_snow = Weather(rain=Rain(rate_mm_h=5.0), snow=Snow(depth_m=0.1))
+    assert Recipe(weather=on_snow).lidar == "weather"
+
+
+def test_boxes_say_what_rain_leaves_of_them() -> None:
+    """Koschmieder's law over the box's pixels, and the pixels that streaks cross."""
+    effect = next(e for e in effects.EFFECTS if e.name == "rain")
+    camera = camera_ahead(40, 30, 40.0)
+    depth = np.full((30, 40), 20.0, np.float32)
+    mask = np.zeros((30, 40), np.uint8)
+    mask[:, 10:20] = 255
+    boxes = Boxes(
+        *(("car", "car", "car"), ("a", "b", "c")),
+        np.array([[20.0, 0, 0], [20.0, 300, 0], [np.nan, 0, 0]]),
+        np.full((3, 3), 4.0),
+        np.tile([1.0, 0, 0, 0], (3, 1)),
+    )
+    placed = PlacedBoxes.of(boxes, np.zeros(3))
+    scene = street()
+    plan = make_plan(wet(100.0), scene).placed["rain"]
+    found = effect.measure(placed, camera, EffectView(plan, depth, mask, None))
+    numbers = effect.table.numbers(boxes.track_ids, **found)
+    sigma = rain(100.0).extinction_per_m
+    assert numbers["rain_transmittance"][0] == pytest.approx(math.exp(-20 * sigma), abs=1e-3)
+    far = math.exp(-math.hypot(20, 300) * sigma)
+    assert numbers["rain_transmittance"][1] == pytest.approx(far, rel=0.05)
+    assert np.isnan(numbers["rain_transmittance"][2])
+    assert numbers["pixels"][0] > 50 and numbers["pixels"][1] == 0
+    assert numbers["streak_fraction"][0] == numbers["streak_pixels"][0] / numbers["pixels"][0] > 0
+    left = visibility({"box_rain": numbers}, 3)
+    np.testing.assert_array_equal(left[:2], numbers["rain_transmittance"][:2])
+    unseen = effect.measure(placed, camera, EffectView(plan, None, None, None))
+    assert (unseen["pixels"] == NOT_COUNTED).all() and (unseen["streak_pixels"] == 0).all()
+    dry = make_plan(wet(0.0), scene).placed["rain"]
+    clear = effect.measure(placed, camera, EffectView(dry, None, None, None))
+    np.testing.assert_array_equal(clear["rain_transmittance"], [1, 1, np.nan])
+
+
+@pytest.mark.long
+def test_files_of_a_job_have_rains_numbers(tmp_path) -> None:
+    rainy = wet(50.0).model_copy(update={"name": "rainy"})
+    job = RenderJob(LABELLED_STREET, [rainy], tmp_path, range(1), ["front"])
+    done = run_job(job, scene_loader=open_street, progress=False)
+    assert done.failed == 0
+    row = read_manifest(tmp_path).to_pylist()[0]
+    assert (row["rain_rate_mm_h"], row["lidar"]) == (50.0, "weather")
+    sample = WeatherDataset(tmp_path, load=("image", "rain", "boxes", "lidar"))[0]
+    assert sample["rain"].any() and not sample["rain"].all()
+    through = sample["boxes"]["rain_transmittance"].numpy()
+    assert ((through > 0.5) & (through < 1)).any()
+    assert (sample["boxes"]["visibility"].numpy() <= through).all()
+    assert set(np.unique(sample["lidar"]["weather_code"])) <= {ATTENUATED, LOST, PRECIPITATION}
+
+
+REFUSED = (
+    ({"rate_mm_h": -1.0}, "rate_mm_h"),
+    ({"rate_mm_h": 301.0}, "rate_mm_h"),
+    ({"rate_mm_h": math.nan}, "rate_mm_h"),
+    ({"rate_mm_h": 1.0, "wind_mps": 100.0}, "wind_mps"),
+    ({"rate_mm_h": 1.0, "wind_mps": -1.0}, "wind_mps"),
+    ({}, "rate_mm_h"),
+    ({"rate_mm_h": 1.0, "sleet": 1.0}, "sleet"),
+)
+
+
+@pytest.mark.parametrize(("fields", "named"), REFUSED)
+def test_absurd_rain_is_refused_by_its_fields_name(fields: dict, named: str) -> None:
+    with pytest.raises(ValidationError, match=named):
+        Rain(**fields)
+
+
+def test_scenes_that_do_not_know_their_scale_or_times_say_what_is_assumed() -> None:
+    scene = street()
+    for other, said in (
+        (dataclasses.replace(scene, has_metric_scale=False), "not known to be a metre"),
+        (dataclasses.replace(scene, has_known_gravity=False), "not known to point down"),
+        (dataclasses.replace(scene, frames=scene.frames[:1]), "the cameras' speed is not known"),
+    ):
+        steps = [step for step in make_plan(wet(5.0), other).steps if step.runs]
+        assert any(said in step.why for step in steps)

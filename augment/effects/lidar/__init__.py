@@ -1,4 +1,4 @@
-"""A recipe's weather on LiDAR sweeps: fog and smog, lying snow, standing water."""
+"""A recipe's weather on LiDAR sweeps: smog, rain and snowfall, lying snow, standing water."""
 
 from augment.effects.lidar.codes import (
     ATTENUATED,
