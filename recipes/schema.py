@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
+from recipes.lens_drops import LensDrops
 from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
@@ -215,6 +216,7 @@ class Sensor(Section):
     """Sigma of the lens's blur, pixels of the rendered picture."""
     exposure_ms: Number = Field(default=5.0, gt=0, le=100)
     """How long the shutter is open: falling drops and flakes streak for as long."""
+    lens_drops: LensDrops | None = None
 
 
 class Output(Section):
@@ -305,7 +307,8 @@ class Recipe(Closed):
             left_out.append("camera")
         else:
             sections["camera"] = self.camera
-        left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
+        absent = (p for p, m in SECTIONS.items() if p not in present and not m.in_first_release)
+        left_out += [path for path in absent if path.partition(".")[0] not in left_out]
         left_out += [
             f"{path}.{name}"
             for path, section in sections.items()
@@ -381,6 +384,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.snow": Snow,
     "weather.rain": Rain,
     "style": Style,
+    "camera.lens_drops": LensDrops,
 }
 # By dotted path, those that save most first.
 KNOBS: dict[str, Knob] = {}
@@ -407,7 +411,7 @@ def remove_section(path: str) -> None:
 
 def _place(path: str) -> tuple[type[Closed], str]:
     holder, _, name = path.rpartition(".")
-    return {"weather": Weather, "": Recipe}[holder], name
+    return {"weather": Weather, "camera": Sensor, "": Recipe}[holder], name
 
 
 def _rebuild() -> None:

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
+from recipes.lens_drops import LensDrops
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
 from recipes.ranges import words
@@ -209,9 +210,12 @@ def test_every_field_changes_the_hash() -> None:
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
     rain = Rain(rate_mm_h=5.0)
     weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain)
-    base = Recipe(weather=weather, style=Style(image="a.png", digest="0" * 64))
+    camera = Sensor(lens_drops=LensDrops(count=5))
+    style = Style(image="a.png", digest="0" * 64)
+    base = Recipe(weather=weather, style=style, camera=camera)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
+    hashes.add(base.model_copy(update={"camera": Sensor()}).hash)
     hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain)).hash)
     hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
     hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
@@ -226,7 +230,7 @@ def test_every_field_changes_the_hash() -> None:
         accepted = (value for value in (*spec.words, *CANDIDATES) if spec.accepts(value))
         inner[name] = next(value for value in accepted if value != inner[name])
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changed) + 6
+    assert len(hashes) == len(changed) + 7
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 

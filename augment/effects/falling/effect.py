@@ -31,7 +31,7 @@ MASK_SHARE = 0.05  # of a pixel, covered by near drops: from here on it is the m
 class FallingEffect(Effect):
     """What falls through the air, on labels and LiDAR sweeps. Its placed data are a Falling."""
 
-    hides: ClassVar[bool] = False
+    is_see_through: ClassVar[bool] = True
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView

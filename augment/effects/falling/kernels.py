@@ -253,8 +253,8 @@ def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, far, airlight, g
 
     clear: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb [3]: the world's z along the
     camera's axes. bands [B, 3]: extinction of a class, depth where it begins, depth from which
-    on it is whole. far [3]: sum of the extinctions, and of them times the
-    depths that they lose; optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the
+    on it is whole. far [3]: sum of the extinctions, and of them times the depths that they lose;
+    optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the
     camera's axes, and in the mean. Light is squares of display-encoded colours. All float32.
     """
     height, width = depth.shape
