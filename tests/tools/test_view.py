@@ -9,6 +9,7 @@ import math
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -248,7 +249,11 @@ def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten
             assert two.widgets["dust/on"][0]["value"] is False
             one.set("flood/on", True)
             one.set("flood/waves/components", "[{")
-            one.wait_for(lambda: "color:#c92a2a" in one.status(), "the refusal")
+            one.wait_for(lambda: "flood.waves.components" in one.status(), "the refusal")
+            one.set("render/base", "recorded")  # the street has no photos
+            one.press("Undo all changes")
+            one.set("render/base", "recorded")
+            one.wait_for(lambda: "SceneError" in one.status(), "the scene's refusal")
             count = len(one.pictures)
             one.press("Undo all changes")
             assert np.array_equal(one.rest(after=count), clear)
@@ -295,6 +300,53 @@ def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
             lambda: any("| reference |" in str(w) for ws in page.widgets.values() for w in ws),
             "the tiers",
         )
+
+
+@pytest.mark.long
+def test_a_photo_and_a_recipe_are_uploaded_and_saved(tmp_path):
+    colors = np.random.default_rng(0).integers(0, 255, (20, 20, 3)) * [1.0, 0.6, 0.2]
+    photo = cv2.imencode(".png", colors.astype(np.uint8))[1].tobytes()
+    edits = Edits("clear", SCALE, folder=tmp_path / "views")
+    with served(edits) as (_, url), PageClient(url) as page:
+        clear, count = page.rest(after=0), len(page.pictures)
+        page.set("style/on", True)
+        page.upload("style/upload image", "../../warm photo.png", photo)
+        warm = page.rest(after=count)
+        assert np.abs(warm.astype(int) - clear).mean() > 2
+        assert "save the recipe first" in page.status()
+        page.press("Save recipe")
+        saved = command_of(page, f"climategs render {tmp_path}")
+        assert np.array_equal(rendered(tmp_path / "out", saved), warm)
+        count = len(page.pictures)
+        page.upload("Open a recipe", "fog.yaml", b"weather: {smog: {visibility_m: 20}}")
+        assert np.abs(page.rest(after=count).astype(int) - clear).mean() > 5
+        page.upload("Open a recipe", "fog.yaml", b"weather: {smoke: 1}")
+        page.wait_for(lambda: "weather.smoke" in page.status(), "the refusal")
+    assert sorted(p.name for p in (tmp_path / "views" / "opened").iterdir()) == [
+        "fog-2.yaml", "fog.yaml",
+    ]  # fmt: skip
+    assert [p.name for p in (tmp_path / "views" / "uploads").iterdir()] == ["warm_photo.png"]
+
+
+@pytest.mark.long
+def test_a_page_that_takes_nothing_holds_up_no_other_and_other_sites_get_none(tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url), PageClient(url) as page:
+        page.rest(after=0)
+        with PageClient(url, origin="http://elsewhere.example") as other:
+            other.wait_for(lambda: not other.is_listening, "the server to hang up")
+            assert not other.widgets
+        assert len(viewer.pages) == 1
+        deaf = PageClient(url)
+        deaf.wait_for(lambda: len(deaf.pictures), "a picture")
+        deaf.stop_listening()
+        for step in range(60):
+            deaf.move(position=[0.1 * step, 0.0, 2.0], look_at=[20.0, 0.0, 1.0])
+            page.move(position=[0.1 * step, 1.0, 2.0], look_at=[20.0, 0.0, 1.0])
+            time.sleep(0.02)
+        count = len(page.pictures)
+        page.move(position=[0.0, 0.0, 2.0], look_at=[20.0, 0.0, 1.0])
+        assert page.rest(after=count).shape[0] > 50
+        deaf.close()
 
 
 # ---- The command ---------------------------------------------------------------------------------

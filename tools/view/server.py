@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -127,7 +128,11 @@ def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
 
     @server.on_client_connect
     async def _(client: ClientHandle) -> None:
-        viewer.open_page(client)
+        connection = server._websock_server._live_connections[client.client_id]
+        if _is_ours(connection.request.headers, host):
+            viewer.open_page(client)
+        else:
+            await connection.close(1008, "pages of other sites have no business here")
 
     @server.on_client_disconnect
     async def _(client: ClientHandle) -> None:
@@ -139,6 +144,17 @@ def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
     finally:
         viewer.stop()
         _stop(server)
+
+
+def _is_ours(headers: Any, host: str) -> bool:
+    """Whether a connection comes from our own page, or from no browser. Any site that someone
+    visits can have the browser connect to this machine, also by a name that it points here.
+    """
+    origin, asked = headers.get("Origin"), headers.get("Host", "")
+    if origin is None:
+        return True
+    name = urlsplit(f"//{asked}").hostname
+    return urlsplit(origin).netloc == asked and (host not in LOOPBACK or name in LOOPBACK)
 
 
 def _stop(server: ViserServer) -> None:
@@ -180,6 +196,14 @@ class Viewer:
                 page.is_closed = page.is_closed or page.client.client_id == client.client_id
             self.pages = [page for page in self.pages if not page.is_closed]
 
+    def report(self, page: Page, error: Exception) -> None:
+        """Says on the page what went wrong; of a defect, in the log where."""
+        if page.is_closed:
+            return
+        if not isinstance(error, ClimateGSError | RecipeError):
+            _LOG.error("%s", "".join(traceback.format_exception(error)))
+        page.show_error(f"{type(error).__name__}: {error}")
+
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -197,12 +221,7 @@ class Viewer:
             try:
                 self._work(page, work)
             except Exception as error:
-                if page.is_closed:
-                    continue
-                if not isinstance(error, ClimateGSError | RecipeError):
-                    _LOG.error("a picture failed\n%s", traceback.format_exc())
-                page.show_error(f"{type(error).__name__}: {error}")
-                page.show_status("not drawn")
+                self.report(page, error)
 
     def _next(self) -> tuple[Page | None, Any]:
         """The page that waits for longest and what to do for it; or None, and how long there is
