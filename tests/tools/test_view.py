@@ -35,6 +35,7 @@ from tests.augment.dust import DustEffect
 from tools.cli import main
 from tools.view.controls import effect_groups, group_of
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
+from tools.view.outputs import OutputViewer
 from tools.view.pictures import free_camera, place_in_window
 from tools.view.server import Viewer, import_viser, serve
 
@@ -347,6 +348,36 @@ def test_a_page_that_takes_nothing_holds_up_no_other_and_other_sites_get_none(tm
         page.move(position=[0.0, 0.0, 2.0], look_at=[20.0, 0.0, 1.0])
         assert page.rest(after=count).shape[0] > 50
         deaf.close()
+
+
+@pytest.mark.long
+def test_an_output_is_looked_through_by_its_numbers(tmp_path):
+    out = tmp_path / "out"
+    where = ["--scene", SMALL_STREET, "--cameras", "front", "--scale", str(SCALE), "--no-cache"]
+    sets = ["--set", "weather.smog.visibility_m={uniform: [20, 80]}", "--variants", "2"]
+    assert main(["render", "dense-fog", *where, *sets, "--out", str(out), "--no-sheet"]) == 0
+    assert main(["render", "clear", *where, "--out", str(out), "--no-sheet"]) == 0
+    viewer = OutputViewer(out)
+    images = {(row["variant"], row["frame"]): viewer.picture(row, "image") for row in viewer.rows}
+    assert len(images) == 6
+    own = (192, 108)
+    with serve(import_viser(), viewer, "127.0.0.1", 0) as url, PageClient(url, own) as page:
+        variants = viewer.values("variant")
+        page.wait_for(lambda: page.pictures, "a picture")
+        for variant in variants:
+            count = len(page.pictures)
+            page.set("variant", variant)
+            page.set("frame", 1)
+            shown = page.rest(after=count) if variant != variants[0] else None
+            assert shown is None or np.array_equal(shown, images[variant, 1])
+        (name,) = (n for n in viewer.numbers if n == "smog_extinction_per_m")
+        least, middle, most = viewer.values(name)
+        assert least == 0
+        page.set(f"only images with/{name}", [(middle + most) / 2, most])
+        page.wait_for(lambda: len(page.widgets["variant"][0]["options"]) == 1, "the thickest")
+        count = len(page.pictures)
+        page.set("shows", "depth")
+        assert page.rest(after=count).std() > 10
 
 
 # ---- The command ---------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
 import cv2
@@ -41,6 +41,7 @@ from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.edits import Edits, free_path, save_recipe, without_weather
+from tools.view.outputs import OutputViewer, is_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
@@ -66,6 +67,8 @@ JOIN_S = 10.0  # that the picture being drawn gets when the server ends
 def view_scene(options: ViewOptions) -> int:
     """Serves pages until it is interrupted. Returns the exit code."""
     viser = import_viser()
+    if is_output(options.scene):
+        return _serve_until_interrupted(viser, OutputViewer(Path(options.scene)), options)
     scene = open_scene(options.scene)
     check_frames(scene)
     given = (text.partition("=") for text in options.overrides)
@@ -74,16 +77,32 @@ def view_scene(options: ViewOptions) -> int:
     make_plan(edits.recipe(), scene)  # refuse before a page opens
     backend = choose_backend(options.backend, scene)
     viewer = Viewer(scene, options.scene, edits, options.out, backend)
+    return _serve_until_interrupted(viser, viewer, options)
+
+
+def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) -> int:
     with serve(viser, viewer, options.host, options.port) as url:
-        print(f"{scene.name}: {url}   (Ctrl-C ends it)", flush=True)
+        print(f"{options.scene}: {url}   (Ctrl-C ends it)", flush=True)
         if options.host not in LOOPBACK:
             print_note(
-                f"note: whoever reaches {options.host} sees this scene, and can have recipes and "
-                f"pictures written to {options.out}: there is no password"
+                f"note: whoever reaches {options.host} sees what is shown here, and can have files "
+                f"written to {options.out}: there is no password"
             )
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
     return 0
+
+
+class Pages(Protocol):
+    """What is served."""
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def open_page(self, client: ClientHandle) -> None: ...
+
+    def close_page(self, client: ClientHandle) -> None: ...
 
 
 def import_viser() -> Any:
@@ -105,7 +124,7 @@ def import_viser() -> Any:
 
 
 @contextlib.contextmanager
-def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
+def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
     """Pages at an address, as long as it lasts; its URL. The next free port, where one is taken.
 
     Raises:
