@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
+from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.style import Style
@@ -148,6 +149,7 @@ class Weather(Closed):
     smog: Smog | None = None
     flood: Flood | None = None
     snow: Snow | None = None
+    rain: Rain | None = None
 
 
 class Render(Section):
@@ -370,6 +372,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.smog": Smog,
     "weather.flood": Flood,
     "weather.snow": Snow,
+    "weather.rain": Rain,
     "style": Style,
 }
 # By dotted path, those that save most first.

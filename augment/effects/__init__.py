@@ -7,10 +7,11 @@ from augment.effects.flood.effect import FloodEffect
 from augment.effects.smog import SmogEffect
 from augment.effects.snow.effect import SnowEffect
 from augment.effects.style.effect import StyleEffect
+from augment.effects.wet.effect import WetEffect
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather; then come the air before it, snow on it, water over it.
-EFFECTS: tuple[Effect, ...] = (StyleEffect(), SmogEffect(), SnowEffect(), FloodEffect())
+EFFECTS: tuple[Effect, ...] = (StyleEffect(), WetEffect(), SmogEffect(), SnowEffect(), FloodEffect())
 
 
 def share_effects(job: Sharing, *, only_files: bool = False) -> None:
