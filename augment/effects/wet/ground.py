@@ -20,6 +20,7 @@ from augment.effects.snow.cells import SnowCells
 from augment.effects.snow.layer import field_of, octaves_of
 from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.support import support_of
+from augment.effects.wet.kernels import CHANNELS, HEIGHT, OPEN
 from augment.geometry import rotmat_from_quat
 from augment.memo import memo_of
 from augment.rng import rng_for
@@ -28,8 +29,6 @@ from augment.semantics import SemanticClass
 
 SETTINGS = PlacementSettings()  # of the cells: those of snow, so that both take one search
 CELL_M = 0.2  # of the map; finer than the ground's water is patchy
-# Channels of the map.
-HEIGHT, OPEN, RISE_X, RISE_Y, HOLLOW, TRACK, CHANNELS = range(7)
 
 # How much of a surface a film of water closes over where it is wet through: asphalt and concrete
 # hold one, soil and grass let it seep.
@@ -101,6 +100,16 @@ class WetGround:
         out[..., OPEN] *= inside
         return out
 
+    def nearest(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """The channels of the cells about points, as `at` beyond the map."""
+        rows, columns = self.channels.shape[:2]
+        i = np.floor((x_m - self.left_m) / CELL_M).astype(np.int64)
+        j = np.floor((y_m - self.bottom_m) / CELL_M).astype(np.int64)
+        inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+        out = self.channels.numpy()[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)]
+        out[..., OPEN] *= inside
+        return out
+
     def puddle_level(self, share: float) -> float:
         """The HOLLOW beyond which water stands where `share` of the open ground has puddles."""
         ordered = self.ordered_hollows
@@ -126,8 +135,8 @@ def _make(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
     classes = cells.semantic.numpy()
     kept = classes != SemanticClass.VEGETATION
     if not kept.any():
-        nothing = torch.zeros(1, 1)
-        channels = torch.zeros(1, 1, CHANNELS)
+        nothing = torch.zeros(2, 2)
+        channels = torch.zeros(2, 2, CHANNELS)
         return WetGround(0.0, 0.0, channels, nothing / 0, nothing, np.zeros(0, np.float32))
     centres, sizes = cells.centers_m.double().numpy()[kept], cells.sizes_m.double().numpy()[kept]
     classes, tracks = classes[kept], cells.tracks.numpy()[kept]
@@ -283,9 +292,7 @@ def wet_splats(scene: Scene, ground: WetGround) -> WetSplats:
 
 
 def _find_splats(own: Gaussians, ground: WetGround) -> WetSplats:
-    classes = (
-        np.zeros(len(own), np.int16) if own.semantic is None else own.semantic.numpy()
-    )
+    classes = np.zeros(len(own), np.int16) if own.semantic is None else own.semantic.numpy()
     x, y, z = own.means.double().numpy().T.reshape(3, -1)
     channels = ground.at(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     near = np.abs(z - channels[:, HEIGHT]) < 2 * _ON_SURFACE_M
