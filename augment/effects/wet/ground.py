@@ -59,6 +59,7 @@ _STEEPEST = np.tan(np.radians(15.0))  # no water stands on more
 _NOISE = ((7.0, 0.8), (2.9, 0.5), (1.2, 0.25), (0.55, 0.1))
 _PER_CM = 0.8
 _NOISE_EVERY = 2  # cells
+NO_PUDDLES = 1e6  # of HOLLOW, that no place has
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ class WetGround:
         """The HOLLOW beyond which water stands where `share` of the open ground has puddles."""
         ordered = self.ordered_hollows
         if share <= 0 or not len(ordered):
-            return float("inf")
+            return NO_PUDDLES
         return float(ordered[min(int((1 - share) * len(ordered)), len(ordered) - 1)])
 
 

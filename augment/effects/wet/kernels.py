@@ -22,6 +22,7 @@ MAX_DROPS = 2  # in a square at a time
 LIFE_NS = 400_000_000
 SPEED_MPS = 0.23  # least of capillary-gravity waves on water, whose length is 1.7 cm
 WAVE_M, WIDTH_M, SLOPE = 0.022, 0.016, 0.1
+ENDS = 3.0  # widths beyond which a ring is none
 LEAST_FALL = 1e-7  # of a ray that meets a plane, at unit depth
 LEAST_SINE = 0.02  # of the angle at which a pixel's footprint is judged
 FADED_PX, FULL_PX = 2.0, 4.0  # waves of so many pixels are gone, and full
@@ -67,7 +68,7 @@ def rings_at(x, y, footprint, rings, seed, timestamp_ns):
                 dx, dy = x - (i + u) * SQUARE_M, y - (j + v) * SQUARE_M
                 d = max(math.sqrt(dx * dx + dy * dy), 1e-4)
                 off = d - reach * age
-                if abs(off) > 3.0 * WIDTH_M:
+                if abs(off) > ENDS * WIDTH_M:
                     continue
                 s = SLOPE * (1.0 - age) * (1.0 - age) * math.exp(-(off / WIDTH_M) * (off / WIDTH_M))
                 s *= math.sin(2.0 * math.pi * off / WAVE_M) / d
@@ -165,11 +166,11 @@ R0 = 0.0201  # of water under a right angle
 ASPHALT, PUDDLE = 0.085, 0.008  # standard deviations of slopes: alpha / sqrt 2 of 0.12 and 0.011
 TRACK_SMOOTHS = 0.35  # share of the roughness that wheels have polished away
 FILM = 0.75  # of wet asphalt that shows water: stones stand out of it
-RIM = 0.25  # of a puddle, in HOLLOW
+RIM = 0.12  # of a puddle, in HOLLOW
 MOTTLE_SIDE = 256  # texels of the noise that makes film and roughness uneven
-FINE_M, COARSE_M = 0.02, 0.35  # its texels
-FINE, COARSE = 0.14, 0.12  # by how much of the film
-LEVELS = 7  # of the mirrored picture: sharp, and blurred upright by 2 to 64 pixels
+FINE_M, COARSE_M = 0.012, 0.2  # its texels
+FINE, COARSE = 0.07, 0.05  # by how much of the film
+LEVELS = 9  # of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels
 FARTHEST_M = 1e5  # stands for the sky
 TABLE = 1024  # steps of the tables of the display's encoding
 

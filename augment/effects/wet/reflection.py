@@ -287,7 +287,7 @@ def find_ground(
     off = (points[..., 2] + float(camera.centre[2]) - channels[..., HEIGHT]).abs()
     near, far = NEAR_OFF + NEAR_PER_M * distance, FAR_OFF + FAR_PER_M * distance
     share = shown * channels[..., OPEN] * (1 - _smoothstep(near, far, off))
-    is_ground = (depth > 0) & (points[..., 2] < 0) & (share > FAINT)
+    is_ground = (depth > 0) & depth.isfinite() & (points[..., 2] < 0) & (share > FAINT)
     found_rows = torch.nonzero(is_ground.any(1))[:, 0]
     rows = (int(found_rows[0]), int(found_rows[-1]) + 1) if len(found_rows) else (0, 0)
     return torch.where(is_ground, share, 0.0), rows
@@ -295,7 +295,8 @@ def find_ground(
 
 def _points(camera: Camera, depth: Tensor, ground: WetGround) -> tuple[Tensor, Tensor, Tensor]:
     """Points from the eye, how far they are, and the map's channels there."""
-    points = camera.ray_directions(torch.float64, depth.device) * depth.double()[..., None]
+    known = torch.where(depth.isfinite(), depth, 0.0).double()
+    points = camera.ray_directions(torch.float64, depth.device) * known[..., None]
     eye = camera.centre.to(depth.device)
     channels = ground.at(points[..., 0] + eye[0], points[..., 1] + eye[1])
     return points.float(), points.norm(dim=-1).float(), channels
@@ -459,7 +460,7 @@ def _mirrored(mirror: Mirror, camera: Camera) -> kernels.Mirrored:
 
 def _water(film: Film) -> kernels.Water:
     return kernels.Water(
-        film.wetness, min(film.level, 1e6), *numbers_of(film.rings), mottle_table(), *_tables()
+        film.wetness, film.level, *numbers_of(film.rings), mottle_table(), *_tables()
     )
 
 

@@ -25,6 +25,7 @@ from augment.cameras import Camera
 from augment.effects.flood.waves import WaveField
 from augment.effects.wet import kernels
 from augment.effects.wet.kernels import (
+    ENDS,
     FADED_PX,
     FULL_PX,
     LEAST_FALL,
@@ -85,7 +86,10 @@ def rings_of(rate_mm_h: float, seed: int, timestamp_ns: int) -> Rings:
 
 
 def ring_slopes(
-    rings: Rings, x_m: Float[Tensor, "P"], y_m: Float[Tensor, "P"], footprint_m: Float[Tensor, "P"]
+    rings: Rings,
+    x_m: Float[Tensor, "*P"],
+    y_m: Float[Tensor, "*P"],
+    footprint_m: Float[Tensor, "*P"],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slopes towards x and y, and the variance of what is not in them, at points of the plane
     (float64, world). footprint_m: what a pixel covers along the view.
@@ -104,6 +108,7 @@ def ring_slopes(
                 off = d - SPEED_MPS * _LIFE_S * age
                 s = SLOPE * (1 - age) ** 2 * torch.exp(-((off / WIDTH_M) ** 2))
                 s = s * torch.sin(2 * math.pi * off / WAVE_M) / d
+                s = torch.where(off.abs() > ENDS * WIDTH_M, 0.0, s)
                 slope_x, slope_y = slope_x + s * dx, slope_y + s * dy
     variance = rings.variance + (rings.unseen - rings.variance) * shown**2
     return (slope_x * shown).float(), (slope_y * shown).float(), variance.float()
