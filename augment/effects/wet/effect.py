@@ -68,26 +68,32 @@ class PlacedWet:
 
 
 class WetEffect(Effect):
+    """Ground that rain has wetted: a part of the section that rain in the air is the other of."""
+
     name, section, model = "wet", "weather.rain", Rain
     draws = (MIRRORED,)
     shares_files = True
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         rain = self.of(recipe)
-        if rain is None or rain.wetness_now == 0:
+        why = None
+        if rain is None or rain.ground_wetness == 0:
             why = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
+        elif rain.wetness == "auto" and not (scene.has_metric_scale and scene.has_known_gravity):
+            why = "wetness is auto, and the scene's metres or gravity are not known"
+        if why is not None:
             stages = (SCENE, PICTURE, PICTURE)
             return Placed(
                 None, tuple(Step(n, False, why, s) for n, s in zip(PASSES, stages, strict=True))
             )
         check_metric_and_level(scene)
-        wet = f"wetness {rain.wetness_now:.2g} of what is open to the sky"
+        wet = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
         steps = (
             Step(DARKER, True, wet, SCENE),
             Step(MIRRORED, True, "at half the resolution, without the ground", PICTURE),
-            Step(SHINE, True, f"{wet}; puddles on {100 * rain.puddles_now:.3g} %", PICTURE),
+            Step(SHINE, True, f"{wet}; puddles on {100 * rain.puddle_share:.3g} %", PICTURE),
         )
-        data = PlacedWet(recipe.seed, rain.wetness_now, rain.puddles_now, rain.rate_mm_h)
+        data = PlacedWet(recipe.seed, rain.ground_wetness, rain.puddle_share, rain.rate_mm_h)
         return Placed(data, steps, frozenset({EXPECTED_DEPTH}))
 
     def prepare(self, own: Active) -> WetGround:
@@ -95,7 +101,7 @@ class WetEffect(Effect):
 
     def share(self, job: Sharing) -> None:
         found = (self.of(recipe) for recipe in job.recipes)
-        if any(rain and rain.wetness_now > 0 for rain in found):
+        if any(rain and rain.ground_wetness > 0 for rain in found):
             share_support(job, SETTINGS)
 
     def cameras(self, own: Active, camera: Camera) -> tuple[Camera, ...] | None:
