@@ -12,8 +12,8 @@ from recipes.fields import Angle, Colour, Number, Unit
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
-# By itself ground gets wet through as 1 - exp(-rate / this), and puddles come to stand on a share of
-# it that grows about as the square root of the rate.
+# By itself ground gets wet through as 1 - exp(-rate / this), and puddles come to stand on a share
+# of it that grows about as the square root of the rate.
 WET_THROUGH_MM_H = 1.5
 PUDDLES_AT_1_MM_H, PUDDLES_POWER, MOST_PUDDLES = 0.03, 0.55, 0.35
 

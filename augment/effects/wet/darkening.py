@@ -61,7 +61,7 @@ def wet_ratio(
     """
     linear = linear_of(rgb)
     albedo = (linear / white).clamp(1e-4, BRIGHTEST)
-    share = wetness if isinstance(wetness, float) else wetness[..., None]
+    share = wetness[..., None] if isinstance(wetness, Tensor) else wetness
     wet = linear * (1 + share * (wet_albedo(albedo) / albedo - 1))
     return torch.where(rgb > 1e-4, display_of(wet) / rgb.clamp_min(1e-4), torch.ones_like(rgb))
 

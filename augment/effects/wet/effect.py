@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from augment.cameras import Camera
 from augment.drawing import LayerRenderer
@@ -76,12 +78,12 @@ class WetEffect(Effect):
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         rain = self.of(recipe)
-        why = None
+        why = ""
         if rain is None or rain.ground_wetness == 0:
             why = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
         elif rain.wetness == "auto" and not (scene.has_metric_scale and scene.has_known_gravity):
             why = "wetness is auto, and the scene's metres or gravity are not known"
-        if why is not None:
+        if rain is None or why:
             stages = (SCENE, PICTURE, PICTURE)
             return Placed(
                 None, tuple(Step(n, False, why, s) for n, s in zip(PASSES, stages, strict=True))
@@ -184,6 +186,8 @@ def _draw_mirror(
     ]
     layers = replace(layers, parts=parts, photo=None)
     raster = layers.draw(view, plane.above(LOWERED_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH}))
+    assert raster.rgb is not None and raster.alpha is not None
+    assert raster.expected_depth is not None
     rgb = layers.add_sky(raster.rgb, raster.alpha, view)
     depth = torch.where(raster.alpha >= 0.5, raster.expected_depth, 0.0)
     return Mirror(view, blur_upright(rgb, backend=own.backend), depth)

@@ -8,6 +8,7 @@ dry, and the shelter's edge is soft.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -161,8 +162,10 @@ def _make(cells: SnowCells, path: np.ndarray, seed: int) -> WetGround:
     hollows = _hollows(heights, np.hypot(rise_x, rise_y), ground, track, low, seed)
     channels = np.stack([heights, open_, rise_x, rise_y, hollows, _blur(track, 0.15)], -1)
     ordered = np.sort(hollows[open_ > 0.5]).astype(np.float32)
+    left_m, bottom_m = (low * CELL_M).tolist()
     return WetGround(
-        *(float(v) for v in low * CELL_M),
+        left_m,
+        bottom_m,
         torch.from_numpy(np.ascontiguousarray(channels, np.float32)),
         torch.from_numpy(tops.astype(np.float32)),
         torch.from_numpy(exposed.astype(np.float32)),
@@ -204,7 +207,8 @@ def _about_path(tops: np.ndarray, path: np.ndarray, low: np.ndarray) -> np.ndarr
     kernel = np.ones((3, 3), np.uint8)
     most = cv2.dilate(np.where(there, filled, -np.float32(1e6)), kernel)
     least = cv2.erode(np.where(there, filled, np.float32(1e6)), kernel)
-    labels, _ = ndimage.label(there & (most - least < _STEP_M))
+    labels = np.zeros(tops.shape, np.int32)
+    ndimage.label(there & (most - least < _STEP_M), output=labels)
     places = np.floor(path[:, :2] / CELL_M - low).astype(np.int64)
     near = np.zeros(tops.shape, np.uint8)
     inside = ((places >= 0) & (places < np.array(tops.shape[::-1]))).all(1)
@@ -237,7 +241,9 @@ def _smooth(tops: np.ndarray, ground: np.ndarray, sigma_m: float) -> np.ndarray:
     if not known.any():
         return np.zeros(tops.shape)
     out = np.where(known, sums / np.maximum(weight, 0.02), 0) + middle
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(
+        ~known, return_distances=False, return_indices=True
+    )
     return out[tuple(nearest)]
 
 

@@ -174,8 +174,8 @@ def blur_upright(
             kernels.decode(_array(rgb), _tables()[0], linear)
         image, levels = linear, [torch.from_numpy(linear)]
         for k in range(1, LEVELS):
-            taps = [_taps(sigma) for sigma in _widening(k)[::-1]]
-            image = cv2.sepFilter2D(image, -1, *taps, borderType=cv2.BORDER_REPLICATE)
+            upright, aside = map(_taps, _widening(k))
+            image = cv2.sepFilter2D(image, -1, aside, upright, borderType=cv2.BORDER_REPLICATE)
             if k >= 2:
                 image = np.concatenate((image, image[-1:])) if len(image) % 2 else image
                 image = 0.5 * (image[0::2] + image[1::2])
