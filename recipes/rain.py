@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 from pydantic import Field
 
@@ -62,11 +61,12 @@ class Rain(EffectModel):
     """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
 
-    wetness: Literal["auto"] | Unit = "auto"
-    """How wet the ground is that is open to the sky: 0 dry, 1 wet through; auto from the rate."""
-    puddles: Literal["auto"] | Unit = "auto"
-    """Share of that ground on which water stands, in its hollows first; auto from the rate. None
-    where wetness is 0."""
+    wetness: Unit | None = None
+    """How wet the ground is that is open to the sky: 0 dry, 1 wet through; null follows from the
+    rate."""
+    puddles: Unit | None = None
+    """Share of that ground on which water stands, in its hollows first; null follows from the rate;
+    none where wetness is 0."""
 
     @property
     def changes(self) -> bool:
@@ -75,14 +75,14 @@ class Rain(EffectModel):
 
     @property
     def ground_wetness(self) -> float:
-        """0 to 1, auto resolved."""
-        if self.wetness != "auto":
+        """0 to 1, that of the rate where it is null."""
+        if self.wetness is not None:
             return self.wetness
         return -math.expm1(-self.rate_mm_h / WET_THROUGH_MM_H)
 
     @property
     def puddle_share(self) -> float:
-        """0 to 1, auto resolved."""
-        if self.puddles != "auto":
+        """0 to 1, that of the rate where it is null."""
+        if self.puddles is not None:
             return self.puddles
         return min(MOST_PUDDLES, PUDDLES_AT_1_MM_H * self.rate_mm_h**PUDDLES_POWER)

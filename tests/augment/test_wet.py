@@ -168,7 +168,8 @@ def test_a_scene_without_open_ground_is_left_as_it_is():
     view = plan_view(make_plan(rain(), scene), scene, eye)
     skipped = {s.name: s for s in view.steps}
     assert not skipped[MIRRORED].runs and "no open ground" in skipped[SHINE].why
-    dry, wet = (render_buffers(scene, eye, make_plan(r, scene)).rgb for r in (Recipe(), rain()))
+    film = rain(0.0, wetness=1.0)  # without what falls
+    dry, wet = (render_buffers(scene, eye, make_plan(r, scene)).rgb for r in (Recipe(), film))
     assert torch.equal(dry, wet)
 
 
@@ -211,6 +212,7 @@ def shown_by(lamp, rise: float, film: Film, focal=600.0):
         buffers=("rgb", "alpha", "expected_depth"),
         clip=plane.above(0.3),
     )
+    assert out.rgb is not None and out.alpha is not None and out.expected_depth is not None
     mirror = Mirror(
         view, blur_upright(out.rgb), torch.where(out.alpha > 0.5, out.expected_depth, 0)
     )

@@ -84,8 +84,8 @@ class WetEffect(Effect):
         why = ""
         if rain is None or rain.ground_wetness == 0:
             why = "the recipe has no rain" if rain is None else "the rain leaves the ground dry"
-        elif rain.wetness == "auto" and not (scene.has_metric_scale and scene.has_known_gravity):
-            why = "wetness is auto, and the scene's metres or gravity are not known"
+        elif rain.wetness is None and not (scene.has_metric_scale and scene.has_known_gravity):
+            why = "wetness is null, and the scene's metres or gravity are not known"
         if rain is None or why:
             stages = (SCENE, PICTURE, PICTURE)
             return Placed(
