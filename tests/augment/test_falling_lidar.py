@@ -34,7 +34,7 @@ from augment.effects.wet.ground import CELL_M, WetGround
 from augment.effects.wet.kernels import CHANNELS, HOLLOW, OPEN
 from augment.effects.wet.lidar import film_gain, wet_echoes
 from augment.jobs.files import visibility
-from augment.jobs.manifest import read_manifest
+from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes
 from augment.labels import Boxes
@@ -280,6 +280,13 @@ def test_a_recipes_rain_is_on_its_sweeps_and_at_rate_0_is_not() -> None:
     for name, column in sweep.columns.items():
         np.testing.assert_array_equal(dry.columns[name], column)
     assert not dry.columns["weather_code"].any()
+
+
+def test_manifests_know_rain_by_what_falls_or_lies() -> None:
+    columns = {"rain_rate_mm_h": [0, 0, 5, 5, 0], "rain_wetness": [0, 0.6, 0, 1, np.nan]}
+    masks = effect_masks({n: np.array(c, np.float64) for n, c in columns.items()}, 5)
+    assert masks["rain"].tolist() == [False, True, True, True, False]
+    assert not masks["other"].any()
 
 
 def test_auto_leaves_sweeps_as_recorded_unless_the_weather_has_surfaces() -> None:
