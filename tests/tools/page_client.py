@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0  # kernels may have to be compiled
 Found = TypeVar("Found")
 
 
