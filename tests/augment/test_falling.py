@@ -18,6 +18,7 @@ from augment.effects.falling.air import (
     draw_falling,
     drawn_depths_m,
     find_drops,
+    left_clear,
     veil_of,
     walk_of,
 )
@@ -151,13 +152,12 @@ def test_kernels_equal_their_reference(kind):
     rng = np.random.default_rng(0)
     alpha, depth, rgb = (rng.random(s, np.float32) for s in ((120, 160), (120, 160), (120, 160, 3)))
     depth *= 8 * (depth > 0.2)
-    clear = np.ones((120, 160), np.float32)
-    kernels.cover_pixels(drops, alpha, depth, clear)
+    clear = left_clear(drops, alpha, depth)
     np.testing.assert_allclose(clear, reference.cover_by_numpy(drops, alpha, depth), atol=1e-5)
     veil = veil_of(falling, camera, GLOW)
     tensors = [torch.from_numpy(image.copy()) for image in (rgb, alpha, depth, clear)]
     expected = reference.blend_by_torch(*tensors, veil).numpy()
-    kernels.blend_falling(rgb, alpha, depth, clear, *veil)
+    kernels.blend_falling(rgb, alpha, depth, clear, *veil._replace(upwards=veil.upwards[()]))
     np.testing.assert_allclose(rgb, expected, atol=1e-4)
 
 
@@ -168,13 +168,14 @@ def test_a_streak_takes_twice_its_drops_cross_section():
     inside &= (drops[:, [1, 3]] < 110).all(1)
     shape = (120, 160)
     for drop in drops[inside][:60]:
-        clear = np.ones(shape, np.float32)
-        kernels.cover_pixels(drop[None], np.zeros(shape, np.float32), clear * 0, clear)
+        nothing = np.zeros(shape, np.float32)
+        clear = left_clear(drop[None], nothing, nothing)
         length = math.hypot(drop[2] - drop[0], drop[3] - drop[1])
         i, o = drop[6], drop[7]
-        area = length * (o + i) + math.pi / 3 * (o * o + o * i + i * i)
-        # A disc of two pixels across is sampled at four points or so.
-        assert (1 - clear).sum() == pytest.approx(drop[8] * area, rel=0.2)
+        area = length * (2 * i + (2 * o + i) * (o - i) / (1.5 * (o + i)))
+        area += math.pi / 2 * (o * o + i * i)
+        # The smallest disc is sampled at five points or so.
+        assert (1 - clear).sum() == pytest.approx(drop[8] * area, rel=0.1)
 
 
 def test_what_is_not_drawn_is_veil():
@@ -192,8 +193,8 @@ def test_what_is_not_drawn_is_veil():
         )
         clear = torch.from_numpy(np.ones(shape, np.float32))
         rgb, clear = draw_falling(white, solid, far, camera, own, scene=scene, motion=FORWARD)
-        veil = veil_of(own, camera, GLOW)
-        tau = float(veil.far[0]) * 400 - float(veil.far[1])
+        extinction, _, grows, _, whole = veil_of(own, camera, GLOW).bands.astype(np.float64).T
+        tau = float((extinction * (400 - whole + grows / 2)).sum())
         means.append(tau - math.log(float(clear.mean())))
         assert torch.isfinite(rgb).all()
     assert means[0] > means[2] * 0.99
@@ -202,9 +203,8 @@ def test_what_is_not_drawn_is_veil():
 
 def test_drops_behind_a_surface_are_hidden():
     drops, shape = find_drops(walk_of(RAIN, view(), STANDING, "x")), (120, 160)
-    clear, near = np.ones(shape, np.float32), np.full(shape, 0.1, np.float32)
-    kernels.cover_pixels(drops, np.ones(shape, np.float32), near, clear)
-    assert (clear == 1).all()
+    near = np.full(shape, 0.1, np.float32)
+    assert (left_clear(drops, np.ones(shape, np.float32), near) == 1).all()
 
 
 # ---- In a picture --------------------------------------------------------------------------------
