@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.falling import kernels, reference
+from augment.effects.falling import air, kernels, reference
 from augment.effects.falling.air import (
     Falling,
     Glow,
@@ -33,6 +33,7 @@ from augment.scene import Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
 from recipes.schema import Rain, Recipe, Sensor, Weather
+from recipes.snowfall import Snowfall
 from tests.scenes import camera_ahead, random_gaussians
 
 RAIN = Falling("rain", 20.0, (3.0, -1.0), 0.0, 7, 0.005, 0.25)
@@ -70,6 +71,14 @@ def test_rain_falls_at_its_rate_and_veils_as_measured(rate):
     sizes = sizes_of("rain", rate)
     assert sizes.rate_mm_h == pytest.approx(rate, rel=1e-9)
     assert 1000 * sizes.extinction_per_m == pytest.approx(0.312 * rate**0.67, rel=0.15)
+
+
+def test_a_millimetre_an_hour_of_snow_lets_see_a_kilometre():
+    """Moderate snow by the meteorological optical range, where contrast falls to 5 %."""
+    sizes = sizes_of("snow", 1.0)
+    assert sizes.rate_mm_h == pytest.approx(1.0)
+    assert math.log(20) / sizes.extinction_per_m == pytest.approx(1000, rel=0.2)
+    assert 0.6 < sizes.speeds_mps.min() < sizes.speeds_mps.max() < 2
 
 
 def test_sizes_are_numbers_at_any_rate():
@@ -207,15 +216,26 @@ def test_drops_behind_a_surface_are_hidden():
     assert (left_clear(drops, np.ones(shape, np.float32), near) == 1).all()
 
 
+def test_eddies_carry_flakes_at_their_speed_and_bring_them_back():
+    at, phase = np.random.default_rng(0).normal(0, 10, (500, 3)), np.linspace(0, 1, 500)
+    times = np.arange(0, 20, 0.01)
+    path = np.stack([reference.sway(at, t, phase, 0.3) for t in times])
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) / 0.01
+    assert 0.2 < speed.mean() < 0.5
+    assert np.linalg.norm(path, axis=-1).max() < 0.3 * air.SWAY_REACH_S
+
+
 # ---- In a picture --------------------------------------------------------------------------------
 
 
 def test_nothing_falls_at_rate_0():
     scene = drive()
     camera = scene.frames[1].cameras["front"]
-    clean, dry = (render_view(scene, camera, r) for r in (Recipe(), rain(0.0)))
+    weather = Weather(rain=Rain(rate_mm_h=0.0), snowfall=Snowfall(rate_mm_h=0.0))
+    clean, dry = (render_view(scene, camera, r) for r in (Recipe(), Recipe(weather=weather)))
     assert (clean.rgb == dry.rgb).all()
-    assert not make_plan(rain(0.0), scene).placed["rain"].steps[0].runs
+    placed = make_plan(Recipe(weather=weather), scene).placed
+    assert not any(s.runs for name in ("rain", "snowfall") for s in placed[name].steps)
 
 
 def test_the_same_bytes_from_any_number_of_threads_alone_or_among_others():

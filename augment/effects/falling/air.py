@@ -49,7 +49,8 @@ _HORIZON_SINE = math.sin(math.radians(15.0))  # up to here is "above the horizon
 _SAMPLES = 4096  # of directions
 _AROUND_M = 30.0  # how far away most of what lights a drop is
 _REFRACTED, _SCATTERED = 0.94, 0.5  # how much of its light a drop, or a flake, has from behind it
-_SWAY_REACH_S = 1.3  # kernels._sway moves no flake farther than its speed in so long
+_AMONG_FLAKES = 0.5  # of a flake's light, which the flakes around it have scattered
+SWAY_REACH_S = 1.3  # kernels._sway moves no flake farther than its speed in so long
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     speeds = np.linalg.norm(velocity - motion.velocity_mps, axis=1)
     speeds += np.linalg.norm(motion.turn_radps) * farthest
     reach = cells_m * math.sqrt(0.75) + half_s * speeds + APERTURE_M / 2
-    reach += sizes.quantiles_m[:, -1] + _SWAY_REACH_S * falling.sway_mps
+    reach += sizes.quantiles_m[:, -1] + SWAY_REACH_S * falling.sway_mps
     # Of the image's sides, inwards; then of its front.
     normals = np.array([
         [camera.fx, 0, camera.cx], [-camera.fx, 0, camera.width - camera.cx],
@@ -275,13 +276,16 @@ def veil_of(falling: Falling, camera: Camera, glow: Glow) -> Veil:
     world = camera.world_from_camera[:3, :3].numpy()
     from_behind = _REFRACTED if falling.kind == "rain" else _SCATTERED
     airlight = glow.airlight if falling.color is None else np.asarray(falling.color) ** 2
+    mean = glow.mean
+    if falling.kind == "snow":
+        mean = mean + _AMONG_FLAKES * (airlight - mean)
     numbers = (
         (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
         world[2],
         np.stack([extinctions, begin, grows, half_inverse, whole], 1),
         float(extinctions.sum()) * LAYER_M,
         airlight,
-        np.concatenate([from_behind * glow.slope @ world, glow.mean[:, None]], 1),
+        np.concatenate([from_behind * glow.slope @ world, mean[:, None]], 1),
     )
     return Veil(*(np.asarray(n, np.float32, order="C") for n in numbers))
 

@@ -61,14 +61,16 @@ def find_drops(
     offsets, counts, found,
 ):  # fmt: skip
     """counts [S]: drops of each slab of cells that may be seen. found [N, NUM_NUMBERS]: theirs from
-    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius to which it covers
-    nothing less, radius beyond which nothing, covered share. Empty: they are counted only.
+    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius up to which it
+    covers as much as in its middle, radius beyond which nothing, covered share. Empty: they are
+    counted only.
 
     slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 3]: size, how far a
     drop can be from its cell's middle, depth to which the class is drawn. keys [B]: of the hashes.
     moves [B, 3, 3]: where the lattice has moved to as the shutter opens, between, as it closes.
-    sways: their speed, and the time. quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]: inwards normal and offset of the view's sides and its front.
-    shutter [2, 3, 4]: camera_from_world at both times. lens: fx, fy, cx, cy, width, height, least
+    sways: their speed, and the time. quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]:
+    inwards normal and offset of the view's sides and its front. shutter [2, 3, 4]:
+    camera_from_world as the shutter opens and closes. lens: fx, fy, cx, cy, width, height, least
     depth, diameter of the aperture, depth in focus. All float64 but for the integers and found.
     """
     is_counting = len(found) == 0
