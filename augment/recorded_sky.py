@@ -32,7 +32,7 @@ _DARK_LEVELS = 70.0  # of 255: this much darker than the brightest tenth of what
 _MIN_LUMA = 90.0
 _MIN_PART = 0.005  # of the image: a smaller bright region is a window or a lamp
 _HIT_PX = 3  # pixels around a LiDAR return that are its surface's
-_TOP_MARGIN_RAD = math.radians(4.0)  # cameras are not where the LiDAR is
+TOP_MARGIN_RAD = math.radians(4.0)  # cameras are not where the LiDAR is
 _BESIDE_PX = 9  # columns beside one whose surface goes on may show the same, leaning
 _TOP_FROM_M = 10.0  # from here on LiDAR and cameras see a return at nearly the same elevation
 _TOP_QUANTILE = 0.999  # a few returns are stray
@@ -149,7 +149,7 @@ def find_sky(
     solid = unknown = np.zeros(above.shape, bool)
     if hits is not None:
         solid = _grown(hits, _HIT_PX, _HIT_PX)
-        reaches = np.any(hits & (elevation_rad > lidar_top_rad - _TOP_MARGIN_RAD), axis=0)[None]
+        reaches = np.any(hits & (elevation_rad > lidar_top_rad - TOP_MARGIN_RAD), axis=0)[None]
         over = np.cumsum(solid, axis=0) == 0  # above all returns of its column
         unknown = over & above & _grown(reaches, 1, _BESIDE_PX)
     bright = looks_like_sky(rgb, above, _WINDOW_PX)
@@ -345,7 +345,7 @@ def _above_surfaces(camera: Camera, drawn: np.ndarray, lidar_top_rad: float) -> 
     rise = rays[..., 2] / np.linalg.norm(rays, axis=2)
     last = len(drawn) - 1
     top = np.where(solid.any(axis=0), solid.argmax(axis=0), last)
-    known = rise[top, np.arange(camera.width)] < math.sin(lidar_top_rad - _TOP_MARGIN_RAD)
+    known = rise[top, np.arange(camera.width)] < math.sin(lidar_top_rad - TOP_MARGIN_RAD)
     # A column beside one whose surface goes on may show the same surface, leaning.
     known = cv2.erode(known.astype(np.uint8)[None], np.ones((1, 2 * border + 1), np.uint8))[0] > 0
     covered = np.maximum.accumulate(_grown(drawn, 2 * border + 1, 2 * border + 1), axis=0)
