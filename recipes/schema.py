@@ -22,6 +22,7 @@ from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
+from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.style import Style
@@ -149,6 +150,7 @@ class Weather(Closed):
     smog: Smog | None = None
     flood: Flood | None = None
     snow: Snow | None = None
+    rain: Rain | None = None
 
 
 class Render(Section):
@@ -205,11 +207,15 @@ class Sensor(Section):
     know nothing of it.
     """
 
+    later_fields = ("exposure_ms",)
+
     noise: Number = Field(default=0.0, ge=0, le=0.2)
     """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
     255."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
     """Sigma of the lens's blur, pixels of the rendered picture."""
+    exposure_ms: Number = Field(default=5.0, gt=0, le=100)
+    """How long the shutter is open: falling drops and flakes streak for as long."""
     lens_drops: LensDrops | None = None
 
 
@@ -297,7 +303,10 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
-        left_out += [] if self.camera != Sensor() else ["camera"]
+        if self.camera == Sensor():
+            left_out.append("camera")
+        else:
+            sections["camera"] = self.camera
         absent = (p for p, m in SECTIONS.items() if p not in present and not m.in_first_release)
         left_out += [path for path in absent if path.partition(".")[0] not in left_out]
         left_out += [
@@ -373,6 +382,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.smog": Smog,
     "weather.flood": Flood,
     "weather.snow": Snow,
+    "weather.rain": Rain,
     "style": Style,
     "camera.lens_drops": LensDrops,
 }

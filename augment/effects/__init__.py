@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from augment.effects.effect import Effect, Sharing
+from augment.effects.falling.effect import RainEffect
 from augment.effects.flood.effect import FloodEffect
 from augment.effects.lens_drops.effect import LensDropsEffect
 from augment.effects.smog import SmogEffect
@@ -11,12 +12,13 @@ from augment.effects.style.effect import StyleEffect
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather; then come the air before it, snow on it, water over it,
-# and last the camera's own glass.
+# what falls before all of it, and last the camera's own glass.
 EFFECTS: tuple[Effect, ...] = (
     StyleEffect(),
     SmogEffect(),
     SnowEffect(),
     FloodEffect(),
+    RainEffect(),
     LensDropsEffect(),
 )
 
