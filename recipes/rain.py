@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Angle, Colour, Number
+from recipes.fields import Angle, Colour, Flag, Number
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
@@ -44,6 +44,10 @@ class Rain(EffectModel):
     min_width_px: Number = Field(default=0.25, ge=0.1, le=16)
     """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
+
+    spray: Flag = True
+    """Vehicles that drive faster than 40 km/h lift spray, by their speed and the water on the
+    road."""
 
     @property
     def changes(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from tests.lidar_sweeps import sweep_of
 from tests.scenes import camera_ahead, one_gaussian
 from tests.streets import LABELLED_STREET, open_street
 
+CAMERA = camera_ahead(96, 64, 80.0, position=(0, 0, 1.5))
 LIGHT = np.array([0.4, 0.5, 0.6])
 
 
@@ -45,12 +47,14 @@ def vehicle(speed_mps: float, *, x_m: float = 0.0, begins_s: float = 0.0) -> Act
 
 
 def traffic(*actors: Actor) -> Scene:
-    ground = one_gaussian((30, 0, -5), (0.2, 0.2, 0.2), scale=1.0, opacity=0.9)
+    ground = one_gaussian((30, 0, -5), 1.0, 0.9)
     return Scene("traffic", "test", ground, actors, ConstantSky(torch.tensor([0.6, 0.6, 0.6])), ())
 
 
-def puffs_at(scene: Scene, seconds: float, water_m: float = 1e-3, **others) -> Puffs:
-    return spray_puffs(scene, round(1e9 * seconds), water_m, **{"seed": 3} | others)
+def puffs_at(
+    scene: Scene, seconds: float, water_m: float = 1e-3, *, seed: int = 3, wind=(0.0, 0.0)
+) -> Puffs:
+    return spray_puffs(scene, round(1e9 * seconds), water_m, seed=seed, wind_mps=wind)
 
 
 def one_puff(x_m: float, extinction: float = 0.3, scale_m: float = 1.0) -> Puffs:
@@ -62,7 +66,7 @@ def one_puff(x_m: float, extinction: float = 0.3, scale_m: float = 1.0) -> Puffs
 
 
 def test_water_on_the_road_is_that_of_the_law_of_drainage():
-    assert film_depth_m(10) == pytest.approx(0.7e-3, rel=0.02) and film_depth_m(0) == 0
+    assert film_depth_m(10.0) == pytest.approx(0.7e-3, rel=0.02) and film_depth_m(0.0) == 0
 
 
 def test_a_car_at_90_km_h_on_a_millimetre_lifts_the_extinction_of_the_law():
@@ -73,9 +77,9 @@ def test_a_car_at_90_km_h_on_a_millimetre_lifts_the_extinction_of_the_law():
         whole = puffs.extinction_per_m * (2 * math.pi) ** 1.5 / np.linalg.det(puffs.whitenings)
         area.append(whole.max() / (25 * INTERVAL_S))
     assert np.median(area) == pytest.approx(0.067 * 3 * 1.2, rel=0.35)  # the thickest of a few
-    points = np.stack([np.full(50, 0.0), np.linspace(-4, 4, 50), np.full(50, 0.7)], 1)
-    across = puffs_at(scene, 10.3)
-    behind = extinction_at(across, points + [2.0 - 6, 0, 0])
+    # When the car's middle is 7.5 m on.
+    points = np.stack([np.full(50, -4.0), np.linspace(-4, 4, 50), np.full(50, 0.7)], 1)
+    behind = extinction_at(puffs_at(scene, 10.3), points)
     assert 0.02 < behind.max() < 0.3 and behind[0] < 0.01
 
 
@@ -83,10 +87,11 @@ def test_slow_vehicles_lift_nothing_and_fast_ones_more_than_less_fast_ones():
     scene = traffic(vehicle(11.0), vehicle(14.0), vehicle(25.0), vehicle(33.0))
     assert spraying_actors(scene) == (1, 2, 3)
     strengths = [
-        puffs_at(traffic(vehicle(speed)), 9.0).extinction_per_m.max() for speed in (14.0, 25.0, 33.0)
+        puffs_at(traffic(vehicle(speed)), 9.0).extinction_per_m.max()
+        for speed in (14.0, 25.0, 33.0)
     ]
     assert 3 * strengths[0] < strengths[1] < strengths[2]
-    assert FROM_MPS == pytest.approx(11.11, abs=0.01)
+    assert pytest.approx(11.11, abs=0.01) == FROM_MPS
     assert len(puffs_at(scene, 9.0, 0.0).extinction_per_m) == 0
 
 
@@ -98,13 +103,13 @@ def test_puffs_are_a_function_of_time_stay_behind_and_thin_out():
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
     later = puffs_at(scene, 9.0 + INTERVAL_S)
-    assert first.centres_m[:, 0].max() < -20 + 2 and later.centres_m[:, 0].max() > -20
+    ends = [puffs.centres_m[:, 0].max() for puffs in (first, later)]
+    assert ends[0] < -20 - 2.25 and ends[1] - ends[0] == pytest.approx(2.0, abs=0.5)
     # Each is the next one's elder brother: where it was born it stays but for wake and eddies.
-    moved = later.centres_m[:-1] - first.centres_m[-len(later.centres_m) + 1 :]
+    moved = later.centres_m[-21:-1] - first.centres_m[-20:]
     assert np.abs(moved[:, 0]).max() < 1.0 and moved[:, 0].min() > -0.2
-    thinned = later.extinction_per_m[:-4] / first.extinction_per_m[-len(later.centres_m) + 1 :][:-3]
-    assert thinned.max() < 1
-    blown = puffs_at(scene, 9.0, wind_mps=(0.0, 5.0))
+    assert (later.extinction_per_m[-21:-4] < first.extinction_per_m[-20:-3]).all()
+    blown = puffs_at(scene, 9.0, wind=(0.0, 5.0))
     assert blown.centres_m[0, 1] > first.centres_m[0, 1] + 3
     assert not np.array_equal(puffs_at(scene, 9.0, seed=4).centres_m, first.centres_m)
 
@@ -123,18 +128,19 @@ def test_spray_is_there_when_a_track_begins_and_gone_some_time_after_its_end():
 
 
 def seen(puffs: Puffs, depth_m: float, *, backend: str = CPU, fog: Fog | None = None):
-    camera = camera_ahead(96, 64, 80.0, position=(0, 0, 1.5))
     rgb = torch.full((64, 96, 3), 0.2)
     depth = torch.full((64, 96), depth_m)
     alpha = torch.ones_like(depth)
-    return blend_puffs(rgb, alpha, depth, camera, puffs, LIGHT, fog=fog, backend=backend)
+    return blend_puffs(rgb, alpha, depth, CAMERA, puffs, LIGHT, fog=fog, backend=backend)
 
 
 @pytest.mark.parametrize("depth_m", [50.0, 10.0, 9.0, 4.0])
 def test_a_puff_takes_what_its_extinction_integrates_to_up_to_the_surface(depth_m):
     found = seen(one_puff(10.0), depth_m)[32, 48].double().numpy() ** 2
-    x = np.linspace(0, depth_m, 20001)
-    tau = np.trapezoid(0.3 * np.exp(-((x - 10) ** 2) / 2), x)
+    ray = CAMERA.ray_directions(torch.float64)[32, 48].numpy()
+    z = np.linspace(0, depth_m, 20001)
+    points = z[:, None] * ray + (0, 0, 1.5)
+    tau = np.trapezoid(extinction_at(one_puff(10.0), points), z) * np.linalg.norm(ray)
     expected = np.exp(-tau) * 0.04 + (1 - np.exp(-tau)) * LIGHT
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
@@ -153,8 +159,8 @@ def test_fog_stands_before_spray():
     clear, foggy = (seen(one_puff(20.0, 3.0), 50.0, fog=f)[32, 48] for f in (None, fog))
     share = math.exp(-0.2 * 20)
     expected = share * LIGHT + (1 - share) * 0.81
-    np.testing.assert_allclose(foggy.double().numpy() ** 2, expected, atol=2e-3)
-    np.testing.assert_allclose(clear.double().numpy() ** 2, LIGHT, atol=2e-3)
+    np.testing.assert_allclose(foggy.double().numpy() ** 2, expected, atol=5e-3)
+    np.testing.assert_allclose(clear.double().numpy() ** 2, LIGHT, atol=5e-3)
 
 
 def test_kernel_and_torch_blend_alike():
@@ -168,7 +174,7 @@ def test_kernel_and_torch_blend_alike():
 
 
 def test_no_pixel_outside_of_a_puffs_window_sees_it():
-    camera = camera_ahead(96, 64, 80.0, position=(0, 0, 1.5))
+    camera = CAMERA
     puffs = puffs_at(traffic(vehicle(25.0, x_m=15.0)), 10.0)
     rays = camera.ray_directions(torch.float64).reshape(-1, 3).numpy()
     lengths = np.linalg.norm(rays, axis=1)
@@ -176,7 +182,8 @@ def test_no_pixel_outside_of_a_puffs_window_sees_it():
     for number, (top, bottom, left, right, run) in enumerate(windows_of(puffs, camera).tolist()):
         one = Puffs(*(array[number : number + 1] for array in puffs))
         tau, _ = look_through(one, eyes, rays / lengths[:, None], np.full(len(rays), 1e3))
-        shown = tau.reshape(64, 96) > 1e-6
+        peak = math.sqrt(2 * math.pi) * one.extinction_per_m[0] * one.scales_m.max()
+        shown = tau.reshape(64, 96) > 0.02 * peak  # a puff ends at three standard deviations
         shown[top:bottom, left:right] = False
         assert not shown.any() and 1 <= run <= 8
 
@@ -184,9 +191,12 @@ def test_no_pixel_outside_of_a_puffs_window_sees_it():
 # ---- Along beams ---------------------------------------------------------------------------------
 
 
+BRIGHTNESS: Any = np.array([0.05, 0.9, 0.3, 0.3])
+
+
 def test_dense_spray_gives_echoes_of_its_own_and_dims_what_stands_behind():
     points = np.array([[40.0, 0, 1.5], [40.0, 0, 1.5], [40.0, 15, 1.5], [6.0, 0, 1.5]])
-    sweep = sweep_of(points, intensity=np.array([0.05, 0.9, 0.3, 0.3]))
+    sweep = sweep_of(points, intensity=BRIGHTNESS)
     origins = np.tile(np.array([0.0, 0, 1.5]), (4, 1))
     world = sweep.points_m[0] - points[0]
     for extinction, scattered in ((0.6, True), (0.02, False)):
@@ -194,8 +204,8 @@ def test_dense_spray_gives_echoes_of_its_own_and_dims_what_stands_behind():
         spray_echoes(echoes, one_puff(12.0, extinction), np.random.default_rng(0))
         assert (echoes.codes[0] == SCATTERED) == scattered
         tau = extinction * math.sqrt(2 * math.pi)
-        assert echoes.gain[1] == pytest.approx(math.exp(-2 * tau), rel=1e-3)
-        assert echoes.codes[1:].tolist() == [UNCHANGED] * 3 and echoes.gain[2:].tolist() == [1, 1]
+        assert scattered or echoes.gain[1] == pytest.approx(math.exp(-2 * tau), rel=1e-3)
+        assert echoes.codes[2:].tolist() == [UNCHANGED] * 2 and echoes.gain[2:].tolist() == [1, 1]
         assert not scattered or 10 < echoes.ranges_m[0] < 14
 
 
@@ -213,8 +223,8 @@ def test_a_recipe_has_spray_where_somebody_drives_fast_enough_and_else_the_same_
     assert np.array_equal(dry.rgb, wet.rgb)
 
     def hurried(actor: Actor) -> Actor:
-        poses = actor.track.world_from_actor.clone()
-        poses[:, :3, 3] += 8 * (poses[:, :3, 3] - actor.track.pose_at(camera.timestamp_ns)[:3, 3])
+        poses, now = actor.track.world_from_actor.clone(), actor.track.world_from_actor[0, :3, 3]
+        poses[:, :3, 3] += 2 * (poses[:, :3, 3] - now)
         return dataclasses.replace(
             actor, track=dataclasses.replace(actor.track, world_from_actor=poses)
         )
@@ -229,6 +239,7 @@ def test_a_recipe_has_spray_where_somebody_drives_fast_enough_and_else_the_same_
     assert "40 km/h" in steps[2].why and "mm of water" in steps[3].why
     without, sprayed = (render_view(fast, camera, rainy(spray=on)) for on in (False, True))
     assert not np.array_equal(without.rgb, sprayed.rgb)
+    assert without.depth_m is not None and sprayed.depth_m is not None
     assert np.array_equal(without.depth_m, sprayed.depth_m)
     alone = render_view(dataclasses.replace(fast), camera, rainy())
     assert np.array_equal(alone.rgb, sprayed.rgb)

@@ -39,7 +39,7 @@ class RainEffect(Effect):
         falling = Falling(
             "rain",
             rain.rate_mm_h,
-            _blows_to(rain.wind_mps, rain.wind_from_deg),
+            blows_to(rain.wind_mps, rain.wind_from_deg),
             0.0,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
@@ -52,7 +52,8 @@ class RainEffect(Effect):
         return _fallen(own, drawn, camera, STREAKS, "rain")
 
 
-def _blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+    """A wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
     angle = math.radians(from_deg)
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from augment.cameras import Camera
 from augment.effects.effect import (
     PICTURE,
@@ -24,13 +22,7 @@ from augment.effects.falling.effect import blows_to
 from augment.effects.lidar.beam import Echoes
 from augment.effects.spray.lidar import spray_echoes
 from augment.effects.spray.picture import blend_puffs, windows_of
-from augment.effects.spray.puffs import (
-    FROM_MPS,
-    Puffs,
-    film_depth_m,
-    spray_puffs,
-    spraying_actors,
-)
+from augment.effects.spray.puffs import FROM_MPS, Puffs, film_depth_m, spray_puffs, spraying_actors
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH
 from augment.rng import rng_for
 from augment.scene import Scene

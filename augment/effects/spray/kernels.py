@@ -50,6 +50,8 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
                 half = 0.5 * puffs[n, 12] * way * math.exp(-0.5 * off)
                 for j in range(first, min(first + run, windows[n, 3])):
                     behind = per * (np.float64(depth[row, j]) - nearest)
+                    if behind < -4:
+                        continue
                     passed = entered + (1.0 if behind > 4 else math.erf(behind))
                     tau = half * max(passed, 0.0)
                     taus[j] += tau

@@ -28,7 +28,6 @@ from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.render.threads import kernel_threads
 
 _RUN_SD, _MAX_RUN = 12, 8  # runs of pixels: in standard deviations of a puff 1 / 12, and pixels
-_NEAR_M = 0.3  # where a puff that begins nearer may show anywhere in the picture
 
 
 def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
@@ -38,23 +37,40 @@ def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
     pose = camera.camera_from_world.numpy()
     centres = puffs.centres_m @ pose[:3, :3].T + pose[:3, 3]
     own = puffs.whitenings @ pose[:3, :3].T
-    covariances = np.linalg.inv(np.swapaxes(own, 1, 2) @ own)
-    reach = np.sqrt(CUT * np.diagonal(covariances, axis1=1, axis2=2))
-    near, far = centres[:, 2] - reach[:, 2], centres[:, 2] + reach[:, 2]
+    reach = CUT * np.linalg.inv(np.swapaxes(own, 1, 2) @ own)
     windows = np.empty((len(centres), 5), np.int64)
     sides = ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width))
     for place, (axis, focal, middle, size) in zip((0, 2), sides, strict=True):
-        ends = centres[:, axis, None] + reach[:, axis, None] * (-1, 1)
-        depths = np.stack([np.maximum(near, _NEAR_M), np.maximum(far, _NEAR_M)], 1)
-        slopes = (ends[:, :, None] / depths[:, None]).reshape(-1, 4)
-        low = np.where(near > _NEAR_M, focal * slopes.min(1) + middle, 0)
-        high = np.where(near > _NEAR_M, focal * slopes.max(1) + middle, size)
-        windows[:, place] = np.clip(np.floor(low), 0, size)
-        windows[:, place + 1] = np.clip(np.ceil(high), 0, size)
-    windows[far <= 0, :4] = 0
+        low, high = _tangents(centres[:, axis], centres[:, 2], reach[:, [axis, 2]][:, :, [axis, 2]])
+        with np.errstate(invalid="ignore"):
+            windows[:, place] = np.clip(np.floor(focal * low + middle), 0, size)
+            windows[:, place + 1] = np.clip(np.ceil(focal * high + middle), 0, size)
+    windows[centres[:, 2] + np.sqrt(reach[:, 2, 2]) <= 0, :4] = 0
     deviations_px = (windows[:, 3] - windows[:, 2]) / (2 * math.sqrt(CUT))
     windows[:, 4] = np.clip(deviations_px / _RUN_SD, 1, _MAX_RUN)
     return windows
+
+
+def _tangents(x: np.ndarray, z: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest slope x / z of an ellipse's part of z > 0, seen from the origin [N]:
+    (x - s z)^2 = (1, -s) reach (1, -s). Infinite where it crosses z = 0.
+    """
+    a = z * z - reach[:, 1, 1]
+    b = x * z - reach[:, 0, 1]
+    c = x * x - reach[:, 0, 0]
+    inside = b * b - a * c
+    root = np.sqrt(np.maximum(inside, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (b - root) / a, (b + root) / a
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    is_right = x - z * reach[:, 0, 1] / reach[:, 1, 1] > 0  # where it crosses z = 0
+    crosses = a <= 0
+    low, high = (
+        np.where(crosses, np.where(is_right, high, -np.inf), low),
+        np.where(crosses, np.where(is_right, np.inf, low), high),
+    )
+    around = (inside <= 0) | ~np.isfinite(first) | ~np.isfinite(second)  # of the origin
+    return np.where(around, -np.inf, low), np.where(around, np.inf, high)
 
 
 def blend_puffs(

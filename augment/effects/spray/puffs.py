@@ -6,7 +6,8 @@ A vehicle lifts the water that its tyres meet, a share of which stays in the air
 
 w being the tyres' width, h the water's depth, d the droplets' diameter (an extinction of 3 LWC /
 (rho d) for a water content LWC, of spheres that are large against the wavelength). At 90 km/h on a
-millimetre of water that fills 2 x 1.5 m with 0.067 /m. f, w and d are assumed, within a factor of 2.
+millimetre of water that fills 2 x 1.5 m with 0.067 /m. f, w and d are assumed: right to a factor
+of 2.
 
 Every INTERVAL_S of absolute time each vehicle that is fast enough leaves a puff where it then is: a
 Gaussian that the wake drags along, that the wind carries, that spreads, and rains out. So a puff's
@@ -20,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from augment.effects.falling.drops import GOLDEN, mix
 from augment.memo import memo_of
 from augment.rng import rng_for
 from augment.scene import Actor, Scene
@@ -34,6 +36,7 @@ _SETTLE_S, _BORN_S = 1.2, 0.12  # in which droplets rain out, and a puff comes u
 _WAKE_SHARE, _WAKE_S = 0.35, 0.5  # of the vehicle's speed, and how soon that is gone
 _STEP_S = 0.25  # to either side, over which speeds are taken
 _MAX_MPS = 70.0  # what is faster has jumped
+THINNEST = 0.003  # optical depth below which a puff is left out
 CUT = 9.0  # square of the distance in standard deviations at which a puff ends
 
 
@@ -124,21 +127,21 @@ def _puffs_of(
     rise = 0.35 + 0.5 * (1 - np.exp(-age_s / 0.5)) - 0.2 * age_s + 0.3 * (draws[:, 2] - 0.5) * drift
     centres += (np.maximum(rise, 0.2) - height / 2)[:, None] * over
     centres += 0.6 * age_s[:, None] * wind_mps
-    scales = np.stack([
-        0.3 + 0.4 * speed * INTERVAL_S + 0.9 * age_s, 0.35 * width + 0.4 * age_s, 0.25 + 0.35 * (1 - np.exp(-age_s)),
-    ], 1)  # fmt: skip
+    lengths = 0.3 + 0.4 * speed * INTERVAL_S + 0.9 * age_s
+    widths, heights = 0.35 * width + 0.4 * age_s, 0.25 + 0.35 * (1 - np.exp(-age_s))
+    scales = np.stack([lengths, widths, heights], 1)
     extinction = whole * left / ((2 * math.pi) ** 1.5 * scales.prod(1))
     axes = np.stack([ahead, aside, over], 1)
-    there = extinction > 1e-5
+    there = math.sqrt(2 * math.pi) * extinction * scales.max(1) > THINNEST
     return Puffs(centres[there], (axes / scales[:, :, None])[there], extinction[there])
 
 
 def _draws(seed: int, scene: str, track_id: str, births: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1) of every puff, [N, 3]."""
-    found = np.empty((len(births), 3))
-    for row, birth in enumerate(births.tolist()):
-        found[row] = rng_for(seed=seed, scene=scene, effect=f"spray {birth} of {track_id}").random(3)
-    return found
+    rng = rng_for(seed=seed, scene=scene, effect=f"spray of {track_id}")
+    key = rng.integers(0, 2**64, dtype=np.uint64)
+    columns = np.arange(1, 4, dtype=np.uint64) * np.uint64(GOLDEN)
+    return (mix(mix(key + births.astype(np.uint64))[:, None] + columns) >> np.uint64(11)) * 2.0**-53
 
 
 # ---- Where vehicles were, also before their tracks begin: straight on ----------------------------
