@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Angle, Colour, Flag, Number
+from recipes.fields import Angle, Colour, Flag, Number, Unit
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
+# By itself ground gets wet through as 1 - exp(-rate / this), and puddles come to stand on a share
+# of it that grows about as the square root of the rate.
+WET_THROUGH_MM_H = 1.5
+PUDDLES_AT_1_MM_H, PUDDLES_POWER, MOST_PUDDLES = 0.03, 0.55, 0.35
 
 
 class Rain(EffectModel):
-    """Rain in the air: drops that streak near the camera and veil what is far."""
+    """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
 
     meant_by = (
         ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
         ("wind_mps", "wind_speed"),
         ("wind_from_deg", "wind_direction wind_deg"),
+        ("wetness", "wet wet_road wet_ground"),
+        ("puddles", "puddle standing_water"),
     )
     knobs = (Knob("min_width_px", (1.0, 0.5, 0.25), "drops drawn one by one; the rest is veil", 7),)
     columns = (
@@ -30,6 +38,14 @@ class Rain(EffectModel):
             shows="nonzero",
             label="rain",
             caption="rain {rain_rate_mm_h:.3g} mm/h",
+        ),
+        Column(
+            "ground_wetness",
+            lambda it: it.ground_wetness,
+            "Wetness of the ground",
+            absent=0.0,
+            shows="nonzero",
+            linear=True,
         ),
     )
 
@@ -45,11 +61,31 @@ class Rain(EffectModel):
     """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
 
+    wetness: Unit | None = None
+    """How wet the ground is that is open to the sky: 0 dry, 1 wet through; null follows from the
+    rate."""
+    puddles: Unit | None = None
+    """Share of that ground on which water stands, in its hollows first; null follows from the rate;
+    none where wetness is 0."""
     spray: Flag = True
-    """Vehicles that drive faster than 40 km/h lift spray, by their speed and the water on the
-    road."""
+    """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
+    wetness."""
 
     @property
     def changes(self) -> bool:
-        """Rain without a rate changes nothing."""
+        """Rain without a rate changes nothing in the air."""
         return self.rate_mm_h > 0
+
+    @property
+    def ground_wetness(self) -> float:
+        """0 to 1, that of the rate where it is null."""
+        if self.wetness is not None:
+            return self.wetness
+        return -math.expm1(-self.rate_mm_h / WET_THROUGH_MM_H)
+
+    @property
+    def puddle_share(self) -> float:
+        """0 to 1, that of the rate where it is null."""
+        if self.puddles is not None:
+            return self.puddles
+        return min(MOST_PUDDLES, PUDDLES_AT_1_MM_H * self.rate_mm_h**PUDDLES_POWER)

@@ -251,9 +251,9 @@ class Output(Section):
     """Write which object each pixel shows: an actor's heaviest splat, or the labelled box that its
     surface lies in."""
     lidar: Flag | Literal["auto", "weather"] = "auto"
-    """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's smog,
-    flood and snow would have them, false writes none; auto is weather where the recipe has snow or
-    a flood and surface is not scene, else true."""
+    """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's
+    weather would have them, false writes none; auto is weather where the recipe has snow or a flood
+    and surface is not scene, else true: smog, rain and snowfall alone put no surface there."""
     labels: Flag = True
     """Pass 3D boxes through."""
     trust: Flag = False

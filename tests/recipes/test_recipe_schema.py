@@ -49,6 +49,8 @@ REFUSED: dict[type, list[dict[str, Any]]] = {
         {"rate_mm_h": 5.0, "wind_mps": -1.0},
         {"rate_mm_h": 5.0, "wind_from_deg": 400},
         {"rate_mm_h": 5.0, "min_width_px": 0},
+        {"rate_mm_h": 5.0, "wetness": 1.01},
+        {"rate_mm_h": 5.0, "puddles": -0.1},
     ],
     Sensor: [{"exposure_ms": 0}, {"exposure_ms": -5.0}, {"exposure_ms": 100.1}],
     Smog: [

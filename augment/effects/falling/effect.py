@@ -7,10 +7,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import numpy as np
+
+from augment.boxes import PlacedBoxes
 from augment.cameras import Camera
-from augment.effects.effect import PICTURE, Active, Drawn, Effect, Placed, Step, skipped
+from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
 from augment.effects.falling.air import Falling, draw_falling
+from augment.effects.falling.labels import falling_table, measure_falling
+from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
 from augment.effects.falling.shutter import frame_interval_s, motion_of
+from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH
 from augment.scene import Scene
@@ -22,11 +28,27 @@ STREAKS = "rain streaks and veil"
 MASK_SHARE = 0.05  # of a pixel, covered by near drops: from here on it is the mask's
 
 
-class RainEffect(Effect):
+class FallingEffect(Effect):
+    """What falls through the air, on labels and LiDAR sweeps. Its placed data are a Falling."""
+
+    is_see_through: ClassVar[bool] = True
+
+    def measure(
+        self, placed: PlacedBoxes, camera: Camera, view: EffectView
+    ) -> dict[str, np.ndarray]:
+        assert self.table is not None
+        return measure_falling(self.table, placed, camera, view)
+
+    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+        kind, rate = own.data.kind, float(own.data.rate_mm_h)
+        precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
+
+
+class RainEffect(FallingEffect):
     """Rain in the air."""
 
     name, section, model, mask = "rain", "weather.rain", Rain, "rain"
-    is_see_through: ClassVar[bool] = True
+    table = falling_table("rain", "streak")
 
     def kernels(self, section: Rain) -> Any:
         return section.changes or None

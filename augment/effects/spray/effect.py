@@ -59,12 +59,15 @@ class SprayEffect(Effect):
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
         elif not rain.spray:
             why = "weather.rain.spray is false"
+        elif rain.ground_wetness == 0:
+            why = "weather.rain.wetness is 0"
         elif not spraying_actors(scene):
             why = f"no actor drives faster than {3.6 * FROM_MPS:.0f} km/h"
         if rain is None or why:
             return Placed(None, skipped((SPRAY,), why, PICTURE))
         wind_mps = blows_to(rain.wind_mps, rain.wind_from_deg)
-        placed = PlacedSpray(film_depth_m(rain.rate_mm_h), wind_mps, recipe.seed)
+        water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
+        placed = PlacedSpray(water_m, wind_mps, recipe.seed)
         why = (
             f"{len(spraying_actors(scene))} actors drive faster than {3.6 * FROM_MPS:.0f} km/h on "
             f"{1000 * placed.water_m:.2g} mm of water"
