@@ -27,7 +27,9 @@ class Rain(EffectModel):
         ("wetness", "wet wet_road wet_ground"),
         ("puddles", "puddle standing_water"),
     )
-    knobs = (Knob("min_width_px", (1.0, 0.5, 0.25), "drops drawn one by one; the rest is veil", 7),)
+    knobs = (
+        Knob("min_width_px", (1.0, 0.5, 0.35, 0.25), "drops drawn one by one; the rest is veil", 7),
+    )
     columns = (
         Column(
             "rain_rate_mm_h",
@@ -59,7 +61,7 @@ class Rain(EffectModel):
     """Where the wind comes from: 0 is world +x, 90 is +y."""
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
-    min_width_px: Number = Field(default=0.25, ge=0.1, le=16)
+    min_width_px: Number = Field(default=0.35, ge=0.1, le=16)
     """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
 

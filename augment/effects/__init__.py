@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from augment.effects.effect import Effect, Sharing
-from augment.effects.falling.effect import RainEffect
+from augment.effects.falling.effect import RainEffect, SnowfallEffect
 from augment.effects.flood.effect import FloodEffect
 from augment.effects.lens_drops.effect import LensDropsEffect
 from augment.effects.smog import SmogEffect
@@ -23,6 +23,7 @@ EFFECTS: tuple[Effect, ...] = (
     FloodEffect(),
     SprayEffect(),
     RainEffect(),
+    SnowfallEffect(),
     LensDropsEffect(),
 )
 
