@@ -11,7 +11,10 @@ in the water, what is seen through it and what the screen reflects are the photo
 the photo is not, as the mirrored one, show splats.
 
 T and the sky's share are those of splats, whose edges lie pixels beside the photo's: a guided
-filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there.
+filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there. Things close to the
+camera lie further off: beside edges that the photo does not show, T is told by what is around, as
+far as the photo shows no edge between (Min et al. 2014, "Fast Global Image Smoothing Based on
+Weighted Least Squares").
 """
 
 from __future__ import annotations
@@ -60,6 +63,15 @@ CLEAR_ALPHA, OPAQUE_ALPHA = 0.04, 0.96
 # colour that counts as an edge.
 RADIUS, EDGE = 1 / 320, 0.05**2
 WIDER = 4  # times as wide for the sky's share: splats of sky and of pale walls are told apart badly
+# Splats lie OFF_M beside what the photo shows, which is many pixels where that is close: edges of T
+# between surfaces, by at least EDGE_OF_T, that may be off by FEWEST_PX or more, at most a WIDEST of
+# the image's width, in a copy ALIGNED_PX wide. An edge of the photo has a contrast of PLAIN of 255
+# or more; where most of T's edges nearby (a NEARBY of the width) are on such, they are where they
+# belong. The further from the others, the more T counts, and everywhere a little, for what is
+# nothing but edge. REACH, ALIKE: of the smoothing, squared pixels and colours of 255.
+OFF_M, EDGE_OF_T, FEWEST_PX, WIDEST, ALIGNED_PX = 0.12, 0.1, 2, 1 / 30, 480
+PLAIN, NEARBY = 26, 1 / 20
+LITTLE, REACH, ALIKE = 0.02, 1000.0, 5.0
 # Where nothing is rendered, rays that fall by more than this (metres a metre) see the road, no sky.
 LEVEL = 0.02
 MAX_CONDITION = 1e3  # of a colour map that is undone: 8 bits come back exactly
@@ -316,7 +328,8 @@ class Photo:
         assert raster.alpha is not None and raster.expected_depth is not None
         alpha, depth = opaque_alpha(raster.alpha), raster.expected_depth
         if kernels_for(self.backend, alpha, depth) == CPU:
-            return self.sharpen(self._transmittance_on_cpu(alpha, depth, fog))
+            found = self._transmittance_on_cpu(alpha, depth, fog)
+            return self.sharpen(self.aligned(found, alpha, depth))
         camera, device, fall = self.camera, alpha.device, self.fall
         lengths, eye_z_m = camera.ray_lengths(device=device), float(camera.centre[2])
         seen = torch.exp(-optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall))
@@ -326,7 +339,46 @@ class Photo:
             road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
             to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
             tau = torch.where(fall > LEVEL, to_road, tau)
-        return self.sharpen(alpha * seen + (1 - alpha) * torch.exp(-tau))
+        found = alpha * seen + (1 - alpha) * torch.exp(-tau)
+        return self.sharpen(self.aligned(found, alpha, depth))
+
+    def aligned(
+        self, values: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"]
+    ) -> Float[Tensor, "H W"]:
+        """Values of about 0 to 1, beside edges of close things those of what is around there."""
+        factor = max(1.0, self.camera.width / ALIGNED_PX)
+        size = max(1, round(self.camera.width / factor)), max(1, round(self.camera.height / factor))
+        full, shown, z = (v.detach().cpu().float().numpy() for v in (values, alpha, depth))
+        own = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+        shown, z = (cv2.resize(v, size, interpolation=cv2.INTER_NEAREST) for v in (shown, z))
+        z = np.where(shown > 0.5, z, np.float32(math.inf))
+        around = np.ones((5, 5), np.uint8)
+        whole = cv2.medianBlur(own, 5)  # without what a reconstruction has of dots
+        edges = (_contrast(whole) > EDGE_OF_T) & np.isfinite(cv2.dilate(z, around))
+        nearest_m = np.maximum(cv2.erode(z, around), 1e-3)
+        off_px = np.where(edges, self.camera.fx / factor * OFF_M / nearest_m, 0)
+        if off_px.max() < FEWEST_PX:
+            return values
+        guide = cv2.resize(self.pixels, size, interpolation=cv2.INTER_AREA)
+        nearby = (max(3, round(NEARBY * size[0])),) * 2
+        asked = (off_px >= FEWEST_PX).astype(np.float32)
+        unseen = asked * (_contrast(guide).max(-1) < PLAIN)
+        off_px[cv2.blur(unseen, nearby) < 0.5 * cv2.blur(asked, nearby)] = 0
+        trust, radius = np.ones(own.shape, np.float32), FEWEST_PX
+        while radius <= WIDEST * size[0]:
+            beside = off_px >= radius
+            if beside.any():
+                away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 3)
+                np.minimum(trust, (2 * away / radius - 1).clip(0, 1), out=trust)
+            radius *= 2
+        if trust.min() == 1:
+            return values
+        smooth = cv2.ximgproc.createFastGlobalSmootherFilter(guide, REACH, ALIKE)
+        weight = np.maximum(trust, np.float32(LITTLE))
+        told = smooth.filter(weight * own) / np.maximum(smooth.filter(weight), 1e-6)
+        shape = (self.camera.width, self.camera.height)
+        change = cv2.resize((1 - trust) * (told - own), shape, interpolation=cv2.INTER_LINEAR)
+        return torch.from_numpy(cv2.add(full, change)).to(values)
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
         """The fog's colour at each pixel; of one pixel where it is one."""
@@ -416,6 +468,12 @@ def open_photo(
         above = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(above, HIGHEST_M) if above > 0 else None
     return Photo(camera, pixels, backend, undone, height_m)
+
+
+def _contrast(image: np.ndarray) -> np.ndarray:
+    """Between the highest and the lowest of each pixel and its neighbours."""
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(image, around) - cv2.erode(image, around)
 
 
 def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
