@@ -34,6 +34,7 @@ from jaxtyping import Float, Int16, UInt8
 from torch import Tensor
 
 from augment.cameras import Camera, Frame
+from augment.cast_shadows import FadedShadows
 from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
@@ -194,7 +195,7 @@ class Photo:
     """A recorded image. camera: that took it, at its size. pixels: as recorded. backend: that
     draws. undone: the map from recorded colours to the scene's, which the camera's colour map turns
     back in the finished picture; None where these are the same. height_m: of the camera above the
-    road; None where unknown.
+    road; None where unknown. faded: the ground's shadows, in smog.
     """
 
     camera: Camera
@@ -203,6 +204,7 @@ class Photo:
     undone: Float[Tensor, "3 4"] | None = None
     height_m: float | None = None
     style: PhotoStyle | None = None
+    faded: FadedShadows | None = None
 
     def is_seen_by(self, camera: Camera) -> bool:
         """Whether the camera is a window of the photo's."""
@@ -266,8 +268,11 @@ class Photo:
         clamped.
         """
         land, style, level = self._cut(self._land, camera), self.style, None
+        gain = None if self.faded is None else self._shadow_gain(self.faded, raster, camera)
+        if gain is not None:
+            land = land * gain
         if style is None:
-            return land, land, None
+            return land, self.sky_colors(camera), None
         if len(style.splats) > 1:
             assert raster.splat_ids is not None
             there = raster.splat_ids >= 0
@@ -276,12 +281,38 @@ class Photo:
             for value in torch.unique(classes).tolist():
                 if value and not torch.equal(style.splats[value], style.splats[0]):
                     own = self._cut(self._in_colors(style.splats[value]), camera)
+                    own = own if gain is None else own * gain
                     land = torch.where((classes == value)[..., None], own, land)
         if style.levels is not None:
             assert raster.splat_ids is not None
             levels = style.levels.to(land.device)
             level = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
         return land, self.sky_colors(camera), level
+
+    def _shadow_gain(
+        self, faded: FadedShadows, raster: RenderOutput, camera: Camera
+    ) -> Float[Tensor, "H W 3"] | None:
+        """What colours are multiplied by, so that the shadows on the ground fade."""
+        depth, alpha = raster.expected_depth, raster.alpha
+        if depth is None or alpha is None:
+            return None
+        small = camera.resized(*_at_most(camera, ALIGNED_PX))
+        z, shown = (
+            cv2.resize(
+                v.detach().cpu().float().contiguous().numpy(),
+                (small.width, small.height),
+                interpolation=cv2.INTER_NEAREST,
+            )
+            for v in (depth, alpha)
+        )
+        points = z[..., None] * small.ray_directions().numpy() + camera.centre.numpy()
+        points[shown < 0.5] = math.inf
+        lit, factors = faded.gains(points.astype(np.float32))
+        lit = cv2.resize(lit, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        if camera is self.camera:
+            lit = self.sharpen(torch.from_numpy(lit), WIDER).numpy()
+        steps = cv2.merge([np.rint(lit * 255).astype(np.uint8)] * 3)
+        return torch.from_numpy(cv2.LUT(steps, factors[None])).to(depth.device)
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """What the sky shows at the pixels of a window."""
@@ -346,8 +377,8 @@ class Photo:
         self, values: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"]
     ) -> Float[Tensor, "H W"]:
         """Values of about 0 to 1, beside edges of close things those of what is around there."""
-        factor = max(1.0, self.camera.width / ALIGNED_PX)
-        size = max(1, round(self.camera.width / factor)), max(1, round(self.camera.height / factor))
+        size = _at_most(self.camera, ALIGNED_PX)
+        factor = self.camera.width / size[0]
         full, shown, z = (v.detach().cpu().float().numpy() for v in (values, alpha, depth))
         own = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
         shown, z = (cv2.resize(v, size, interpolation=cv2.INTER_NEAREST) for v in (shown, z))
@@ -468,6 +499,12 @@ def open_photo(
         above = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(above, HIGHEST_M) if above > 0 else None
     return Photo(camera, pixels, backend, undone, height_m)
+
+
+def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:
+    """Width and height of a copy of the camera's image."""
+    factor = max(1.0, camera.width / width_px)
+    return max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
 
 
 def _contrast(image: np.ndarray) -> np.ndarray:

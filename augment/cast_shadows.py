@@ -2,7 +2,8 @@
 
 A dark ground is a shadow or dark asphalt. Things that stand on it tell which: from every direction
 of a coarse grid they are let cast shadows on the ground, and the direction whose shadows differ
-most from the rest in brightness is the sun's. If even those are hardly darker, there is no sun.
+most from the rest in brightness is the sun's. If even those are hardly darker, or half as bright
+without being bluer, there is no sun.
 How dark shadows are comes from the ground's two modes of luminance (Otsu 1979), where modes and
 cast shadows agree, since what stands higher than a recording reaches casts shadows as well.
 """
@@ -10,17 +11,20 @@ cast shadows agree, since what stands higher than a recording reaches casts shad
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+import torch
+from jaxtyping import Float, Float32, Int16
+from torch import Tensor
 
 from augment.geometry import rotmat_from_quat
 from augment.memo import memo_of
+from augment.render.fog import Fog, vertical_optical_depth
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, Scene
+from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
 
 # The first tells; paint is left out.
@@ -44,9 +48,11 @@ _LARGEST_M = 1.5  # standard deviation; larger splats are sky or haze
 _MAX_ASKED = 8000  # cells of ground, of all
 _MIN_SHARE = 0.02  # of them in the shade of a direction, for it to tell anything
 # Shaded over lit luminance of a direction's shadows: at most the first is a sun, at least the
-# second is none. Where nothing casts them, the darkest direction has 0.84 (PandaSet 002, whose sun
-# is behind clouds).
-_SUNNY, _SUNLESS = 0.65, 0.8
+# second is none, if they are as blue as the sky that lights them, and if they are grey, as asphalt
+# is, half as bright where it is new. (Nothing casts shadows in PandaSet 002, whose sun is behind
+# clouds: the darkest direction has 0.84.)
+_BLUE, _GREY = (0.65, 0.8), (0.4, 0.5)
+_BLUENESS = (1.03, 1.12)  # their blue over red, beside what is lit
 ON_GROUND_M = 0.3  # off the ground's height
 _DARKEST = 0.15  # of a shadow in clear air, whatever a camera's contrast makes of it
 
@@ -197,13 +203,16 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     a, e = np.unravel_index(explained.argmax(), explained.shape)
     slope = math.tan(_ELEVATIONS[e])
     shaded = horizons[a] > slope
+    log_rgb = np.log(np.maximum(road.linear[rows, columns], 1e-4))
+    change = np.median(log_rgb[shaded], 0) - np.median(log_rgb[~shaded], 0)
+    blue = _ramp(math.exp(change[2] - change[0]), *_BLUENESS)
+    sunny, sunless = (g + blue * (b - g) for g, b in zip(_GREY, _BLUE, strict=True))
     by_direction = math.exp(np.median(own[shaded]) - np.median(own[~shaded]))
-    certainty = min(1.0, max(0.0, (_SUNLESS - by_direction) / (_SUNLESS - _SUNNY)))
+    certainty = 1 - _ramp(by_direction, sunny, sunless)
     dark = own <= _between(own)
     both = (shaded & dark, ~shaded & ~dark)
     if min(both[0].sum(), both[1].sum()) < _MIN_SHARE * len(dark):
         certainty, both = 0.0, (dark, ~dark)
-    log_rgb = np.log(np.maximum(road.linear[rows, columns], 1e-4))
     modes = [np.median(log_rgb[chosen], 0) if chosen.any() else log_rgb[0] for chosen in both]
     change = (modes[0] - modes[1]).clip(math.log(_DARKEST), 0)
     ratio = np.exp(certainty * change)
@@ -214,13 +223,14 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
         there = np.nonzero(part.known)
         if len(there[0]) == 0:
             continue
-        horizon = grid.horizons(tops, part.height_m, *there, _AZIMUTHS[a : a + 1])[0]
+        horizon = grid.horizons(tops, part.height_m, there[0], there[1], _AZIMUTHS[a : a + 1])[0]
         light = np.where(horizon > slope, float(np.exp(change) @ _LUMINANCE), 1.0)
         lit_road = float(np.exp(modes[1]) @ _LUMINANCE)
         albedos[ground] = np.median(np.exp(part.log_luminance[there]) / light) / lit_road
     whole = grid.surface(g, np.logical_or.reduce(grounds), albedos)
-    dark_log, lit_log = (float(np.log(np.exp(mode) @ _LUMINANCE)) for mode in modes)
-    lit = ((whole.log_luminance - dark_log) / max(lit_log - dark_log, 1e-3)).clip(0, 1)
+    dark_level, lit_level = (float(np.exp(mode) @ _LUMINANCE) for mode in modes)
+    lit = np.exp(whole.log_luminance) - dark_level
+    lit = (lit / max(lit_level - dark_level, 1e-3 * lit_level)).clip(0, 1)
     return CastShadows(
         certainty=certainty,
         ratio=_triple(ratio),
@@ -356,6 +366,11 @@ def _explained(horizons: np.ndarray, log_luminance: np.ndarray) -> np.ndarray:
     return out
 
 
+def _ramp(value: float, low: float, high: float) -> float:
+    """0 below low, 1 above high, straight between."""
+    return min(1.0, max(0.0, (value - low) / (high - low)))
+
+
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
@@ -367,3 +382,111 @@ def _between(values: np.ndarray) -> float:
     scaled = (255 * (values - low) / max(high - low, 1e-6)).astype(np.uint8)
     threshold, _ = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     return low + (threshold + 0.5) / 255 * (high - low)
+
+
+# ---- Shadows in smog -----------------------------------------------------------------------------
+# Of the light on lit ground, q comes from the sky and 1 - q from the sun. Smog lets T of the sun's
+# through; the rest arrives scattered, everywhere alike, so that the ground's mean stays: with a
+# share s of the sun seen from a place, and f of it in the mean,
+#
+#     before  E = q + (1 - q) s          after  E' = q + (1 - q) (T s + (1 - T) f)
+#
+# which multiplies linear colours by E' / E, and encoded ones by its 1/2.2th power.
+
+SMOG_DEEP_M = 200.0  # uniform smog has no top: fog lies 50 to 300 m deep
+_LOWEST_SUN = math.sin(math.radians(10.0))  # whatever its shadows look like
+NUM_FADES = 32  # from shaded to lit
+_ENCODING = 2.2
+_GROUND_CLASSES = (*_GROUNDS, SemanticClass.LANE_MARKING)
+
+
+@dataclass(frozen=True, eq=False)
+class FadedShadows:
+    """The ground of a scene under a sun that smog has dimmed. transmittance: T, 0 to 1. rows int16
+    [N]: of the background's splats among `maps` [NUM_FADES + 1, 3, 4]; the first changes nothing.
+    """
+
+    shadows: CastShadows
+    transmittance: float
+    rows: Int16[Tensor, "N"]
+    maps: Float[Tensor, "K 3 4"]
+
+    def on(self, part: PosedGaussians) -> PosedGaussians:
+        """The background with its shadows faded, before any maps that it has."""
+        if part.color_maps is None:
+            return replace(part, color_maps=self.maps, color_rows=self.rows)
+        outer, rows = part.color_maps.to(self.maps), part.map_rows
+        maps = outer[:, None, :, :3] @ self.maps[None, :, :, :3]
+        maps = torch.cat([maps, outer[:, None, :, 3:].expand(-1, len(self.maps), -1, -1)], -1)
+        if rows is None:
+            return replace(part, color_maps=maps.flatten(0, 1), color_rows=self.rows)
+        known = torch.where((rows >= 0) & (rows < len(outer)), rows, 0)
+        return replace(
+            part,
+            color_maps=maps.flatten(0, 1),
+            color_rows=(known * len(self.maps) + self.rows).to(torch.int16),
+        )
+
+    def gains(
+        self, points_m: Float32[np.ndarray, "H W 3"]
+    ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "K 3"]]:
+        """Of points in the world: the share of the sun that they see, where they are no ground the
+        mean, which changes nothing; and factors of encoded colours by steps of that share.
+        """
+        lit = _lit_near(self.shadows, *np.moveaxis(points_m, -1, 0))
+        steps = np.linspace(0, 1, 256)
+        return lit.astype(np.float32), _factors(self.shadows, self.transmittance, steps)
+
+
+def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
+    """The scene's shadows under a sun of which this arrives; None where it shows none."""
+    shadows = shadows_of(scene)
+    if shadows is None or shadows.certainty == 0 or transmittance >= 1:
+        return None
+
+    def place() -> Tensor:
+        g = scene.background
+        lit = _lit_near(shadows, *g.means.double().numpy().T)
+        rows = 1 + np.rint(lit * (NUM_FADES - 1))
+        off = np.abs(lit - shadows.lit_share) < 1e-6
+        if g.semantic is not None:
+            off |= ~np.isin(g.semantic.numpy(), [int(own) for own in _GROUND_CLASSES])
+        return torch.from_numpy(np.where(off, 0, rows).astype(np.int16))
+
+    def scale() -> Tensor:
+        factors = _factors(shadows, transmittance, np.linspace(0, 1, NUM_FADES))
+        maps = torch.zeros(NUM_FADES + 1, 3, 4)
+        maps[:, :, :3] = torch.diag_embed(torch.from_numpy(np.vstack([np.ones(3), factors])))
+        return maps
+
+    memo = memo_of(scene)
+    rows = memo.get(("faded shadows",), place)
+    return FadedShadows(
+        shadows, transmittance, rows, memo.get(("faded shadows", transmittance), scale)
+    )
+
+
+def sun_transmittance(fog: Fog, shadows: CastShadows, ground_z_m: float) -> float:
+    """T of the sun's light, down to the ground."""
+    climb = max(math.sin(math.radians(shadows.elevation_deg)), _LOWEST_SUN)
+    if fog.scale_height_m is None:
+        return math.exp(-fog.sigma_per_m * SMOG_DEEP_M / climb)
+    return math.exp(-vertical_optical_depth(fog, ground_z_m) / climb)
+
+
+def _lit_near(
+    shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
+) -> np.ndarray:
+    """Share of the sun that places see, drawn to the mean off the ground."""
+    lit, known, height_m = shadows.at(x_m, y_m)
+    over = np.abs(z_m - height_m / np.maximum(known, 1e-6)) / ON_GROUND_M
+    weight = known * (2 - 2 * over).clip(0, 1)
+    return shadows.lit_share + weight * (lit / np.maximum(known, 1e-6) - shadows.lit_share)
+
+
+def _factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
+    """(E' / E)^(1/2.2) of shares of the sun [K], float32 [K, 3]."""
+    q = np.array(shadows.ratio)
+    seen, mean = lit[:, None], shadows.lit_share
+    after = q + (1 - q) * (transmittance * seen + (1 - transmittance) * mean)
+    return ((after / (q + (1 - q) * seen)) ** (1 / _ENCODING)).astype(np.float32)
