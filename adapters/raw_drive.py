@@ -22,7 +22,7 @@ from pydantic import BeforeValidator, Field
 from adapters.plain_files import MISSING, read_image_size
 from adapters.uri import UriOptions
 from augment.cameras import Frame
-from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, MOVED, SCATTERED
+from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
@@ -39,6 +39,7 @@ _READERS = 4  # threads that decode images to check them; decoding releases the 
 _MAX_FAULTS = 3  # sentences about one camera's images; more become one
 _MAX_NAMED = 3  # frames that a message lists
 _NO_FILE = "has no image"
+_STILL_M = 1e-4  # a return that is no further from its record has not moved
 
 
 # ---- Which frames --------------------------------------------------------------------------------
@@ -285,11 +286,13 @@ def stored_records(
     their coordinates to the bit; the others are carried back in float64, so that only float32's
     rounding is left: less than 0.01 mm within 100 m of the sensor."""
     out = records[sweep.columns[INDEX_COLUMN]]
-    moved = np.flatnonzero(np.isin(sweep.columns[CODE_COLUMN], (MOVED, SCATTERED)))
-    offsets = sweep.points_m[moved] - world_from_file[:3, 3]
+    changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
+    offsets = sweep.points_m[changed] - world_from_file[:3, 3]
     places = np.linalg.solve(world_from_file[:3, :3], offsets.T)
-    for axis, name in enumerate("xyz"):
-        out[moved, columns.index(name)] = places[axis]
+    axes = [columns.index(name) for name in "xyz"]
+    moved = (np.abs(places - out[changed][:, axes].T) > _STILL_M).any(0)
+    for axis, column in enumerate(axes):
+        out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
     return out.tobytes()
 

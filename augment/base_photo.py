@@ -49,9 +49,9 @@ from augment.render.buffers import (
     RenderOutput,
     kernels_for,
 )
-from augment.render.composite import map_colors
+from augment.render.composite import add_elevation, map_colors, pixels_at_unit_depth
 from augment.render.cuda import runtime as gpu
-from augment.render.fog import Fog, airlight_gain, optical_depth, sky_optical_depth
+from augment.render.fog import Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians, Scene
 from recipes.schema import Recipe
@@ -180,14 +180,33 @@ def _is_window(outer: Camera, inner: Camera) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PhotoStyle:
-    """A style's colour maps. splats [C, 3, 4]: one, or one a class. sky [3, 4]. levels [N + 2]: the
-    sky in each of the background's splats, 0 to 1, between zeros that stand for no splat and for
+    """A style's colour maps. splats [C, 3, 4]: one, or one a class. sky [3, 4]. levels [M]: the sky
+    in each of the background's M - 2 splats, 0 to 1, between zeros that stand for no splat and for
     actors'; None where there is none in any.
+
+    others [K, 3, 4]: of the splats' maps, those that differ from the first. marks [R, 3, 4]: what a
+    map makes of any colour: the sky in a splat, and in how far it takes each of the others; by rows
+    of the background's splats, or by classes where `rows` is None. None where there is nothing to
+    mark, or others are more than two.
     """
 
     splats: Float[Tensor, "C 3 4"]
     sky: Float[Tensor, "3 4"]
-    levels: Float[Tensor, "N+2"] | None = None
+    levels: Float[Tensor, " M"] | None = None
+    others: Float[Tensor, "K 3 4"] | None = None
+    marks: Float[Tensor, "R 3 4"] | None = None
+    rows: Int16[Tensor, " N"] | None = None
+
+    def marked(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
+        """The parts in the colours of their marks."""
+        assert self.marks is not None
+        own = self.marks[: len(self.splats)].contiguous()
+        return tuple(
+            replace(part, color_maps=own, color_rows=None)
+            if part.instance_id > 0 or self.rows is None
+            else replace(part, color_maps=self.marks, color_rows=self.rows)
+            for part in parts
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +236,22 @@ class Photo:
             own.add(SPLAT_IDS)
         return frozenset(own)
 
+    def prepare(
+        self, parts: Sequence[PosedGaussians]
+    ) -> tuple[tuple[PosedGaussians, ...], frozenset[str]]:
+        """The parts and the buffers that `clear_picture` takes."""
+        if self._takes_marks(parts):
+            assert self.style is not None
+            return self.style.marked(parts), frozenset({RGB})
+        return blackened(parts), self.buffers_for(parts)
+
+    def _takes_marks(self, parts: Sequence[PosedGaussians]) -> bool:
+        """Whether splats say in place of their colours what a style does to them, which takes half
+        as long as knowing the heaviest one of each pixel.
+        """
+        marks = None if self.style is None else self.style.marks
+        return marks is not None and not any(part.is_overlay for part in parts)
+
     def paint(
         self,
         raster: RenderOutput,
@@ -245,20 +280,65 @@ class Photo:
     def clear_picture(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians]
     ) -> Float[Tensor, "H W 3"]:
-        """The photo with what lies on the scene, before any smog. raster: of `blackened` parts."""
-        land, sky, level = self.colors(raster, parts, self.camera)
-        rgb = land
-        if self.style is not None:
-            assert raster.alpha is not None
-            alpha = opaque_alpha(raster.alpha)
-            share = 1 - alpha if level is None else 1 - alpha * (1 - level)
-            if self.height_m is not None:
-                share = share.masked_fill(self.fall > LEVEL, 0.0)
-            rgb = mix(land, sky, self.sharpen(share, WIDER))
+        """The photo with what lies on the scene, before any smog. raster: of the parts that
+        `prepare` gives.
+        """
+        rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
         if raster.overlay is None:
             return rgb
         assert raster.rgb is not None
         return add_faded(raster.rgb, rgb, 1 - raster.overlay)
+
+    def _styled(
+        self, style: PhotoStyle, raster: RenderOutput, parts: Sequence[PosedGaussians]
+    ) -> Float[Tensor, "H W 3"]:
+        assert raster.alpha is not None
+        if not self._takes_marks(parts):
+            land, sky, level = self.colors(raster, parts, self.camera)
+            return mix(land, sky, self.sharpen(self._sky_share(raster.alpha, level), WIDER))
+        alpha, marks = raster.alpha, raster.rgb
+        assert marks is not None
+        if kernels_for(self.backend, alpha, marks) == CPU:
+            share = self.sharpen(self._marked_share_on_cpu(alpha, marks), WIDER)
+        else:
+            level = (marks[..., 0] / alpha.clamp_min(1e-6)).clamp_max(1)
+            share = self.sharpen(self._sky_share(alpha, level), WIDER)
+        if style.others is None and self.backend == CPU:
+            return self._in_both_on_cpu(style, share)
+        land = self._land
+        for number, other in enumerate(() if style.others is None else style.others):
+            weight = (marks[..., 1 + number] / alpha.clamp_min(1e-6)).clamp_max(1)
+            land = mix(land, self._in_colors(other), weight)
+        return mix(land, self._sky, share)
+
+    def _sky_share(
+        self, alpha: Float[Tensor, "H W"], level: Float[Tensor, "H W"] | None
+    ) -> Float[Tensor, "H W"]:
+        """How much of each pixel is sky: beside the surfaces, and painted on them."""
+        alpha = opaque_alpha(alpha)
+        share = 1 - alpha if level is None else 1 - alpha * (1 - level)
+        if self.height_m is not None:
+            share = share.masked_fill(self.fall > LEVEL, 0.0)
+        return share
+
+    def _marked_share_on_cpu(self, alpha: Tensor, marks: Tensor) -> Tensor:
+        out = np.empty(tuple(alpha.shape), np.float32)
+        fall = (-self.camera.world_from_camera[2, :3]).tolist()
+        numbers = (CLEAR_ALPHA, OPAQUE_ALPHA), *pixels_at_unit_depth(self.camera)
+        numbers = *numbers, (*fall, math.inf if self.height_m is None else LEVEL)
+        with kernel_threads(ROWS):
+            kernels.sky_share(
+                alpha.detach().numpy(), marks.detach().numpy(),
+                *(np.asarray(n, np.float32) for n in numbers), out,
+            )  # fmt: skip
+        return torch.from_numpy(out)
+
+    def _in_both_on_cpu(self, style: PhotoStyle, share: Tensor) -> Tensor:
+        maps = (_composed(own, self.undone).numpy() for own in (style.splats[0], style.sky))
+        out = np.empty(self.pixels.shape, np.float32)
+        with kernel_threads(ROWS):
+            kernels.styled_colors(self.pixels, *maps, share.numpy(), out)
+        return torch.from_numpy(out)
 
     def colors(
         self, raster: RenderOutput, parts: Sequence[PosedGaussians], camera: Camera
@@ -334,7 +414,7 @@ class Photo:
             color_map, least = _composed(style_map, self.undone), 0.0
         if self.backend == CPU:
             out = np.empty(self.pixels.shape, np.float32)
-            given = np.empty((0, 4), np.float32) if color_map is None else color_map.numpy()
+            given = np.eye(3, 4, dtype=np.float32) if color_map is None else color_map.numpy()
             with kernel_threads(ROWS):
                 kernels.scene_colors(self.pixels, given, np.float32(least), out)
             return torch.from_numpy(out)
@@ -348,9 +428,17 @@ class Photo:
         """Values of 0 to 1 whose edges move to the photo's. times: RADIUS."""
         radius = max(2, round(RADIUS * times * self.camera.width))
         source = np.ascontiguousarray(values.detach().cpu().float().numpy())
-        guide = cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)  # in colour it takes twice as long
-        found = cv2.ximgproc.guidedFilter(guide, source, radius, EDGE * 255**2)
-        return torch.from_numpy(found).clamp_(0, 1).to(values.device)
+        there = np.flatnonzero(source.max(1) > 0)
+        if not len(there):
+            return values
+        # No window of the other rows holds a value.
+        rows = slice(max(0, there[0] - 2 * radius), there[-1] + 1 + 2 * radius)
+        guide = cv2.cvtColor(
+            self.pixels[rows], cv2.COLOR_RGB2GRAY
+        )  # in colour it takes twice as long
+        found = np.zeros_like(source)
+        found[rows] = cv2.ximgproc.guidedFilter(guide, source[rows], radius, EDGE * 255**2)
+        return torch.from_numpy(np.clip(found, 0, 1, out=found)).to(values.device)
 
     def transmittance(self, raster: RenderOutput, fog: Fog) -> Float[Tensor, "H W"]:
         """T of what the photo shows, up to the rendered depth; where nothing is rendered up to the
@@ -413,10 +501,14 @@ class Photo:
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
         """The fog's colour at each pixel; of one pixel where it is one."""
-        color = torch.tensor(fog.rgb, device=self._device)[None, None]
         if fog.overcast == 0:
-            return color
-        return color + airlight_gain(fog, -self.fall / self.camera.ray_lengths(device=self._device))
+            return torch.tensor(fog.rgb, device=self._device)[None, None]
+        size = (self.camera.height, self.camera.width)
+        nothing = torch.zeros(size, device=self._device)
+        raster = RenderOutput(
+            rgb=torch.zeros(*size, 3, device=self._device), alpha=nothing, expected_depth=nothing
+        )
+        return add_elevation(raster, self.camera, fog, behind=True, backend=self.backend)
 
     def _transmittance_on_cpu(self, alpha: Tensor, depth: Tensor, fog: Fog) -> Tensor:
         camera, out = self.camera, np.empty(tuple(alpha.shape), np.float32)

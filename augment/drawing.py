@@ -52,13 +52,29 @@ class LayerRenderer:
 
         shown: how much of each pixel of a photo shows this layer; None for all of it.
         """
+        raster = self._draw_level(camera, clip, buffers, pixel_mask, shown)
+        if self.fog is None or self.fog.overcast == 0:
+            return raster
+        with timed("airlight by elevation"):
+            rgb = add_elevation(raster, camera, self.fog, backend=self.backend)
+        return replace(raster, rgb=rgb)
+
+    def _draw_level(
+        self,
+        camera: Camera,
+        clip: HeightClip | None,
+        buffers: frozenset[str],
+        pixel_mask: Bool[Tensor, "H W"] | None = None,
+        shown: Float[Tensor, "H W"] | None = None,
+    ) -> RenderOutput:
+        """As `draw`, in the airlight of the horizon."""
         later = self.fog if self.fog_on_buffers else None
         photo = self.photo if self.photo is not None and self.photo.is_seen_by(camera) else None
         parts = self.parts
         if photo is not None:
             buffers = buffers | photo.buffers_for(parts)
             parts = blackened(parts) if shown is None else parts
-        tilted = self.fog if self.fog is not None and self.fog.overcast > 0 else None
+        tilted = self.fog is not None and self.fog.overcast > 0
         raster = rasterize(
             parts,
             camera,
@@ -75,10 +91,6 @@ class LayerRenderer:
         if later is not None:
             with timed("smog on buffers"):
                 raster = replace(raster, rgb=fog_raster(raster, camera, later))
-        if tilted is not None:
-            with timed("airlight by elevation"):
-                rgb = add_elevation(raster, camera, tilted, backend=self.backend)
-                raster = replace(raster, rgb=rgb)
         return raster
 
     def draw_whole(
@@ -87,11 +99,16 @@ class LayerRenderer:
         """The picture with its sky, not clamped, and the scene's buffers."""
         if self.photo is not None:
             return self._draw_on_photo(self.photo, camera, buffers)
+        fog = self.fog if self.fog is not None and self.fog.scale_height_m is None else None
+        if fog is not None and fog.overcast > 0:
+            with timed("rasterise"):
+                raster = self._draw_level(camera, None, buffers)
+            with timed("airlight by elevation"):  # of the surfaces and behind them at once
+                return add_elevation(raster, camera, fog, behind=True, backend=self.backend), raster
         with timed("rasterise"):
             raster = self.draw(camera, None, buffers)
         assert raster.rgb is not None and raster.alpha is not None
-        uniform = self.fog is not None and self.fog.scale_height_m is None  # hides the sky
-        with timed("airlight behind the splats" if uniform else "sky"):
+        with timed("sky" if fog is None else "airlight behind the splats"):  # which hides the sky
             return self.add_sky(raster.rgb, raster.alpha, camera), raster
 
     def add_sky(
@@ -114,12 +131,12 @@ class LayerRenderer:
         self, photo: Photo, camera: Camera, buffers: frozenset[str]
     ) -> tuple[Float[Tensor, "H W 3"], RenderOutput]:
         """The photo with what lies on the scene, through the smog up to each pixel's depth."""
-        requested = (buffers - {RGB}) | photo.buffers_for(self.parts) | {ALPHA}
+        parts, own = photo.prepare(self.parts)
+        requested = (buffers - {RGB}) | own | {ALPHA}
         if self.fog is not None:
             requested = requested | {EXPECTED_DEPTH}
-        parts = blackened(self.parts)
         with timed("rasterise"):
-            settings = replace(self.settings, sh_degree=0)  # black in all bands
+            settings = replace(self.settings, sh_degree=0)  # one colour in all bands
             raster = rasterize(
                 parts, camera, buffers=requested, settings=settings, backend=self.backend
             )

@@ -248,9 +248,8 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
         SceneError: an effect cannot be placed in this scene.
     """
     active = plan.active(scene, backend=backend)
-    cameras = (camera,)
-    for own in active:
-        cameras = own.effect.cameras(own, camera) or cameras
+    looking = [c for own in active for c in own.effect.cameras(own, camera) or ()]
+    cameras = tuple(looking) or (camera,)
     poses = actor_poses(scene, camera)
     sight = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
     drawn = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)

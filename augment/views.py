@@ -107,18 +107,19 @@ def _draw(view: ViewPlan, layers: LayerRenderer, camera: Camera) -> Drawn:
         drawn = own.effect.draw(own, layers, camera, view.buffers)
         if drawn is not None:
             return drawn
-    return Drawn(*layers.draw_whole(camera, view.buffers))
+    return Drawn(*layers.draw_whole(camera, view.buffers), layers)
 
 
 def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:
     """Where each effect is what a pixel shows: the last one where there are several."""
-    masks = dict[str, Tensor]()
+    masks, opaque = dict[str, Tensor](), list[Tensor]()
     for own in reversed(view.effects):
         mask = own.effect.mask_of(own, drawn)
         if mask is not None and own.effect.mask is not None:
-            for later in masks.values():
+            for later in opaque:
                 mask = mask & ~later
             masks[own.effect.mask] = mask
+            opaque += [] if own.effect.is_see_through else [mask]
     return masks
 
 

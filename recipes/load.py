@@ -74,8 +74,11 @@ def parse_recipe(
     return _template(text, Place(source, folder=folder), name, overrides)
 
 
-def read_overrides(texts: Iterable[str], option: str = "--set") -> dict[str, Node]:
-    """Of a command line: `weather.smog.visibility_m=60`. Files are named from the working folder.
+def read_overrides(
+    texts: Iterable[str], option: str = "--set", folder: Path | None = None
+) -> dict[str, Node]:
+    """Of a command line: `weather.smog.visibility_m=60`. Files are named from the folder, by default
+    the working folder.
 
     Raises:
         RecipeError: one is not PATH=VALUE, or its value is no YAML.
@@ -83,7 +86,7 @@ def read_overrides(texts: Iterable[str], option: str = "--set") -> dict[str, Nod
     overrides = {}
     for text in texts:
         path, equals, value = text.partition("=")
-        place = Place(f"{option} {short(text, 100)}", None, Path())
+        place = Place(f"{option} {short(text, 100)}", None, folder or Path())
         if not equals or not path.strip():
             raise place.error("write PATH=VALUE, as in weather.smog.visibility_m=60")
         overrides[path.strip()] = _value_node(value, place)

@@ -64,7 +64,9 @@ MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and lose
 # the end of a field's name says its unit
 UNITS = {
     "_per_m": "1/metre",
+    "_mm": "millimetres",
     "_m": "metres",
+    "_s": "seconds",
     "_deg": "degrees",
     "_ntu": "nephelometric turbidity units",
 }

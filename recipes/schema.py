@@ -21,6 +21,8 @@ from pydantic.fields import FieldInfo
 from recipes.effect import Column, EffectModel, Knob, Section, Value
 from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
 from recipes.flood import Flood
+from recipes.lens_drops import LensDrops
+from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
 from recipes.style import Style
@@ -148,6 +150,7 @@ class Weather(Closed):
     smog: Smog | None = None
     flood: Flood | None = None
     snow: Snow | None = None
+    rain: Rain | None = None
 
 
 class Render(Section):
@@ -204,11 +207,16 @@ class Sensor(Section):
     know nothing of it.
     """
 
+    later_fields = ("exposure_ms",)
+
     noise: Number = Field(default=0.0, ge=0, le=0.2)
     """Sigma of sensor noise at mid grey, of photons and reading, demosaiced; 0.004 is one level of
     255."""
     psf_px: Number = Field(default=0.0, ge=0, le=16)
     """Sigma of the lens's blur, pixels of the rendered picture."""
+    exposure_ms: Number = Field(default=5.0, gt=0, le=100)
+    """How long the shutter is open: falling drops and flakes streak for as long."""
+    lens_drops: LensDrops | None = None
 
 
 class Output(Section):
@@ -243,9 +251,9 @@ class Output(Section):
     """Write which object each pixel shows: an actor's heaviest splat, or the labelled box that its
     surface lies in."""
     lidar: Flag | Literal["auto", "weather"] = "auto"
-    """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's smog,
-    flood and snow would have them, false writes none; auto is weather where the recipe has snow or
-    a flood and surface is not scene, else true."""
+    """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's
+    weather would have them, false writes none; auto is weather where the recipe has snow or a flood
+    and surface is not scene, else true: smog, rain and snowfall alone put no surface there."""
     labels: Flag = True
     """Pass 3D boxes through."""
     trust: Flag = False
@@ -295,8 +303,12 @@ class Recipe(Closed):
         data, present = self.model_dump(mode="json"), self.sections()
         sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
         left_out = [] if self.quality != Quality() else ["quality"]
-        left_out += [] if self.camera != Sensor() else ["camera"]
-        left_out += [p for p, m in SECTIONS.items() if p not in present and not m.in_first_release]
+        if self.camera == Sensor():
+            left_out.append("camera")
+        else:
+            sections["camera"] = self.camera
+        absent = (p for p, m in SECTIONS.items() if p not in present and not m.in_first_release)
+        left_out += [path for path in absent if path.partition(".")[0] not in left_out]
         left_out += [
             f"{path}.{name}"
             for path, section in sections.items()
@@ -370,7 +382,9 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.smog": Smog,
     "weather.flood": Flood,
     "weather.snow": Snow,
+    "weather.rain": Rain,
     "style": Style,
+    "camera.lens_drops": LensDrops,
 }
 # By dotted path, those that save most first.
 KNOBS: dict[str, Knob] = {}
@@ -397,7 +411,7 @@ def remove_section(path: str) -> None:
 
 def _place(path: str) -> tuple[type[Closed], str]:
     holder, _, name = path.rpartition(".")
-    return {"weather": Weather, "": Recipe}[holder], name
+    return {"weather": Weather, "camera": Sensor, "": Recipe}[holder], name
 
 
 def _rebuild() -> None:

@@ -348,6 +348,35 @@ class EvaluateOptions(Command):
         return 0
 
 
+class ViewOptions(RecipeCommand):
+    """Look at a scene in the browser, with a slider for every field of every effect.
+
+    Recipes and pictures that the page saves are repeated by render, to the byte (docs/viewer.md).
+
+    Args:
+        scene: The scene, as for render.
+        recipe: A recipe file or the name of a preset to start with.
+        out: The folder that recipes and pictures are saved in.
+        scale: Resolution relative to the recipe's, as for render.
+        host: The address that pages are served at. 127.0.0.1 is for browsers on this machine.
+        port: Or the next that is free.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+    """
+
+    scene: Positional[str]
+    recipe: str = "clear"
+    out: Annotated[Path, _local("pages save to this machine")] = Path("views")
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8080
+    backend: Backend = "auto"
+
+    def run(self) -> int:
+        from tools.view.server import view_scene
+
+        return view_scene(self)
+
+
 def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     """Render the embedded street under five recipes, with a contact sheet and a video.
 
@@ -494,6 +523,7 @@ COMMANDS = {
     "fit": FitOptions,
     "inspect": InspectOptions,
     "explain": ExplainOptions,
+    "view": ViewOptions,
     "recipes": RecipesOptions,
     "sheet": SheetOptions,
     "report": ReportOptions,

@@ -47,7 +47,10 @@ if TYPE_CHECKING:
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
 KINDS = (SHORT, LONG, CAMERAS)
 MAX_ANGLE_DEG = 90.0  # between the optical axes of neighbouring cameras
-_BUFFERS = ("image", "depth", "water", "instance")
+# Masks of what passes between camera and scene within one exposure, or sits on the lens: no view of
+# another moment or camera shows it.
+PASSING = ("rain", "snowfall", "lens_drops")
+_BUFFERS = ("image", "depth", "water", "instance", *PASSING)
 _KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mostly 6 or 7
 MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
 ALL, DRY, WATER = "all", "dry", "water"
@@ -215,12 +218,16 @@ class Views:
                 f"median}}"
             )
         depth_m = depth_in_metres(images["depth"])
+        counts = depth_m > 0
+        for name in PASSING:
+            if name in images:
+                counts &= images[name] == 0
         return View(
             DepthView(
                 self.camera(row),
                 images["image"].astype(np.float32) / np.float32(255),
                 depth_m,
-                (depth_m > 0).astype(np.float32),
+                counts.astype(np.float32),
             ),
             images[WATER] > 0 if WATER in images else None,
             images["instance"] > 0 if "instance" in images else None,

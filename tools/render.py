@@ -105,9 +105,10 @@ def kernel_modules(
 
 
 def _alters_picture(recipe: Recipe) -> bool:
-    """Whether its fog scatters or its camera adds noise, which are passes over the picture."""
+    """Whether airlight by elevation, scatter or a camera's noise pass over its picture."""
     smog = recipe.weather.smog
-    return recipe.camera.noise > 0 or (smog is not None and smog.scatter > 0)
+    of_smog = smog is not None and (smog.scatter > 0 or smog.overcast > 0)
+    return recipe.camera.noise > 0 or of_smog
 
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:

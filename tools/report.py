@@ -73,6 +73,7 @@ _CODES = {
     codes.SCATTERED: "scattered in the air or at the water",
     codes.LOST: "lost",
     codes.MOVED: "on another surface",
+    codes.PRECIPITATION: "on a drop or a flake",
 }
 _FACTS = {
     "size": "Image size", "camera": "Cameras", "trajectory": "Trajectory",

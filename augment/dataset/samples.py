@@ -8,6 +8,7 @@ A sample is a dictionary:
     instance          int32 [H, W], 0 = none, else the object's number: `boxes` has them; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
     snow              bool [H, W], where the pixel shows snow; None where there is no snow
+    rain, snowfall    bool [H, W], where a streak or a flake covers the pixel; None without
     trust             bool [H, W], where the picture can be believed; None where nobody asked
     boxes             all boxes of the frame, see `box_tensors`; None where there are none
     lidar             the frame's sweep, see `lidar_tensors`; None where there is none
@@ -187,7 +188,9 @@ def box_tensors(
     submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
     and of its pixels behind water (NaN where the image shows none); None where there is no flood.
     snow_fraction: float64 [B], how much of its pixels is snow (as above); None without snow.
-    transmittance: float64 [B], of the smog before the box, 0 to 1; None without smog.
+    transmittance, rain_transmittance, snowfall_transmittance: float64 [B], of the smog, rain or
+    snowfall before the box, 0 to 1; streak_fraction, flake_fraction: float64 [B], how much of its
+    pixels shows a streak or a flake (as above); None without such weather.
     visibility: float64 [B], what all of that leaves of the box, 0 to 1
     (`augment.jobs.files.visibility`).
 

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 from augment.effects.effect import Effect, Sharing
+from augment.effects.falling.effect import RainEffect
 from augment.effects.flood.effect import FloodEffect
+from augment.effects.lens_drops.effect import LensDropsEffect
 from augment.effects.smog import SmogEffect
 from augment.effects.snow.effect import SnowEffect
 from augment.effects.style.effect import StyleEffect
+from augment.effects.wet.effect import WetEffect
 from recipes.schema import add_section, remove_section
 
-# Style colours what stands in the weather; then come the air before it, snow on it, water over it.
-EFFECTS: tuple[Effect, ...] = (StyleEffect(), SmogEffect(), SnowEffect(), FloodEffect())
+# Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
+# water over it, what falls before all of it, and last the camera's own glass.
+EFFECTS: tuple[Effect, ...] = (
+    StyleEffect(),
+    WetEffect(),
+    SmogEffect(),
+    SnowEffect(),
+    FloodEffect(),
+    RainEffect(),
+    LensDropsEffect(),
+)
 
 
 def share_effects(job: Sharing, *, only_files: bool = False) -> None:

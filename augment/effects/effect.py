@@ -138,11 +138,13 @@ class InView:
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A picture. rgb: display-encoded, not clamped, sky included. raster: buffers of the scene's
-    surfaces. masks: bool, by name. skipped: reasons by the passes that drawing found needless.
+    surfaces. layers: what was drawn, with its fog. masks: bool, by name. skipped: reasons by the
+    passes that drawing found needless.
     """
 
     rgb: Float[Tensor, "H W 3"]
     raster: RenderOutput
+    layers: LayerRenderer
     masks: Mapping[str, Bool[Tensor, "H W"]] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
 
@@ -175,10 +177,12 @@ class Effect:
     """One effect; hooks that are not overridden leave things as they are.
 
     name: one word. section: dotted path of its part of a recipe, whose model is `model`. mask: name
-    of its mask image and file. table: of what it does to labelled boxes. lies_on_scene: it adds
-    surfaces to the scene, as overlays (PosedGaussians.is_overlay), which output.surface = "scene"
-    leaves out. shares_files: what it shares is large, takes long and lies in files. draws: those of
-    its passes that run the rasteriser. folded: what turns off a pass that runs inside the
+    of its mask image and file. is_see_through: other effects' masks keep the pixels of its own.
+    share_column: of the manifest, for the share of an image's pixels in its mask. table: of what it
+    does to labelled boxes. lies_on_scene: it adds surfaces to the scene, as overlays
+    (PosedGaussians.is_overlay), which output.surface = "scene" leaves out. shares_files: what it
+    shares is large, takes long and lies in files. draws: those of its passes that run the
+    rasteriser. folded: what turns off a pass that runs inside the
     rasteriser, by its name: dotted path of a field, and its value.
     """
 
@@ -186,6 +190,8 @@ class Effect:
     section: ClassVar[str]
     model: ClassVar[type[EffectModel]]
     mask: ClassVar[str | None] = None
+    is_see_through: ClassVar[bool] = False
+    share_column: ClassVar[str | None] = None
     table: ClassVar[BoxTable | None] = None
     lies_on_scene: ClassVar[bool] = False
     shares_files: ClassVar[bool] = False

@@ -421,6 +421,7 @@ def fog_echoes(echoes: Echoes, medium: Fog, rng: np.random.Generator) -> None:
     tau = optical_depth_of_arrays(medium, air, eyes_z, ends_z, series_below=1e-4)
     echoes.gain *= np.exp(-2 * tau)
     scatter = scatter_before(medium, eyes_z, air, model, rng)
+    echoes.haze_per_m += extinction_at(medium, eyes_z)
     echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
     wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
     rows = np.flatnonzero(wins)

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -36,7 +36,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.box_tables import BOXES_2D, MODAL_SIDES, SIDES, BoxNumbers, BoxTable, BoxWeather
-from augment.jobs.layout import TRUST
+from augment.jobs.layout import TRUST, share_columns
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
 from augment.labels import Boxes, LabelSource
@@ -483,14 +483,14 @@ def _require(array: np.ndarray, dtype: type, ndim: int, name: str) -> None:
 @dataclass(frozen=True)
 class Written:
     """checksum: SHA-256 of the image file, hexadecimal. files: relative to the output folder.
-    trusted_fraction: of its pixels, None where nobody asked. Times in seconds.
+    shares: of its pixels in masks, by the manifest's column. Times in seconds.
     """
 
     checksum: str
     files: tuple[str, ...]
     encode_s: float
     write_s: float
-    trusted_fraction: float | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
 
 
 def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
@@ -557,9 +557,9 @@ def write_view(
     for relative, data in files.items():
         write_atomic(out_dir / relative, data, clear=False)
     write_s = time.perf_counter() - encoded
-    trust = view.masks.get(TRUST)
-    trusted = None if trust is None else float((trust == 255).mean())
-    return Written(checksum, tuple(files), encoded - started, write_s, trusted)
+    columns = {mask: c for mask, c in share_columns().items() if mask in view.masks}
+    shares = {column: float((view.masks[mask] == 255).mean()) for mask, column in columns.items()}
+    return Written(checksum, tuple(files), encoded - started, write_s, shares)
 
 
 class WritePump:

@@ -279,7 +279,7 @@ class VariantState:
             checksum=outcome.checksum,
             lidar=outcome.lidar,
             lidar_note=outcome.lidar_note,
-            trusted_fraction=outcome.trusted_fraction,
+            shares=outcome.shares,
         )
 
 

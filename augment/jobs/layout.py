@@ -61,6 +61,12 @@ def mask_names() -> tuple[str, ...]:
     return (*(e.mask for e in reversed(effects.EFFECTS) if e.mask), TRUST)
 
 
+def share_columns() -> dict[str, str]:
+    """The manifest's columns that say how many of an image's pixels a mask marks, by the mask."""
+    shares = ((e.mask, e.share_column) for e in reversed(effects.EFFECTS))
+    return {**{m: column for m, column in shares if m and column}, TRUST: "trusted_fraction"}
+
+
 def path_columns(paths: Mapping[str, str | None]) -> dict[str, str | None]:
     """Paths by kind as the manifest's columns."""
     return {f"{kind}_path": path for kind, path in paths.items()}

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, variant_name
+from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, share_columns, variant_name
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
@@ -61,7 +61,8 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
         **{"width": whole, "height": whole},
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *words, "quality"), text),
-        **{"render_scale": pa.float64(), "settings": text, "trusted_fraction": pa.float64()},
+        **{"render_scale": pa.float64(), "settings": text},
+        **dict.fromkeys(share_columns().values(), pa.float64()),
     }
 
 
@@ -101,9 +102,9 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
                 there |= present
                 refuted |= ~present & ~np.isnan(values)
         masks[path.rpartition(".")[2]] = there & ~refuted
-    other = np.zeros(rows, bool)
+    other, known = np.zeros(rows, bool), columns_of_effects()
     for name, values in numbers.items():
-        if name.partition("_")[0] not in masks:
+        if name not in known and name.partition("_")[0] not in masks:
             other |= ~np.isnan(values) & (values != 0)
     return {**masks, "other": other}
 
@@ -185,7 +186,7 @@ def _check_values(table: pa.Table, where: str) -> None:
         elif name == "render_scale":
             scaled = pc.and_(pc.greater(column, 0), pc.is_finite(column))
             _refuse(table, name, pc.invert(scaled), "a number above 0, or null", where)
-        elif name == "trusted_fraction":
+        elif name in share_columns().values():
             shares = pc.and_(pc.greater_equal(column, 0), pc.less_equal(column, 1))
             _refuse(table, name, pc.invert(shares), "0 to 1, or null", where)
         elif pa.types.is_floating(column.type):
@@ -538,9 +539,11 @@ def image_row(
     checksum: str = "",
     lidar: str | None = None,
     lidar_note: str | None = None,
-    trusted_fraction: float | None = None,
+    shares: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """The row by columns. paths: by column; a failed image has none, whatever they say."""
+    """The row by columns. paths: by column; a failed image has none, whatever they say. shares: as
+    of Written.
+    """
     return {
         "scene": scene,
         "variant": variant_name(recipe),
@@ -549,7 +552,8 @@ def image_row(
         **shown_words(recipe),
         "lidar": lidar,
         "lidar_note": lidar_note,
-        "trusted_fraction": trusted_fraction,
+        **dict.fromkeys(share_columns().values()),
+        **(shares or {}),
         "seed": recipe.seed,
         "recipe": recipe.name,
         **vars(identity),

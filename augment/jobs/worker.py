@@ -210,7 +210,7 @@ class Chunk:
 @dataclass(frozen=True)
 class Outcome:
     """What became of one image. lidar, lidar_note: as of PassedLidar. box_weather: of its boxes.
-    trusted_fraction: as of Written.
+    shares: as of Written.
     """
 
     variant: int
@@ -222,7 +222,7 @@ class Outcome:
     lidar: str | None = None
     lidar_note: str | None = None
     box_weather: BoxWeather = field(default_factory=dict)
-    trusted_fraction: float | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -400,7 +400,7 @@ class FrameRunner:
             status=OK,
             checksum=written.checksum,
             box_weather=box_weather,
-            trusted_fraction=written.trusted_fraction,
+            shares=written.shares,
         )
         self._pump.after(drawn.lidar, lambda: self._complete(done, drawn.lidar, written.files))
 

@@ -10,10 +10,11 @@ import functools
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from numpy.polynomial import Chebyshev, Polynomial
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render import composite_kernels
+from augment.render import composite_kernels, picture_kernels
 from augment.render.buffers import AUTO, CPU, RenderOutput, kernels_for
 from augment.render.fog import (
     Fog,
@@ -35,7 +36,7 @@ from augment.sky import (
 )
 
 ROWS = 32  # image rows a thread takes at a time
-NUM_GAINS = 1025  # of airlight by slope in the kernels' table, which then errs by 1e-6
+NUM_GAINS = 8  # coefficients of airlight's growth with the slope, which then errs by 1e-6
 AIRLIGHT_SIZE = 64  # texels along a face of airlight by elevation, which then errs by 1e-4
 
 
@@ -64,18 +65,33 @@ def _airlight(fog: Fog) -> Sky:
 
 @functools.lru_cache(maxsize=16)
 def _gains(overcast: float) -> np.ndarray:
-    """What varying airlight is multiplied by, less 1, by slope; float32, none without overcast."""
-    slopes = torch.linspace(-1, 1, NUM_GAINS if overcast > 0 else 0)
-    return airlight_gain(Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast), slopes)[:, 0].numpy()
+    """c of what varying airlight is multiplied by, less 1, at a slope s >= 0: s (c0 + c1 s + ...);
+    float32 [NUM_GAINS], zeros without overcast.
+    """
+
+    def per_slope(slopes: np.ndarray) -> np.ndarray:
+        fog = Fog(0.0, (1.0, 1.0, 1.0), overcast=overcast)
+        return airlight_gain(fog, torch.from_numpy(slopes))[:, 0].numpy() / slopes
+
+    found = Chebyshev.interpolate(per_slope, NUM_GAINS - 1, [0, 1]).convert(kind=Polynomial)
+    return np.resize(np.append(found.coef, np.zeros(NUM_GAINS)), NUM_GAINS).astype(np.float32)
+
+
+def pixels_at_unit_depth(camera: Camera) -> tuple[Float[np.ndarray, " W"], Float[np.ndarray, " H"]]:
+    """Where columns and rows lie in the plane at z = 1, float32."""
+    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return u.astype(np.float32), v.astype(np.float32)
 
 
 def add_elevation(
-    raster: RenderOutput, camera: Camera, fog: Fog, *, backend: str = CPU
+    raster: RenderOutput, camera: Camera, fog: Fog, *, behind: bool = False, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
     """Colours in fog that were drawn with the airlight of the horizon, with that of their rays.
 
     raster: colour, alpha and expected depth, by which the fog's share of a pixel is judged, as
-    deferred fog does; hence exact for one surface a pixel. backend: as of `map_colors`.
+    deferred fog does; hence exact for one surface a pixel. behind: with the endless fog behind
+    them, too. backend: as of `map_colors`.
     """
     rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
     assert rgb is not None and alpha is not None and depth is not None
@@ -83,17 +99,21 @@ def add_elevation(
         tau = optical_depth(fog, *ways_of_raster(raster, camera, fog))
         rays = camera.ray_directions(rgb.dtype, rgb.device)
         gain = airlight_gain(fog, rays[..., 2] / rays.norm(dim=-1))
-        return rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
+        seen = rgb + (alpha * -torch.expm1(-tau))[..., None] * gain
+        return seen + (1 - alpha)[..., None] * (rgb.new_tensor(fog.rgb) + gain) if behind else seen
     eye, per_height = 0.0, 0.0
     if fog.scale_height_m is not None:
         eye, per_height = float(camera.centre[2]) - fog.base_z_m, 1 / fog.scale_height_m
     medium = fog.sigma_per_m, eye * per_height, per_height
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    numbers = u, v, camera.world_from_camera[2, :3].numpy(), medium, _gains(fog.overcast)
-    numbers = *numbers, fog.varying_rgb or fog.rgb
+    numbers = camera.world_from_camera[2, :3].numpy(), medium, _gains(fog.overcast)
+    numbers = (
+        *pixels_at_unit_depth(camera),
+        *numbers,
+        fog.varying_rgb or fog.rgb,
+        fog.rgb if behind else (),
+    )
     with kernel_threads(ROWS):
-        composite_kernels.add_elevation(
+        picture_kernels.add_elevation(
             rgb.detach().numpy(), alpha.detach().contiguous().numpy(),
             depth.detach().contiguous().numpy(),
             *(np.ascontiguousarray(n, np.float32) for n in numbers),

@@ -39,14 +39,11 @@ def renormalise_alpha(alpha, rgb, overlay, least):
 
 @inner()
 def airlight_gain(slope, gains):
-    """What varying airlight is multiplied by, less 1; gains: by slope, from -1 to 1, or empty."""
-    if gains.size == 0:
-        return np.float32(0)
-    half = np.float32((gains.size - 1) // 2)
-    place = min(max((slope + np.float32(1)) * half, np.float32(0)), half + half)
-    first = min(int(place), gains.size - 2)
-    share = place - np.float32(first)
-    return gains[first] + share * (gains[first + 1] - gains[first])
+    """What varying airlight is multiplied by, less 1. gains [8]: of augment.render.composite."""
+    s, one = abs(slope), np.float32(1)
+    p = gains[4] + s * (gains[5] + s * (gains[6] + s * gains[7]))
+    p = s * (gains[0] + s * (gains[1] + s * (gains[2] + s * (gains[3] + s * p))))
+    return p if slope >= 0 else -p / (one + p)
 
 
 @inner()
@@ -60,30 +57,6 @@ def layered_way(distance, eye, up):
     mean = series if x < np.float32(0.01) else (one - math.exp(-x)) / x
     lowest = eye + min(up, np.float32(0))
     return distance * math.exp(min(-lowest, np.float32(MAX_EXPONENT))) * mean
-
-
-@kernel
-def add_elevation(rgb, alpha, depth, u, v, rise, medium, gains, varying):
-    """rgb += alpha (1 - t) gain varying, in place: what elevation adds to the airlight.
-
-    depth: [H, W], z. u [W], v [H]: image coordinates at unit depth. rise [3]: world z along the
-    camera's axes. medium: extinction at its base, height of the eye above that in scale heights,
-    1 / scale height (0 of uniform fog). All float32.
-    """
-    sigma, eye, per_height = medium[0], medium[1], medium[2]
-    one = np.float32(1)
-    for i in prange(alpha.shape[0]):
-        for j in range(alpha.shape[1]):
-            if alpha[i, j] > 0:
-                length = math.sqrt(u[j] * u[j] + v[i] * v[i] + one)
-                climb = u[j] * rise[0] + v[i] * rise[1] + rise[2]
-                way = depth[i, j] * length
-                if per_height > 0:
-                    way = layered_way(way, eye, depth[i, j] * climb * per_height)
-                gain = airlight_gain(climb / length, gains)
-                gain *= alpha[i, j] * (one - math.exp(-sigma * way))
-                for c in range(U(3)):
-                    rgb[i, j, c] += gain * varying[c]
 
 
 @kernel

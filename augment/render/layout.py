@@ -6,6 +6,7 @@ Arrays are flat; the CPU's indices are unsigned, which is what lets the compiler
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -41,7 +42,7 @@ LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z (no
 
 @dataclass(frozen=True)
 class HeightClip:
-    """The side of the plane z = z_m (world, metres) that is kept.
+    """The side of the plane up . x = z_m (world, metres) that is kept. up: unit.
 
     reach_m: splats that lie farther from the plane than this with all they are may be left out,
     where whoever asks could not see them. overlaps: keep one pixel more than half of the edge, for
@@ -52,6 +53,7 @@ class HeightClip:
     keep: Literal["above", "below"]
     reach_m: float = math.inf
     overlaps: bool = False
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         if self.keep not in SIGNS or not math.isfinite(self.z_m):
@@ -66,6 +68,10 @@ class HeightClip:
     def sign(self) -> float:
         """1 where heights above the plane are kept, -1 where those below are."""
         return SIGNS[self.keep]
+
+    def height_of(self, point: Sequence[float]) -> float:
+        """Of a point (world) above the plane, metres."""
+        return sum(a * b for a, b in zip(self.up, point, strict=True)) - self.z_m
 
     @property
     def edge_px(self) -> float:

@@ -98,11 +98,12 @@ def part_views(
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
     views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:
-        views[:, layout.V_CLIP_EYE] = clip.sign * (float(camera.centre[2]) - clip.z_m)
-        views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * poses[:, 2, :3]
-        upwards = camera.camera_from_world.numpy()[:3, 2]
+        up, eye_height = np.array(clip.up), clip.height_of(camera.centre.tolist())
+        views[:, layout.V_CLIP_EYE] = clip.sign * eye_height
+        views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * (up @ poses[:, :3, :3])
+        upwards = camera.camera_from_world.numpy()[:3, :3] @ up
         views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * upwards
-        views[:, layout.V_CLIP_FALL] = clip.sign * (float(camera.centre[2]) - clip.z_m)
+        views[:, layout.V_CLIP_FALL] = clip.sign * eye_height
         views[:, layout.V_CLIP_LONGEST] = LONGEST
         if camera.is_orthographic:
             views[:, layout.V_CLIP_FALL] = -clip.sign * upwards[2]

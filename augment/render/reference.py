@@ -199,10 +199,10 @@ def _heights(
     gaussians: Gaussians, offsets: Tensor, part: PosedGaussians, camera: Camera, clip: HeightClip
 ) -> Float[Tensor, "M"]:
     """Heights of the means above the plane, by way of the eye, so that float32 keeps its digits."""
-    rise = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rise = torch.tensor(clip.up, dtype=torch.float64)
     if part.world_from_part is not None:
-        rise = part.world_from_part[2, :3]
-    return offsets @ rise.to(offsets.dtype) + (float(camera.centre[2]) - clip.z_m)
+        rise = rise @ part.world_from_part[:3, :3]
+    return offsets @ rise.to(offsets.dtype) + clip.height_of(camera.centre.tolist())
 
 
 def _cut(
@@ -213,11 +213,12 @@ def _cut(
     clip: HeightClip,
 ) -> tuple[Float[Tensor, "M 6"], Tensor]:
     """Cuts, and which splats have a part on the kept side. heights: positive there."""
-    up = (clip.sign * camera.camera_from_world[:3, 2]).to(axes.dtype)
+    rise = torch.tensor(clip.up, dtype=torch.float64)
+    up = (clip.sign * (camera.camera_from_world[:3, :3] @ rise)).to(axes.dtype)
     reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
     gx, gy = _depth_slope(*_image_axes(points, axes, camera), axes[:, 2])
     by = _divisors(points, camera)
-    fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / by**2
+    fall = clip.sign * clip.height_of(camera.centre.tolist()) / by**2
     most = LONGEST
     if camera.is_orthographic:
         fall, most = -up[2], math.inf

@@ -41,7 +41,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render import picture_kernels
 from augment.render.buffers import AUTO, CPU, kernels_for
-from augment.render.composite import ROWS
+from augment.render.composite import ROWS, pixels_at_unit_depth
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth, sky_optical_depth
 from augment.render.threads import kernel_threads
 
@@ -115,7 +115,6 @@ def _scattered_share(
     alpha: Tensor, depth: Tensor, camera: Camera, medium: Fog, strength: float
 ) -> Float32[np.ndarray, "H W"]:
     """As _scattered_share_by_torch, by a kernel."""
-    rays = (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)
     height_m, sigma = medium.scale_height_m, medium.sigma_per_m
     if height_m is not None:
         a = (float(camera.centre[2]) - medium.base_z_m) / height_m
@@ -123,7 +122,7 @@ def _scattered_share(
     out = np.empty((camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
         picture_kernels.scattered_share(
-            alpha.contiguous().numpy(), depth.contiguous().numpy(), np.array(rays, np.float32),
+            alpha.contiguous().numpy(), depth.contiguous().numpy(), *pixels_at_unit_depth(camera),
             camera.world_from_camera[2, :3].numpy().astype(np.float32), np.float32(strength),
             np.float32(min(sigma, 1e30)), np.float32(0 if height_m is None else 1 / height_m), out,
         )  # fmt: skip

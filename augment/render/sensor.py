@@ -76,7 +76,8 @@ def add_noise(
     if kernels_for(backend, rgb) == CPU:
         noisy = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS):
-            picture_kernels.add_noise(noisy, draws, sigmas)
+            rows = noisy.reshape(len(noisy), -1), draws.reshape(len(noisy), -1)
+            picture_kernels.add_noise(*rows, sigmas)
         return torch.from_numpy(noisy)
     levels = (rgb.clamp(0, 1) * 255 + 0.5).long()
     sigma = torch.from_numpy(sigmas).to(rgb.device)[levels]

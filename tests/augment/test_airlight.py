@@ -205,10 +205,12 @@ def test_the_kernels_are_the_definition(height, eye_z):
     def both(run):
         return run("cpu"), run("reference")
 
-    def bent(backend):
+    def bent(backend, **options):
         raster = RenderOutput(rgb=rgb.clone(), alpha=alpha, expected_depth=depth)
-        return add_elevation(raster, view, fog, backend=backend)
+        return add_elevation(raster, view, fog, backend=backend, **options)
 
+    fast, slow = both(lambda on: bent(on, behind=True))
+    assert torch.allclose(fast, slow, atol=2e-5)
     fast, slow = both(bent)
     assert torch.allclose(fast, slow, atol=2e-5)
     assert torch.equal(fast[:5], rgb[:5]) and torch.equal(fast[10:12], rgb[10:12])
@@ -228,7 +230,8 @@ def test_endless_fog_is_a_sky_of_its_airlight(road):
     smog, flood = Smog(extinction_per_m=0.05, color=AIR, overcast=1.0), Flood(level_m=0.3)
     flooded, dry = (picture(road, "left", smog, flood=water) for water in (flood, None))
     assert bool(torch.isfinite(flooded).all())
-    assert torch.allclose(flooded[:20, 40:], dry[:20, 40:])  # the sky beside the wall
+    # The sky beside the wall: of a cube map, which errs along its edges, and by the rays.
+    assert torch.allclose(flooded[:20, 40:], dry[:20, 40:], atol=2e-3)
 
 
 def test_views_in_bytes_are_the_same_twice(road):

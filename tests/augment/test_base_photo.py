@@ -14,7 +14,8 @@ from adapters.procedural import open_truth
 from adapters.uri import parse_uri
 from augment.base_photo import MAX_CONDITION, Photo, open_photo
 from augment.cameras import Camera
-from augment.effects.style.color_maps import CLASSES, StyleMaps
+from augment.effects.style.color_maps import CLASSES, LEVELS, StyleMaps
+from augment.effects.style.style import SceneStyle
 from augment.errors import SceneError
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
@@ -22,13 +23,15 @@ from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
 from augment.render.fog import Fog
+from augment.render.rasterize import rasterize
 from augment.scene import Scene
+from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
-from tests.snow_scenes import drive, sheet, wall
+from tests.snow_scenes import drive, sheet, stack_all, wall
 
 AIRLIGHT = (0.7, 0.72, 0.75)
 COLOR_MAP = torch.tensor([[1.2, 0.1, 0.0, -0.05], [0.0, 0.8, 0.1, 0.02], [0.05, 0.0, 1.1, 0.0]])
@@ -233,6 +236,40 @@ def test_a_style_maps_land_and_sky_of_the_photo_each_by_its_own(scene):
     for rows, own in ((slice(60, 85), land), (slice(0, 10), sky)):
         expected = photo[rows] @ own[:, :3].numpy().T + own[:, 3].numpy()
         assert np.abs(rgb[rows, 20:140] - 255 * expected[:, 20:140]).max() <= 0.51
+
+
+def test_splats_say_by_marks_what_a_style_does_to_them(scene):
+    """As their heaviest splats do, pixel by pixel, where these are solid."""
+    maps = torch.eye(3, 4).repeat(CLASSES, 1, 1)
+    maps[:, :, 3] = 0.1
+    maps[int(SemanticClass.ROAD), :, 3] = torch.tensor([0.3, 0.0, 0.2])
+    end = wall(WALL_M, (-12, 12), (0, 3))
+    end = dataclasses.replace(end, semantic=torch.zeros(len(end), dtype=torch.int16))
+    road = sheet((0.6, WALL_M), (-12, 12), semantic=int(SemanticClass.ROAD))
+    scene = dataclasses.replace(scene, background=stack_all((end, road)))
+    levels = torch.zeros(len(scene.background), dtype=torch.int16)
+    levels[: len(end)] = (end.means[:, 1] > 0).short() * (LEVELS // 2)
+    sky = torch.tensor([[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0]])
+    whole = SceneStyle(StyleMaps(maps, sky, sky), scene.sky, scene, levels).on_photo
+    camera = ahead(scene)
+
+    def shown(style, dtype=torch.float32):
+        photo = dataclasses.replace(open_photo(scene, camera, None, backend="cpu"), style=style)
+        parts, buffers = photo.prepare(scene.parts_for(camera))
+        raster = rasterize(parts, camera, buffers=buffers | {"alpha"})
+        moved = {name: getattr(raster, name) for name in ("rgb", "alpha")}
+        moved = {name: None if own is None else own.to(dtype) for name, own in moved.items()}
+        return photo.clear_picture(dataclasses.replace(raster, **moved), parts)
+
+    by_marks, by_ids = shown(whole), shown(dataclasses.replace(whole, marks=None))
+    assert float((by_marks - by_ids).abs().quantile(0.9)) < 0.01
+    torch.testing.assert_close(by_marks, shown(whole, torch.float64).float(), rtol=0, atol=1e-5)
+    one = dataclasses.replace(whole, splats=maps[:1], others=None, marks=whole.marks[:: len(maps)])
+    one = dataclasses.replace(one, rows=levels)  # one map for all takes a kernel
+    fast, slow = shown(one), shown(dataclasses.replace(one, others=maps[:0]))
+    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+    by_ids = shown(dataclasses.replace(one, marks=None))
+    assert float((fast - by_ids).abs().quantile(0.9)) < 0.01
 
 
 # ---- Jobs, and what is refused -------------------------------------------------------------------

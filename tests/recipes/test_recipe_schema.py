@@ -17,10 +17,12 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.flood import MAX_WAVES, Flood, Wave, Waves
+from recipes.lens_drops import LensDrops
 from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
+from recipes.rain import Rain
 from recipes.ranges import words
 from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
-from recipes.schema import Output, Quality, Recipe, Render, Smog, Weather
+from recipes.schema import Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.style import Style, style_preset_names
 
@@ -38,6 +40,19 @@ def smoggy(**smog: Any) -> Recipe:
 
 
 REFUSED: dict[type, list[dict[str, Any]]] = {
+    Rain: [
+        {},
+        {"rate_mm_h": -1e-9},
+        {"rate_mm_h": 301.0},
+        {"rate_mm_h": math.nan},
+        {"rate_mm_h": 5.0, "wind_mps": 60.1},
+        {"rate_mm_h": 5.0, "wind_mps": -1.0},
+        {"rate_mm_h": 5.0, "wind_from_deg": 400},
+        {"rate_mm_h": 5.0, "min_width_px": 0},
+        {"rate_mm_h": 5.0, "wetness": 1.01},
+        {"rate_mm_h": 5.0, "puddles": -0.1},
+    ],
+    Sensor: [{"exposure_ms": 0}, {"exposure_ms": -5.0}, {"exposure_ms": 100.1}],
     Smog: [
         {"visibility_m": True},
         {"visibility_m": "300"},
@@ -195,11 +210,15 @@ def test_every_field_changes_the_hash() -> None:
     wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
-    weather = Weather(smog=smog, flood=flood, snow=snow)
-    base = Recipe(weather=weather, style=Style(image="a.png", digest="0" * 64))
+    rain = Rain(rate_mm_h=5.0)
+    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain)
+    camera = Sensor(lens_drops=LensDrops(count=5))
+    style = Style(image="a.png", digest="0" * 64)
+    base = Recipe(weather=weather, style=style, camera=camera)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
-    hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
+    hashes.add(base.model_copy(update={"camera": Sensor()}).hash)
+    hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain)).hash)
     hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
     hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changed = [spec for spec in FIELDS if spec.path not in ELSEWHERE]
@@ -213,7 +232,7 @@ def test_every_field_changes_the_hash() -> None:
         accepted = (value for value in (*spec.words, *CANDIDATES) if spec.accepts(value))
         inner[name] = next(value for value in accepted if value != inner[name])
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changed) + 6
+    assert len(hashes) == len(changed) + 7
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 

@@ -36,7 +36,7 @@ def make_row(
     row |= {"variant": f"{recipe}-{variant:03d}", "frame": frame, "camera": camera}
     row |= {"timestamp_ns": frame, "width": WIDTH, "height": HEIGHT, "surface": "solid"}
     row |= {"style": None, "style_method": None, "quality": None, "base": "splats"}
-    row |= {"render_scale": 1.0, "trusted_fraction": None}
+    row |= {"render_scale": 1.0, "trusted_fraction": None, "lens_drops_fraction": None}
     row |= {"settings": None, "lidar": None, "lidar_note": None, "smog_extinction_per_m": 0.0}
     row |= {"flood_level_m": math.nan, "snow_depth_m": math.nan, "snow_coverage": math.nan}
     row |= {"style_strength": 0.0, "seed": 3, "recipe": recipe, "recipe_hash": "0"}

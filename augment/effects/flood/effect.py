@@ -87,7 +87,9 @@ class FloodEffect(Effect):
             return Placed(
                 None, tuple(Step(name, False, "the recipe has no flood") for name in PASSES)
             )
-        medium, reason = flood_medium(flood, recipe.seed, scene)
+        rain = recipe.weather.rain
+        rate = rain.rate_mm_h if rain is not None else 0.0
+        medium, reason = flood_medium(flood, recipe.seed, scene, rate)
         level_z_m = medium.level_z_m
         if lowest_z_m(scene) >= level_z_m:
             why = f"no splat reaches below the level, z = {level_z_m:.2f} m"
@@ -116,7 +118,7 @@ class FloodEffect(Effect):
             return None
         why = "what stands before the water hides all of it"
         hidden = dict.fromkeys(PASSES if found.is_hidden else (), why)
-        return Drawn(found.rgb, found.scene, {"water": found.water}, hidden)
+        return Drawn(found.rgb, found.scene, layers, {"water": found.water}, hidden)
 
     def front_surface(self, own: Active, camera: Camera) -> FrontSurface | None:
         if _is_under(own.data, camera):  # seen from below, the surface has no depth
@@ -143,7 +145,9 @@ def _is_under(medium: FloodMedium, camera: Camera) -> bool:
     return float(camera.centre[2]) <= medium.level_z_m
 
 
-def flood_medium(flood: Flood, seed: int, scene: Scene) -> tuple[FloodMedium, str]:
+def flood_medium(
+    flood: Flood, seed: int, scene: Scene, rain_mm_h: float = 0.0
+) -> tuple[FloodMedium, str]:
     """The flood at its height in the scene, and what explains it. seed: of the recipe.
 
     Raises:
@@ -161,11 +165,13 @@ def flood_medium(flood: Flood, seed: int, scene: Scene) -> tuple[FloodMedium, st
         refraction_index=flood.refraction_index,
         fresnel=flood.fresnel,
         reflection=flood.reflection,
+        rain_mm_h=rain_mm_h,
+        seed=seed,
     )
     reason = (
         f"surface at z = {level_z_m:.2f} m, {level_z_m - ground.lowest_z_m:.2f} m above the lowest "
         f"road ({ground.source}), reflection {flood.reflection}, "
-        f"{len(medium.waves.amplitudes_m)} waves"
+        f"{len(medium.waves.amplitudes_m)} waves{', rings of drops' if rain_mm_h > 0 else ''}"
     )
     return medium, reason
 

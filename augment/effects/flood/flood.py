@@ -23,7 +23,8 @@ class FloodMedium:
     """Water placed in a scene: its surface is the plane z = level_z_m, scene world, metres.
 
     extinction_per_m: of red, green and blue along the way through the water, >= 0, may be
-    infinite. rgb: colour of deep water seen from above, display-encoded.
+    infinite. rgb: colour of deep water seen from above, display-encoded. rain_mm_h: whose drops
+    draw rings on it; seed: of them.
     """
 
     level_z_m: float
@@ -33,6 +34,8 @@ class FloodMedium:
     refraction_index: float = 1.333
     fresnel: FresnelModel = "exact"
     reflection: ReflectionTier = "mirrored"
+    rain_mm_h: float = 0.0
+    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)

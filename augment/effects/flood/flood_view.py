@@ -42,6 +42,7 @@ from augment.effects.flood.water_plane import (
     resized,
 )
 from augment.effects.flood.waves import wave_field
+from augment.effects.wet.ripples import rings_of, with_rings
 from augment.render.buffers import ALPHA, CPU, EXPECTED_DEPTH, RGB, RenderOutput, kernels_for
 from augment.render.composite import sky_behind
 from augment.render.constants import DEPTH_EPS
@@ -282,6 +283,8 @@ def render_flooded(
     seen = cover <= HIDDEN_COVER
     with timed("flood: waves"):
         field = wave_field(medium.waves, crop, medium.level_z_m, device=device, backend=backend)
+        rings = rings_of(medium.rain_mm_h, medium.seed, camera.timestamp_ns)
+        field = with_rings(field, crop, medium.level_z_m, rings, backend=backend)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)

@@ -1,5 +1,13 @@
-"""A recipe's weather on LiDAR sweeps: fog and smog, lying snow, standing water."""
+"""A recipe's weather on LiDAR sweeps: smog, rain and snowfall, lying snow, standing water."""
 
-from augment.effects.lidar.codes import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar.codes import (
+    ATTENUATED,
+    LOST,
+    MOVED,
+    PRECIPITATION,
+    SCATTERED,
+    UNCHANGED,
+    drop_lost,
+)
 
-__all__ = ["ATTENUATED", "LOST", "MOVED", "SCATTERED", "UNCHANGED", "drop_lost"]
+__all__ = ["ATTENUATED", "LOST", "MOVED", "PRECIPITATION", "SCATTERED", "UNCHANGED", "drop_lost"]

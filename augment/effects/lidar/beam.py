@@ -16,7 +16,6 @@ from augment.effects.lidar.codes import (
     INDEX_COLUMN,
     LOST,
     MOVED,
-    SCATTERED,
     UNCHANGED,
 )
 from augment.labels import KnowsLidarOrigins, LidarSweep
@@ -40,7 +39,11 @@ class LidarModel:
     where the receiver sees the beam, and all of it (Hahner et al. 2021, section 3). near_gain:
     share of a signal from the first metres that is not suppressed, unpublished: the default makes
     fog of 40 m visibility cost a surface of 50 % reflectance at 25 m, as far as LiDARs see in it
-    (Bijelic, Gruber and Ritter 2018, "A Benchmark for Lidar Sensors in Fog").
+    (Bijelic, Gruber and Ritter 2018, "A Benchmark for Lidar Sensors in Fog"). focus_m: nearer
+    spots are out of focus, and the receiver's field holds (r / focus_m)^2 of their light: that of a
+    lens of 3 cm over a field of 3 mrad, and near_gain at 1 m. aperture_m, divergence_rad: the
+    beam's diameter as it leaves, and how it grows. range_noise_m: an echo n times as strong as
+    the noise has a range of error range_noise_m / sqrt(2 n) (both of Kilic et al. 2021).
     """
 
     wavelength_um: float = 0.905
@@ -49,6 +52,10 @@ class LidarModel:
     overlap_from_m: float = 0.9
     overlap_full_m: float = 1.0
     near_gain: float = 0.01
+    focus_m: float = 10.0
+    aperture_m: float = 0.01
+    divergence_rad: float = 3e-3
+    range_noise_m: float = 0.09
 
     @property
     def pulse_m(self) -> float:
@@ -58,6 +65,11 @@ class LidarModel:
     def noise_reflectance(self, ranges_m: np.ndarray) -> np.ndarray:
         """The reflectance that is just seen at a range in clear air: 0.1 (R / reach)^2."""
         return 0.1 * (ranges_m / self.reach_m) ** 2
+
+    @property
+    def noise_signal(self) -> float:
+        """What is just seen at any range, as `signal` has it."""
+        return 0.1 / (math.pi * self.reach_m**2)
 
 
 DEFAULT_MODEL = LidarModel()
@@ -137,8 +149,9 @@ class Echoes:
     origins, directions [N, 3]: scene world; directions are unit. ranges_m [N]: as reported, 0 where
     the source has no point: such rows are never touched. air_m [N]: of the way, through the air.
     reflectance [N]: of what gives the echo, incidence included, relative to a white surface met
-    head on. gain [N]: what the weather leaves of the echo. is_new [N]: the echo is not the
-    source's, so its intensity follows from reflectance.
+    head on. gain [N]: what the weather leaves of the echo. haze_per_m [N]: extinction about the
+    sensor, of what has dimmed echoes so far. is_new [N]: the echo is not the source's, so its
+    intensity follows from reflectance. is_moved [N]: it lies elsewhere than in the source.
     """
 
     source: LidarSweep
@@ -150,8 +163,10 @@ class Echoes:
     air_m: np.ndarray
     reflectance: np.ndarray
     gain: np.ndarray
+    haze_per_m: np.ndarray
     codes: np.ndarray
     is_new: np.ndarray
+    is_moved: np.ndarray
 
     @staticmethod
     def of(
@@ -178,8 +193,10 @@ class Echoes:
             air_m=ranges.copy(),
             reflectance=np.maximum(reflectances(sweep), model.noise_reflectance(ranges)),
             gain=np.ones(count),
+            haze_per_m=np.zeros(count),
             codes=np.full(count, UNCHANGED, np.uint8),
             is_new=np.zeros(count, bool),
+            is_moved=np.zeros(count, bool),
         )
 
     def replace(
@@ -188,7 +205,8 @@ class Echoes:
         """Echoes [M] of something else, met in the air, for the returns in rows [M]."""
         self.ranges_m[rows] = self.air_m[rows] = ranges_m
         self.reflectance[rows], self.gain[rows] = reflectance, 1.0
-        self.codes[rows], self.is_new[rows] = code, True
+        self.codes[rows] = code
+        self.is_new[rows] = self.is_moved[rows] = True
 
     def see_through(
         self, rows: np.ndarray, ranges_m: np.ndarray, air_m: np.ndarray, kept: np.ndarray
@@ -196,9 +214,23 @@ class Echoes:
         """Move the returns in rows [M] along their beams, and dim them to kept [M]."""
         moves = np.abs(ranges_m - self.ranges_m[rows]) > _MIN_M
         self.codes[rows[moves]] = MOVED
+        self.is_moved[rows[moves]] = True
         self.ranges_m[rows[moves]] = ranges_m[moves]
         self.air_m[rows] = air_m
         self.gain[rows] *= kept
+
+    def spread_ranges(self, gain_before: np.ndarray, normal: np.ndarray) -> None:
+        """Ranges with the noise that echoes have gained since their gain was gain_before [N], by
+        normal variates [N]: what was recorded has the rest. An echo at the noise has most.
+        """
+        levels = self.reflectance / self.model.noise_reflectance(np.maximum(self.ranges_m, _MIN_M))
+        inverse = [1 / np.maximum(levels * gain, 1.0) for gain in (self.gain, gain_before)]
+        sigma = self.model.range_noise_m * np.sqrt(np.maximum(inverse[0] - inverse[1], 0) / 2)
+        rows = np.flatnonzero((sigma > 0) & (self.ranges_m > 0) & (self.codes != LOST))
+        noisy = self.ranges_m[rows] + sigma[rows] * normal[rows]
+        self.ranges_m[rows] = np.maximum(noisy, _MIN_M)
+        self.is_moved[rows] = True
+        self.codes[rows[self.codes[rows] == UNCHANGED]] = ATTENUATED
 
     def lose_faint(self) -> None:
         """Lose what is below the sensor's noise."""
@@ -217,8 +249,8 @@ class Echoes:
         return LidarSweep(columns)
 
     def _coordinates(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        rows = np.flatnonzero((self.codes == MOVED) | (self.codes == SCATTERED))
         lost = self.codes == LOST
+        rows = np.flatnonzero(self.is_moved & ~lost)
         if not len(rows) and not lost.any():
             return {}
         moved = self.dataset_origins[rows] + self.ranges_m[rows, None] * self.directions[rows]

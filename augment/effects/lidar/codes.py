@@ -8,13 +8,15 @@ from augment.labels import LidarSweep
 
 CODE_COLUMN, INDEX_COLUMN = "weather_code", "source_index"
 
-# weather_code. Where several hold, the greatest of LOST, SCATTERED, MOVED, ATTENUATED in this order
-# of precedence is given: what a trainer has to know first.
+# weather_code. Where several hold, the first of LOST, PRECIPITATION or SCATTERED, MOVED, ATTENUATED
+# is given: what a trainer has to know first.
 UNCHANGED = 0  # the row is the source's, to the bit
-ATTENUATED = 1  # the same surface at the same place, with less intensity
-SCATTERED = 2  # made by droplets in the air, or by muddy water at its surface: no surface is there
+# The same surface with less intensity; in rain and snowfall its range has the noise of that.
+ATTENUATED = 1
+SCATTERED = 2  # made by droplets in the air, spray too, or by muddy water: no surface is there
 LOST = 3  # nothing came back above the sensor's noise: x, y, z are NaN, the intensity is 0
 MOVED = 4  # a surface elsewhere on the beam: that of the snow, or a bed as seen through water
+PRECIPITATION = 5  # a drop of rain or a flake: no surface is there
 
 
 def drop_lost(sweep: LidarSweep) -> LidarSweep:

@@ -2,7 +2,8 @@
 
 1. Snow ends it where it comes to the layer first: the echo is the snow's.
 2. Water bends it, swallows it, or sends it away; snow under water has melted.
-3. Smog dims the echo along the way through the air, there and back, and adds its own.
+3. Smog, rain and snowfall dim the echo along the way through the air, there and back, and add
+   their own.
 4. The sensor reports the strongest echo, if that is above its noise.
 """
 

@@ -43,8 +43,7 @@ from augment.ground import check_metric_and_level
 from augment.jobs.box_tables import BoxTable, share_of_pixels
 from augment.memo import memo_of
 from augment.render.buffers import EXPECTED_DEPTH, OVERLAY
-from augment.render.constants import RasterSettings
-from augment.render.fog import optical_depth_of_arrays
+from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.scene import Gaussians, Scene
 from augment.timing import timed
 from recipes.schema import Recipe
@@ -148,7 +147,7 @@ class SnowEffect(Effect):
             rgb = add_grain(
                 *(drawn.rgb, depth, snow, torch.stack(hidden).any(0) if hidden else None),
                 *(camera, layers.grain, layers.sun, _carriers(own, camera)),
-                extinction_per_m=_extinction_about(own, camera),
+                extinction_per_m=_extinction_at(camera, drawn.layers.fog),
                 backend=own.backend,
             )
         return replace(drawn, rgb=rgb)
@@ -193,15 +192,12 @@ def _carriers(own: Active, camera: Camera) -> list[Carrier]:
     return found
 
 
-def _extinction_about(own: Active, camera: Camera) -> float:
-    """Of the fog that earlier effects put into the scene, at the camera, 1/metre."""
-    layers = LayerRenderer((), own.scene.sky, None, False, RasterSettings(), own.backend)
-    for other in own.earlier:
-        layers = other.effect.edit_scene(other, layers, camera)
-    if layers.fog is None:
+def _extinction_at(camera: Camera, fog: Fog | None) -> float:
+    """1/metre."""
+    if fog is None:
         return 0.0
     eye_z_m = np.array([float(camera.centre[2])])
-    return float(optical_depth_of_arrays(layers.fog, np.ones(1), eye_z_m, eye_z_m)[0])
+    return float(optical_depth_of_arrays(fog, np.ones(1), eye_z_m, eye_z_m)[0])
 
 
 def _is_seen(view: EffectView) -> bool:

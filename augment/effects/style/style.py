@@ -266,10 +266,21 @@ class SceneStyle:
     @cached_property
     def on_photo(self) -> PhotoStyle:
         """The maps for a photo of the scene."""
-        levels = None
+        splats, levels, rows, marks = self.maps.splats, None, None, None
+        others = [m for m in torch.unique(splats, dim=0) if not torch.equal(m, splats[0])]
         if self.levels is not None:
             levels = torch.nn.functional.pad(self.levels.float() / LEVELS, (1, 1))
-        return PhotoStyle(self.maps.splats, self.maps.sky, levels)
+            rows = map_rows(self.levels, self.bare.background.semantic, len(splats))
+        if len(others) < 3 and (others or levels is not None):
+            steps = 1 if levels is None else LEVELS + 1
+            marks = torch.zeros(steps, len(splats), 3, 4)
+            marks[:, :, 0, 3] = torch.arange(steps)[:, None] / LEVELS
+            for number, other in enumerate(others):
+                marks[:, :, 1 + number, 3] = (splats == other).flatten(1).all(1).float()
+            marks = marks.flatten(0, 1)
+        return PhotoStyle(
+            splats, self.maps.sky, levels, torch.stack(others) if others else None, marks, rows
+        )
 
     @property
     def own_bytes(self) -> int:

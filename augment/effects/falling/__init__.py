@@ -1,0 +1,1 @@
+"""Rain and snow that fall through the air."""

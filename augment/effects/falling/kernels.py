@@ -1,0 +1,289 @@
+"""Numba kernels: which drops a camera sees, what of a pixel they cover, the veil of the rest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL
+from augment.render.cpu.jit import inner, kernel
+
+ROWS = 16  # image rows a thread takes at a time
+FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
+SOFT_M = 0.1  # drops this far behind a surface are hidden
+NUM_NUMBERS = 9  # of a drop in the picture
+_HALF = float(2**-21)
+_CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
+_GOLDEN = np.uint64(GOLDEN)
+
+
+@inner()
+def _mix(value):
+    """As drops.mix."""
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return value ^ (value >> np.uint64(31))
+
+
+@inner()
+def _unit(bits, shift):
+    """21 of the bits as a number in [0, 1)."""
+    return np.float64((bits >> np.uint64(shift)) & np.uint64(0x1FFFFF)) * _HALF
+
+
+@inner()
+def _sway(out, point, time, phase, sway):
+    """Adds to a point where the air's eddies and a flake's own flutter have it.
+
+    sway: speed of each of the two, m/s. Eddies: three waves across their direction of travel, so
+    the air is neither pressed nor thinned; flutter: a level circle of the flake's own.
+    """
+    x, y, z = point[0], point[1], point[2]
+    for wave in range(3):
+        along = x if wave == 0 else y if wave == 1 else z
+        turn = (0.9 + 0.3 * wave) * time
+        angle = (1.1 + 0.4 * wave) * along
+        size = sway / (0.9 + 0.3 * wave) * 0.6
+        out[(wave + 1) % 3] += size * math.sin(angle + turn)
+        out[(wave + 2) % 3] += size * math.cos(1.3 * angle - turn)
+    pace = 4 + 8 * phase
+    out[0] += sway / pace * math.sin(pace * time + 50 * phase)
+    out[1] += sway / pace * math.cos(pace * time + 50 * phase)
+
+
+@kernel
+def find_drops(
+    slabs, columns, cells, keys, moves, times, sways, quantiles, shares, planes, shutter, lens,
+    offsets, counts, found,
+):  # fmt: skip
+    """counts [S]: drops of each slab of cells that may be seen. found [N, NUM_NUMBERS]: theirs from
+    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius to which it covers
+    nothing less, radius beyond which nothing, covered share. Empty: they are counted only.
+
+    slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 3]: size, how far a
+    drop can be from its cell's middle, depth to which the class is drawn. keys [B]: of the hashes.
+    moves [B, 3, 3]: where the lattice has moved to as the shutter opens, between, as it closes.
+    times [2]: of opening and closing, for sways [1]. quantiles [B, Q]. shares: as
+    drops.cell_counts. planes [5, 4]: inwards normal and offset of the view's sides and its front.
+    shutter [2, 3, 4]: camera_from_world at both times. lens: fx, fy, cx, cy, width, height, least
+    depth, diameter of the aperture, depth in focus. All float64 but for the integers and found.
+    """
+    is_counting = len(found) == 0
+    for slab in prange(len(slabs)):
+        b, i = slabs[slab, 0], slabs[slab, 1]
+        size, reach, farthest = cells[b, 0], cells[b, 1], cells[b, 2]
+        number = np.int64(0)
+        at, ends = np.empty(3), np.empty((2, 3))
+        for j in range(columns[b, 0], columns[b, 1]):
+            x = (np.float64(i) + 0.5) * size + moves[b, 1, 0]
+            y = (np.float64(j) + 0.5) * size + moves[b, 1, 1]
+            low, high = -1e18, 1e18  # z of the cells' middles, scene world
+            for side in range(6):
+                n = min(side, 4)  # the last one is the far end, which faces the front
+                flip = -1.0 if side == 5 else 1.0
+                rest = flip * (planes[n, 0] * x + planes[n, 1] * y + planes[n, 3]) + reach
+                if side == 5:
+                    rest += farthest
+                slope = flip * planes[n, 2]
+                if abs(slope) < 1e-9:
+                    if rest < 0:
+                        high = -1e18
+                elif slope > 0:
+                    low = max(low, -rest / slope)
+                else:
+                    high = min(high, -rest / slope)
+            if low > high:
+                continue
+            first = np.int64(math.floor((low - moves[b, 1, 2]) / size - 0.5))
+            last = np.int64(math.ceil((high - moves[b, 1, 2]) / size - 0.5))
+            for k in range(first, last + 1):
+                cell = keys[b] + np.uint64(i) * _CELL_X
+                cell = cell + np.uint64(j) * _CELL_Y + np.uint64(k) * _CELL_Z
+                cell = _mix(cell)
+                share = np.float64(cell >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+                for drop in range(MAX_IN_CELL):
+                    if share < shares[drop]:
+                        break
+                    bits = _mix(cell + np.uint64(drop + 1) * _GOLDEN)
+                    more = _mix(bits ^ _GOLDEN)
+                    ok = True
+                    for end in range(2):
+                        m = 2 * end
+                        at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, m, 0]
+                        at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, m, 1]
+                        at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, m, 2]
+                        if sways[0] > 0:
+                            for c in range(3):
+                                ends[end, c] = at[c]
+                            _sway(at, ends[end], times[end], _unit(more, 21), sways[0])
+                        for c in range(3):
+                            ends[end, c] = (
+                                shutter[end, c, 0] * at[0]
+                                + shutter[end, c, 1] * at[1]
+                                + shutter[end, c, 2] * at[2]
+                                + shutter[end, c, 3]
+                            )
+                    near = lens[6]
+                    z0, z1 = ends[0, 2], ends[1, 2]
+                    if max(z0, z1) <= near:
+                        continue
+                    for end in range(2):  # what is behind the front is cut off
+                        if ends[end, 2] < near:
+                            cut = (near - z0) / (z1 - z0)
+                            for c in range(3):
+                                ends[end, c] = ends[0, c] + cut * (ends[1, c] - ends[0, c])
+                            ends[end, 2] = near
+                            z0, z1 = ends[0, 2], ends[1, 2]
+                    z = 0.5 * (z0 + z1)
+                    if z >= farthest:
+                        continue
+                    place = _unit(more, 0) * (quantiles.shape[1] - 1)
+                    q = np.int64(place)
+                    across = quantiles[b, q]
+                    across += (place - q) * (quantiles[b, q + 1] - across)
+                    focal = math.sqrt(lens[0] * lens[1])
+                    wide = across / z * focal
+                    blur = lens[7] * abs(1 / z - 1 / lens[8]) * focal
+                    outside = max(0.5 * (wide + blur) + 0.5, 1.0)
+                    inside = max(0.5 * abs(wide - blur) - 0.5, 0.0)
+                    u0 = lens[0] * ends[0, 0] / z0 + lens[2]
+                    v0 = lens[1] * ends[0, 1] / z0 + lens[3]
+                    u1 = lens[0] * ends[1, 0] / z1 + lens[2]
+                    v1 = lens[1] * ends[1, 1] / z1 + lens[3]
+                    if (
+                        max(u0, u1) < -outside
+                        or max(v0, v1) < -outside
+                        or min(u0, u1) > lens[4] + outside
+                        or min(v0, v1) > lens[5] + outside
+                    ):
+                        ok = False
+                    if not ok:
+                        continue
+                    if not is_counting:
+                        length = math.sqrt((u1 - u0) ** 2 + (v1 - v0) ** 2)
+                        spread = length * (outside + inside)
+                        spread += (
+                            math.pi / 3
+                            * (outside * outside + outside * inside + inside * inside)
+                        )  # fmt: skip
+                        fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
+                        cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
+                        row = offsets[slab] + number
+                        found[row, 0], found[row, 1] = u0, v0
+                        found[row, 2], found[row, 3] = u1, v1
+                        found[row, 4], found[row, 5] = 1 / z0, 1 / z1
+                        found[row, 6], found[row, 7] = inside, outside
+                        found[row, 8] = cover * fade
+                    number += 1
+        counts[slab] = number
+
+
+@kernel
+def cover_pixels(drops, alpha, depth, clear):
+    """clear [H, W]: share of each pixel that none of the drops covers, in their order.
+
+    drops: as found by find_drops. alpha, depth [H, W]: of the surfaces; depth 0 where none is.
+    """
+    height, width = clear.shape
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    for band in prange((height + ROWS - 1) // ROWS):
+        top = np.int64(band) * ROWS
+        bottom = min(top + ROWS, height)
+        for drop in range(len(drops)):
+            u0, v0, u1, v1 = drops[drop, 0], drops[drop, 1], drops[drop, 2], drops[drop, 3]
+            outside = drops[drop, 7]
+            if max(v0, v1) + outside < top or min(v0, v1) - outside > bottom:
+                continue
+            inside, share = drops[drop, 6], drops[drop, 8]
+            near, farther = drops[drop, 4], drops[drop, 5] - drops[drop, 4]
+            du, dv = u1 - u0, v1 - v0
+            per_length = one / max(du * du + dv * dv, np.float32(1e-12))
+            ramp = one / (outside - inside)
+            lowest = np.int64(math.floor(min(v0, v1) - outside))
+            highest = np.int64(math.ceil(max(v0, v1) + outside))
+            for i in range(max(top, lowest), min(bottom, highest + 1)):
+                v = np.float32(i) + half
+                # The piece of the streak that is so near to the row.
+                a, b = zero, one
+                if abs(dv) > np.float32(1e-3):
+                    a, b = (v - outside - v0) / dv, (v + outside - v0) / dv
+                    a, b = min(a, b), max(a, b)
+                    a, b = min(max(a, zero), one), min(max(b, zero), one)
+                ua, ub = u0 + a * du, u0 + b * du
+                left = max(np.int64(math.floor(max(min(ua, ub) - outside, zero))), 0)
+                right = np.int64(math.ceil(min(max(ua, ub) + outside, np.float32(width))))
+                for j in range(left, min(right, width)):
+                    x, y = np.float32(j) + half - u0, v - v0
+                    along = min(max((x * du + y * dv) * per_length, zero), one)
+                    x -= along * du
+                    y -= along * dv
+                    covered = (outside - math.sqrt(x * x + y * y)) * ramp
+                    if covered <= zero:
+                        continue
+                    covered = min(covered, one) * share
+                    surface = depth[i, j]
+                    if surface > zero:
+                        z = one / (near + along * farther)
+                        before = (surface - z) * np.float32(1 / SOFT_M) + one
+                        before = min(max(before, zero), one)
+                        covered *= one - alpha[i, j] * (one - before)
+                    clear[i, j] *= one - covered
+
+
+@inner()
+def _decay(y):
+    """exp(-y) for y >= 0, within 5e-6 of 1: of plain sums, which LLVM writes as vectors."""
+    one = np.float32(1)
+    z = min(y, np.float32(80)) * np.float32(-1 / 64)
+    p = one + z * np.float32(1 / 4) * (one + z * np.float32(1 / 5))
+    p = one + z * (one + z * np.float32(1 / 2) * (one + z * np.float32(1 / 3) * p))
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    return p * p
+
+
+@kernel
+def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, far, airlight, glow):
+    """rgb [H, W, 3] behind the veil and the drops, in place.
+
+    clear: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb [3]: the world's z along the
+    camera's axes. bands [B, 3]: extinction of a class, depth where it begins, depth from which
+    on it is whole. far [3]: sum of the extinctions, and of them times the depths that they lose;
+    optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the
+    camera's axes, and in the mean. Light is squares of display-encoded colours. All float32.
+    """
+    height, width = depth.shape
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    last = bands[len(bands) - 1, 2]
+    for i in prange(height):
+        v = (np.float32(i) + half - rays[3]) * rays[1]
+        for j in range(width):
+            u = (np.float32(j) + half - rays[2]) * rays[0]
+            length = math.sqrt(one + u * u + v * v)
+            z = depth[i, j]
+            tau = far[0] * z - far[1]
+            if z < last:
+                tau = zero
+                for b in range(len(bands)):
+                    begin, whole = bands[b, 1], bands[b, 2]
+                    inside = min(max(z - begin, zero), whole - begin)
+                    ramp = half * inside * inside / max(whole - begin, np.float32(1e-6))
+                    tau += bands[b, 0] * (ramp + max(z - whole, zero))
+            slope = climb[0] * u + climb[1] * v + climb[2]
+            # Of the sky: straight up over the sine of the elevation.
+            sky = _decay(far[2] * length / max(slope, np.float32(1e-6)))
+            shown = alpha[i, j] if z > zero else zero
+            seen = sky + shown * (_decay(tau * length) - sky)
+            through = clear[i, j]
+            per_length = one / length
+            for c in range(3):
+                light = glow[c, 3]
+                light += (glow[c, 0] * u + glow[c, 1] * v + glow[c, 2]) * per_length
+                own = max(rgb[i, j, c], zero)
+                own = airlight[c] + seen * (own * own - airlight[c])
+                rgb[i, j, c] = math.sqrt(max(light + through * (own - light), zero))

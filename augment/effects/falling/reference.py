@@ -1,0 +1,162 @@
+"""What the kernels of falling drops compute, in plain NumPy and torch: slow, and easy to check."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL, mix
+from augment.effects.falling.kernels import FADE, SOFT_M
+
+if TYPE_CHECKING:
+    from augment.effects.falling.air import Veil, Walk
+
+
+def find_drops_by_numpy(walk: Walk) -> Float32[np.ndarray, "N 9"]:
+    """As kernels.find_drops, of all cells of the box around each class's pyramid of sight."""
+    found = [_drops_of_class(walk, number) for number in range(len(walk.cells))]
+    return np.concatenate(found).astype(np.float32)
+
+
+def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
+    size, reach, farthest = walk.cells[number]
+    rows = walk.slabs[walk.slabs[:, 0] == number, 1]
+    if len(rows) == 0:
+        return np.zeros((0, 9))
+    columns = np.arange(*walk.columns[number])
+    # The heights of the box: where the middle of the view is, and as far around as it reaches.
+    around = farthest * np.sqrt(1 + (walk.lens[4:6] / walk.lens[:2]).sum() ** 2) + reach
+    pose = walk.shutter.mean(0)
+    eye_z = float(-(pose[:, :3].T @ pose[:, 3])[2])
+    heights = (eye_z + np.array([-around, around]) - walk.moves[number, 1, 2]) / size
+    levels = np.arange(math.floor(heights[0]) - 1, math.ceil(heights[1]) + 2)
+    cells = np.stack(np.meshgrid(rows, columns, levels, indexing="ij"), -1).reshape(-1, 3)
+    cells = cells.astype(np.int64)
+    middles = (cells + 0.5) * size + walk.moves[number, 1]
+    inside = middles @ walk.planes[:, :3].T + walk.planes[:, 3]
+    cells = cells[(inside >= -reach).all(1) & (inside[:, 4] <= farthest + reach)]
+    factors = np.array(CELL_FACTORS, np.uint64)
+    with np.errstate(over="ignore"):
+        key = mix(walk.keys[number] + (cells.astype(np.uint64) * factors).sum(1, dtype=np.uint64))
+        counts = (key >> np.uint64(11)) / 2.0**53 >= walk.shares[:MAX_IN_CELL, None]
+        drop, cell = np.nonzero(counts)
+        bits = mix(key[cell] + (drop + 1).astype(np.uint64) * np.uint64(GOLDEN))
+        more = mix(bits ^ np.uint64(GOLDEN))
+
+    def unit(values: np.ndarray, shift: int) -> np.ndarray:
+        return ((values >> np.uint64(shift)) & np.uint64(0x1FFFFF)) / 2.0**21
+
+    within = np.stack([unit(bits, shift) for shift in (0, 21, 42)], 1)
+    ends = []
+    for end in range(2):
+        at = (cells[cell] + within) * size + walk.moves[number, 2 * end]
+        if walk.sways[0] > 0:
+            at = at + sway(at, walk.times[end], unit(more, 21), float(walk.sways[0]))
+        ends.append(at @ walk.shutter[end, :, :3].T + walk.shutter[end, :, 3])
+    place = unit(more, 0) * (walk.quantiles.shape[1] - 1)
+    across = np.interp(place, np.arange(walk.quantiles.shape[1]), walk.quantiles[number])
+    return _streaks(ends[0], ends[1], across, farthest, walk.lens)
+
+
+def sway(at: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.ndarray:
+    """As kernels._sway, [N, 3]."""
+    out = np.zeros_like(at)
+    for wave in range(3):
+        pace = 0.9 + 0.3 * wave
+        angle = (1.1 + 0.4 * wave) * at[:, wave]
+        size = speed / pace * 0.6
+        out[:, (wave + 1) % 3] += size * np.sin(angle + pace * time)
+        out[:, (wave + 2) % 3] += size * np.cos(1.3 * angle - pace * time)
+    pace = 4 + 8 * phase
+    out[:, 0] += speed / pace * np.sin(pace * time + 50 * phase)
+    out[:, 1] += speed / pace * np.cos(pace * time + 50 * phase)
+    return out
+
+
+def _streaks(
+    opened: np.ndarray, closed: np.ndarray, across: np.ndarray, farthest: float, lens: np.ndarray
+) -> np.ndarray:
+    """Drops in the picture from where they are as the shutter opens and closes, [N, 3] each."""
+    fx, fy, cx, cy, width, height, near, aperture, focus = lens
+    seen = np.maximum(opened[:, 2], closed[:, 2]) > near
+    opened, closed, across = opened[seen], closed[seen], across[seen]
+    cut = (near - opened[:, 2]) / np.where(closed[:, 2] == opened[:, 2], 1, (closed - opened)[:, 2])
+    crossing = opened + cut[:, None] * (closed - opened)
+    crossing[:, 2] = near
+    opened, closed = (np.where(e[:, 2:] < near, crossing, e) for e in (opened, closed))
+    z0, z1 = opened[:, 2], closed[:, 2]
+    z, focal = (z0 + z1) / 2, math.sqrt(fx * fy)
+    wide, blur = across / z * focal, aperture * np.abs(1 / z - 1 / focus) * focal
+    outside = np.maximum((wide + blur) / 2 + 0.5, 1)
+    inside = np.maximum(np.abs(wide - blur) / 2 - 0.5, 0)
+    u = np.stack([fx * opened[:, 0] / z0 + cx, fx * closed[:, 0] / z1 + cx])
+    v = np.stack([fy * opened[:, 1] / z0 + cy, fy * closed[:, 1] / z1 + cy])
+    length = np.hypot(u[1] - u[0], v[1] - v[0])
+    spread = length * (outside + inside)
+    spread += math.pi / 3 * (outside**2 + outside * inside + inside**2)
+    fade = np.clip((farthest - z) / ((1 - FADE) * farthest), 0, 1)
+    cover = np.minimum(math.pi / 2 * wide**2 / spread, 1) * fade
+    shown = (z < farthest) & (u.max(0) >= -outside) & (v.max(0) >= -outside)
+    shown &= (u.min(0) <= width + outside) & (v.min(0) <= height + outside)
+    numbers = (u[0], v[0], u[1], v[1], 1 / z0, 1 / z1, inside, outside, cover)
+    return np.stack(numbers, 1)[shown]
+
+
+def cover_by_numpy(
+    drops: np.ndarray, alpha: np.ndarray, depth: np.ndarray
+) -> Float[np.ndarray, "H W"]:
+    """As kernels.cover_pixels: what is left clear."""
+    height, width = depth.shape
+    clear = np.ones((height, width))
+    for u0, v0, u1, v1, near, far, inside, outside, share in drops.astype(np.float64):
+        rows = slice(
+            max(0, math.floor(min(v0, v1) - outside)), math.ceil(max(v0, v1) + outside) + 1
+        )
+        across = slice(max(0, math.floor(min(u0, u1) - outside)), math.ceil(max(u0, u1) + outside))
+        y, x = np.mgrid[:height, :width][:, rows, across] + 0.5
+        du, dv = u1 - u0, v1 - v0
+        along = ((x - u0) * du + (y - v0) * dv) / max(du * du + dv * dv, 1e-12)
+        along = along.clip(0, 1)
+        away = np.hypot(x - u0 - along * du, y - v0 - along * dv)
+        covered = ((outside - away) / (outside - inside)).clip(0, 1) * share
+        z, surface = 1 / (near + along * (far - near)), depth[rows, across]
+        before = ((surface - z) / SOFT_M + 1).clip(0, 1)
+        hidden = np.where(surface > 0, alpha[rows, across] * (1 - before), 0)
+        clear[rows, across] *= 1 - covered * (1 - hidden)
+    return clear
+
+
+def blend_by_torch(
+    rgb: Float[Tensor, "H W 3"],
+    alpha: Float[Tensor, "H W"],
+    depth: Float[Tensor, "H W"],
+    clear: Float[Tensor, "H W"],
+    veil: Veil,
+) -> Float[Tensor, "H W 3"]:
+    """As kernels.blend_falling."""
+    rays, climb, bands, far, airlight, glow = (
+        torch.from_numpy(numbers).to(rgb.device, rgb.dtype) for numbers in veil
+    )
+    height, width = depth.shape
+    u = (torch.arange(width, device=rgb.device, dtype=rgb.dtype) + 0.5 - rays[2]) * rays[0]
+    v = (torch.arange(height, device=rgb.device, dtype=rgb.dtype) + 0.5 - rays[3]) * rays[1]
+    v, u = torch.meshgrid(v, u, indexing="ij")
+    length = torch.sqrt(1 + u * u + v * v)
+    z = depth[..., None]
+    begin, whole = bands[:, 1], bands[:, 2]
+    inside = torch.minimum((z - begin).clamp_min(0), whole - begin)
+    ramp = inside**2 / 2 / (whole - begin).clamp_min(1e-6)
+    tau = (bands[:, 0] * (ramp + (z - whole).clamp_min(0))).sum(-1)
+    slope = climb[0] * u + climb[1] * v + climb[2]
+    sky = torch.exp(-(far[2] * length / slope.clamp_min(1e-6)).clamp_max(80))
+    shown = torch.where(depth > 0, alpha, 0)
+    seen = sky + shown * (torch.exp(-(tau * length).clamp_max(80)) - sky)
+    directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]
+    light = directions @ glow[:, :3].T + glow[:, 3]
+    own = airlight + seen[..., None] * (rgb.clamp_min(0) ** 2 - airlight)
+    return (light + clear[..., None].to(rgb.dtype) * (own - light)).clamp_min(0).sqrt()

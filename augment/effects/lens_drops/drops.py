@@ -1,0 +1,169 @@
+"""Where drops are on a camera's glass: a function of seed, camera, time and the car's path.
+
+Each of the drops that a recipe counts lives through one life after another. A life has a number, by
+the time; where it begins and how large it is are hashed from seed, camera, drop and life. With a
+wiper, lives end when it wipes, and drops arrive one by one until it wipes again. Larger drops run:
+down by gravity, and with the air stream by the way that the car has driven since they came. Nothing
+is remembered from image to image.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from augment.cameras import Camera
+from augment.memo import memo_of
+from augment.rng import rng_for
+from augment.scene import Scene
+from recipes.lens_drops import LensDrops
+
+LIFE_S = (8.0, 40.0)  # of a drop on glass that nothing wipes
+RUNS_FROM_M = 1.2e-3  # radius from which a drop overcomes the glass's hold
+RUN_MPS = 3e-3  # of a drop larger than that by a millimetre
+BALANCE_MPS = 15.0  # speed of the car at which the air stream carries as strongly as gravity
+_MAX_RUN = 2.0  # times RUN_MPS
+_MEANDER_M, _MEANDER_TURN_M = 0.6e-3, 8e-3  # to the sides of a drop's way, and how long a bend is
+_LARGEST_SD = 2.5  # of the radii's logarithm, where their distribution ends
+_DRAWS = 12
+
+
+class Drops(NamedTuple):
+    """N drops on the glass, in the order of their numbers. centres_m [N, 2]: right and down from
+    the optical axis. radii_m [N]: of a circle of the mean extent. bends [N, 4]: of the outline, see
+    augment.effects.lens_drops.optics. contact_rad [N]: angle between glass and water at the rim.
+    """
+
+    centres_m: np.ndarray
+    radii_m: np.ndarray
+    bends: np.ndarray
+    contact_rad: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlacedDrops:
+    """drops: of the recipe. count: how many. seed: the recipe's."""
+
+    drops: LensDrops
+    count: int
+    seed: int
+
+
+def drops_at(placed: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
+    """The drops on the camera's glass at its time."""
+    own, count = placed.drops, placed.count
+    rng = rng_for(
+        seed=placed.seed, scene=scene.name, effect="camera.lens_drops", camera=camera.name
+    )
+    key = rng.integers(0, 2**64, dtype=np.uint64)
+    time_ns = np.full(count, camera.timestamp_ns, np.int64)
+    slots = np.arange(count, dtype=np.uint64)
+    if own.wiper_s is None:
+        constant = _units(key, slots, np.zeros(count, np.int64))
+        life_s = LIFE_S[0] + (LIFE_S[1] - LIFE_S[0]) * constant[:, 0]
+        life_ns = (1e9 * life_s).astype(np.int64)
+        time_ns += (constant[:, 1] * life_ns).astype(np.int64)
+    else:
+        life_ns = np.full(count, round(1e9 * own.wiper_s))
+        wiper = rng_for(seed=placed.seed, scene=scene.name, effect="camera.lens_drops.wiper")
+        time_ns += int(wiper.random() * life_ns[0]) if count else 0
+    lives = time_ns // life_ns
+    units = _units(key, slots, lives + 1)
+    age_s = (time_ns - lives * life_ns) / 1e9
+    if own.wiper_s is not None:
+        age_s = age_s - units[:, 2] * own.wiper_s
+    sd = np.clip(ndtri(np.clip(units[:, 3], 1e-9, 1 - 1e-9)), -_LARGEST_SD, _LARGEST_SD)
+    radii_m = own.radius_mm / 1000 * np.exp(own.radius_spread * sd)
+    low = own.glass_m * np.array([-camera.cx / camera.fx, -camera.cy / camera.fy])
+    extent = own.glass_m * np.array([camera.width / camera.fx, camera.height / camera.fy])
+    centres_m = low + extent * units[:, 4:6]
+    centres_m += _run(scene, camera, np.maximum(age_s, 0.0), radii_m, units)
+    bends = np.stack([0.14 * units[:, 8], math.tau * units[:, 9], 0.08 * units[:, 10],
+                      math.tau * units[:, 7]], -1)  # fmt: skip
+    contact_rad = np.radians(35 + 30 * units[:, 11])
+    there = age_s >= 0
+    return Drops(centres_m[there], radii_m[there], bends[there], contact_rad[there])
+
+
+def _run(
+    scene: Scene, camera: Camera, age_s: np.ndarray, radii_m: np.ndarray, units: np.ndarray
+) -> np.ndarray:
+    """How far drops have run since they came [N, 2], metres on the glass."""
+    larger = np.clip((radii_m - RUNS_FROM_M) / 1e-3, 0, _MAX_RUN) * (0.5 + units[:, 6])
+    rotation = camera.camera_from_world[:3, :3].numpy()
+    down = -rotation[:2, 2] if scene.has_known_gravity else np.array([0.0, 1.0])
+    path = memo_of(scene).get(("odometer",), lambda: Odometer.of(scene))
+    ahead = rotation @ path.ahead_at(camera.timestamp_ns)
+    # What blows along the axis is turned upwards by the glass, as by a windscreen.
+    air = np.array([-ahead[0], -ahead[1] - abs(ahead[2])])
+    driven_m = path.driven_m(camera.timestamp_ns, age_s)
+    way = age_s[:, None] * down + (driven_m / BALANCE_MPS)[:, None] * air
+    way *= (RUN_MPS * larger)[:, None]
+    length = np.hypot(*way.T)
+    across = np.stack([-way[:, 1], way[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
+    bend = np.sin(math.tau * (length / _MEANDER_TURN_M + units[:, 7]))
+    bend -= np.sin(math.tau * units[:, 7])
+    return way + (_MEANDER_M * bend * np.minimum(length / _MEANDER_TURN_M, 1))[:, None] * across
+
+
+@dataclass(frozen=True, eq=False)
+class Odometer:
+    """The way that the car has driven. times_ns [T]: strictly increasing. driven_m [T]. ahead
+    [T, 3]: the car's x axis in the world.
+    """
+
+    times_ns: list[int]
+    metres: np.ndarray
+    ahead: np.ndarray
+
+    @staticmethod
+    def of(scene: Scene) -> Odometer:
+        poses = {frame.timestamp_ns: frame.world_from_ego.numpy() for frame in scene.frames}
+        times = sorted(poses)
+        places = np.array([poses[t][:3, 3] for t in times]).reshape(-1, 3)
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        ahead = np.array([poses[t][:3, 0] for t in times]).reshape(-1, 3)
+        return Odometer(times, np.concatenate([[0.0], np.cumsum(steps)]), ahead)
+
+    def ahead_at(self, time_ns: int) -> np.ndarray:
+        """The car's x axis [3] at the frame before this time, or the first; 0 without frames."""
+        if not self.times_ns:
+            return np.zeros(3)
+        return self.ahead[max(bisect_right(self.times_ns, time_ns) - 1, 0)]
+
+    def driven_m(self, time_ns: int, before_s: np.ndarray) -> np.ndarray:
+        """Metres driven in the seconds before a time [N]; beyond the frames on at the same speed,
+        and none of a car that is known at one time only.
+        """
+        if len(self.times_ns) < 2:
+            return np.zeros(len(before_s))
+        seconds = np.array([t - self.times_ns[0] for t in self.times_ns]) / 1e9
+        now_s = (time_ns - self.times_ns[0]) / 1e9
+
+        def at(s: np.ndarray) -> np.ndarray:
+            first = (self.metres[1] - self.metres[0]) / (seconds[1] - seconds[0])
+            last = (self.metres[-1] - self.metres[-2]) / (seconds[-1] - seconds[-2])
+            inside = np.interp(s, seconds, self.metres)
+            return inside + first * np.minimum(s, 0) + last * np.maximum(s - seconds[-1], 0)
+
+        return at(np.full(len(before_s), now_s)) - at(now_s - before_s)
+
+
+def _units(key: np.uint64, slots: np.ndarray, lives: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1) of every drop's life [N, _DRAWS], by rounds of SplitMix64 (Steele, Lea and
+    Flood 2014).
+    """
+    state = _mix(_mix(key + slots) + lives.astype(np.uint64))
+    columns = np.arange(1, _DRAWS + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    return (_mix(state[:, None] + columns) >> np.uint64(11)) * 2.0**-53
+
+
+def _mix(z: np.ndarray) -> np.ndarray:
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))

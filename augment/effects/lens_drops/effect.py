@@ -1,0 +1,60 @@
+"""Drops of water on the camera's glass: the last of what stands between scene and sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
+
+from augment.cameras import Camera
+from augment.effects.effect import PICTURE, Active, Drawn, Effect, Placed, Step, skipped
+from augment.effects.lens_drops.drops import PlacedDrops, drops_at
+from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
+from augment.scene import Scene
+from augment.timing import timed
+from recipes.lens_drops import LensDrops
+from recipes.schema import Recipe
+
+ON_GLASS = "lens drops"
+
+
+class LensDropsEffect(Effect):
+    """Drops on the glass before the lens, which show the scene upside down and out of focus."""
+
+    name, section, model, mask = "lens_drops", "camera.lens_drops", LensDrops, "lens_drops"
+    is_see_through = True
+    share_column = "lens_drops_fraction"
+
+    def kernels(self, section: LensDrops) -> Hashable:
+        return section.changes or None
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        drops = self.of(recipe)
+        if drops is None or not drops.changes:
+            why = "the recipe has no drops on the lens"
+            if drops is not None:
+                why = "camera.lens_drops.count is 0"
+            return Placed(None, skipped((ON_GLASS,), why, PICTURE))
+        blur_mrad = 2000 * drops.aperture_m / drops.glass_m
+        why = (
+            f"{drops.count} drops about {drops.radius_mm:g} mm in radius, {drops.glass_m:g} m "
+            f"before the lens, blurred over {blur_mrad:.3g} mrad; "
+        )
+        why += "never wiped" if drops.wiper_s is None else f"wiped every {drops.wiper_s:g} s"
+        data = PlacedDrops(drops, drops.count, recipe.seed)
+        return Placed(data, (Step(ON_GLASS, True, why, PICTURE),))
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        if camera.is_orthographic:
+            return drawn
+        with timed(ON_GLASS):
+            drops, lens = drops_at(own.data, own.scene, camera), own.data.drops
+            if len(drops.radii_m) == 0:
+                return drawn
+            around = map_surroundings(
+                drawn.rgb, camera, drawn.layers, level=own.scene.has_known_gravity
+            )
+            layer, step, margin = draw_drops(
+                drops, around, camera, glass_m=lens.glass_m, aperture_m=lens.aperture_m
+            )
+            rgb, mask = blend_drops(drawn.rgb, layer, step, margin, backend=own.backend)
+        return replace(drawn, rgb=rgb, masks={**drawn.masks, self.mask: mask})

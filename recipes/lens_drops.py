@@ -1,0 +1,55 @@
+"""What a recipe may say of drops of water on the glass before a camera's lens."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from recipes.effect import Column, EffectModel
+from recipes.fields import Number, Whole
+
+
+class LensDrops(EffectModel):
+    """Drops of water on the glass before the lens, out of its focus."""
+
+    meant_by = (
+        ("lens_drops", "drops raindrops droplets water_drops"),
+        ("glass_m", "distance distance_m windshield_m"),
+        ("wiper_s", "wiper wipers wiper_period_s"),
+    )
+    columns = (
+        Column(
+            "lens_drops_count",
+            lambda it: it.count,
+            "Drops on the lens",
+            absent=0.0,
+            shows="nonzero",
+            label="lens drops",
+            caption="{lens_drops_count:.0f} drops on the lens",
+        ),
+    )
+
+    count: Whole = Field(ge=0, le=500)
+    """Drops on the part of the glass that the camera looks through; with a wiper, just before it
+    wipes."""
+    radius_mm: Number = Field(default=1.0, gt=0, le=20)
+    """Median radius of a drop on the glass."""
+    radius_spread: Number = Field(default=0.4, ge=0, le=1.5)
+    """Standard deviation of the radius's logarithm; 0 for drops of one size."""
+    glass_m: Number = Field(default=0.05, ge=0.003, le=2)
+    """Distance of the glass from the lens's aperture: a windscreen's, or a housing's."""
+    focal_mm: Number = Field(default=6.0, ge=0.5, le=500)
+    """Focal length of the lens, which is focused at infinity; the picture's angles do not follow
+    it."""
+    f_number: Number = Field(default=1.8, ge=0.5, le=64)
+    """Focal length over the aperture's diameter: the smaller, the softer the drops."""
+    wiper_s: Number | None = Field(default=None, ge=0.2, le=3600)
+    """Time from one wipe to the next; null for glass that nothing wipes."""
+
+    @property
+    def changes(self) -> bool:
+        return self.count > 0
+
+    @property
+    def aperture_m(self) -> float:
+        """Radius of the aperture."""
+        return self.focal_mm / self.f_number / 2000

@@ -1,0 +1,88 @@
+"""What a recipe may say of rain."""
+
+from __future__ import annotations
+
+import math
+
+from pydantic import Field
+
+from recipes.effect import Column, EffectModel, Knob
+from recipes.fields import Angle, Colour, Number, Unit
+
+MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
+MAX_WIND_MPS = 60.0
+# By itself ground gets wet through as 1 - exp(-rate / this), and puddles come to stand on a share
+# of it that grows about as the square root of the rate.
+WET_THROUGH_MM_H = 1.5
+PUDDLES_AT_1_MM_H, PUDDLES_POWER, MOST_PUDDLES = 0.03, 0.55, 0.35
+
+
+class Rain(EffectModel):
+    """Rain: drops that streak near the camera and veil what is far, and the wet ground below."""
+
+    meant_by = (
+        ("rate_mm_h", "rain_rate mm_h mm_per_hour"),
+        ("wind_mps", "wind_speed"),
+        ("wind_from_deg", "wind_direction wind_deg"),
+        ("wetness", "wet wet_road wet_ground"),
+        ("puddles", "puddle standing_water"),
+    )
+    knobs = (Knob("min_width_px", (1.0, 0.5, 0.25), "drops drawn one by one; the rest is veil", 7),)
+    columns = (
+        Column(
+            "rain_rate_mm_h",
+            lambda it: it.rate_mm_h,
+            "Rain",
+            "mm/h",
+            absent=0.0,
+            shows="nonzero",
+            label="rain",
+            caption="rain {rain_rate_mm_h:.3g} mm/h",
+        ),
+        Column(
+            "ground_wetness",
+            lambda it: it.ground_wetness,
+            "Wetness of the ground",
+            absent=0.0,
+            shows="nonzero",
+            linear=True,
+        ),
+    )
+
+    rate_mm_h: Number = Field(ge=0, le=MAX_RATE_MM_H)
+    """Water that falls on level ground: drizzle below 1, moderate rain 2.5 to 10, heavy to 50."""
+    wind_mps: Number = Field(default=0.0, ge=0, le=MAX_WIND_MPS)
+    """Speed of the wind, which the drops have too."""
+    wind_from_deg: Angle = 0.0
+    """Where the wind comes from: 0 is world +x, 90 is +y."""
+    color: Colour | None = None
+    """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
+    min_width_px: Number = Field(default=0.25, ge=0.1, le=16)
+    """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
+    farther ones are the veil."""
+
+    wetness: Unit | None = None
+    """How wet the ground is that is open to the sky: 0 dry, 1 wet through; null follows from the
+    rate."""
+    puddles: Unit | None = None
+    """Share of that ground on which water stands, in its hollows first; null follows from the rate;
+    none where wetness is 0."""
+
+    @property
+    def changes(self) -> bool:
+        """Rain without a rate changes nothing in the air."""
+        return self.rate_mm_h > 0
+
+    @property
+    def ground_wetness(self) -> float:
+        """0 to 1, that of the rate where it is null."""
+        if self.wetness is not None:
+            return self.wetness
+        return -math.expm1(-self.rate_mm_h / WET_THROUGH_MM_H)
+
+    @property
+    def puddle_share(self) -> float:
+        """0 to 1, that of the rate where it is null."""
+        if self.puddles is not None:
+            return self.puddles
+        return min(MOST_PUDDLES, PUDDLES_AT_1_MM_H * self.rate_mm_h**PUDDLES_POWER)

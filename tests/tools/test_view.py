@@ -1,0 +1,331 @@
+"""`climategs view`: controls made from models, edits as command lines say them, and whole pages as
+a browser sees them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from page_client import PageClient
+from streets import LABELLED_STREET, SMALL_STREET, open_street
+
+from augment import effects
+from augment.cameras import Camera
+from augment.errors import ClimateGSError
+from augment.geometry import invert_rigid
+from augment.views import render_view
+from recipes.errors import RecipeError
+from recipes.fields import found
+from recipes.load import load_recipe
+from recipes.recipe_file import recipe_file
+from recipes.schema import SECTIONS
+from tests.augment.dust import DustEffect
+from tools.cli import main
+from tools.view.controls import effect_groups, group_of
+from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
+from tools.view.pictures import free_camera, place_in_window
+from tools.view.server import Viewer, import_viser, serve
+
+SCALE = 0.2
+
+
+@pytest.fixture
+def dust() -> Iterator[None]:
+    effects.add_effect(DustEffect())
+    yield
+    effects.remove_effect("dust")
+
+
+@contextmanager
+def served(edits: Edits, uri: str = SMALL_STREET) -> Iterator[tuple[Viewer, str]]:
+    viewer = Viewer(open_street(uri), uri, edits, edits.folder, "cpu")
+    with serve(import_viser(), viewer, "127.0.0.1", 0) as url:
+        yield viewer, url
+
+
+# ---- Controls ------------------------------------------------------------------------------------
+
+
+def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(dust):
+    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+    groups = (*effect_groups(), group_of("camera"), group_of("render"))
+    assert {group.path for group in groups} == {*SECTIONS, "camera", "render"}
+    for group in groups:
+        there = {control.path for control in group.walk()}
+        fields = {p for p in leaves if p.startswith(f"{group.path}.") and "[]" not in p}
+        others = tuple(f"{path}." for path in SECTIONS if path != group.path)
+        fields = {path for path in fields if not path.startswith(others)}
+        assert fields - there <= {f"{group.path}.digest", f"{group.path}.probability"}
+        for control in group.walk():
+            assert control.hint
+            if control.kind != "slider":
+                continue
+            leaf, kind = leaves[control.path], int if control.whole else float
+            for way in np.linspace(0, 1, 41):
+                value = kind(control.value_at(way))
+                assert leaf.accepts(value), (control, way, value)
+                if not control.whole and control.way_of(value) not in (0, 1):
+                    assert control.value_at(control.way_of(value)) == pytest.approx(value, 0.006)
+    paths = {c.path: c for group in groups for c in group.walk()}
+    half = paths["weather.dust.half_m"]
+    assert (half.way, half.high, half.hint.split()[-1]) == ("log", 1e6, "[metres]")
+    assert paths["weather.dust.distance"].words == ("depth", "ray")
+    assert paths["weather.flood.level_m"].value_at(0.5) == 0
+    assert paths["weather.smog.scatter"].step == 0.01
+
+
+def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
+    for section in SECTIONS:
+        edits = Edits("clear").with_section(section)
+        assert found(edits.recipe(), section) is not None, start_of_section(section)
+        assert found(edits.without_section(section).recipe(), section) is None
+
+
+# ---- Edits ---------------------------------------------------------------------------------------
+
+
+def test_a_command_line_says_what_the_page_does():
+    edits = Edits("winter-fog", 0.5).with_section("weather.flood").without_section("weather.snow")
+    edits = edits.with_values({"weather.smog.visibility_m": "60", "seed": "5", "variant": "3"})
+    words = shlex.split(edits.command("--scene x --out y"))
+    sets = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
+    from tools.render import resolve_recipes
+
+    (recipe,) = resolve_recipes([words[2]], 1, 0.5, sets)
+    assert recipe == edits.recipe() and (recipe.seed, recipe.variant) == (5, 3)
+    assert recipe.weather.smog is not None and recipe.weather.smog.visibility_m == 60
+    assert recipe.weather.flood is not None and recipe.weather.snow is None
+    # What was set comes back with the effect.
+    again = edits.without_section("weather.smog").with_section("weather.smog").recipe()
+    assert again == recipe
+    assert without_weather(recipe).sections() == {}
+
+
+def test_of_two_fields_that_exclude_each_other_the_older_gives_way():
+    edits = Edits("dense-fog").with_values({"weather.smog.extinction_per_m": "0.1"})
+    with pytest.raises(RecipeError, match="keep one of them"):
+        edits.recipe()
+    others = ("weather.smog.scale_height_m", "weather.smog.visibility_m")
+    smog = edits.giving_way("weather.smog.extinction_per_m", others).recipe().weather.smog
+    assert smog is not None and (smog.extinction_per_m, smog.visibility_m) == (0.1, None)
+    assert Edits("clear").giving_way("seed", others) == Edits("clear")
+
+
+def test_a_saved_recipe_reads_back_with_its_files_and_replaces_none(tmp_path):
+    for blue in (40, 200):
+        photo = tmp_path / "uploads" / "photo.png"
+        photo.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(photo), np.random.default_rng(0).integers(0, blue, (9, 9, 3), np.uint8))
+        edits = Edits("clear", folder=tmp_path).with_values({
+            "style": '{"image": "uploads/photo.png"}', "render.scale": "0.5",
+        })  # fmt: skip
+        recipe, path = edits.recipe(), free_path(tmp_path, "mood", ".yaml").with_suffix(".yaml")
+        save_recipe(recipe, path)
+        assert load_recipe(path).resolve(0).hash == recipe.hash
+    assert sorted(p.name for p in tmp_path.glob("*.yaml")) == ["mood-2.yaml", "mood.yaml"]
+    assert load_recipe(tmp_path / "mood.yaml").resolve(0).style is not None
+
+
+# ---- Cameras -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("aspect", [0.5, 4 / 3, 3.0])
+def test_a_window_shows_a_cameras_pixels_where_its_own_pinhole_sees_them(aspect):
+    own = Camera("off", 160, 90, 80.0, 82.0, 70.0, 50.0, torch.eye(4, dtype=torch.float64))
+    place = place_in_window(own, aspect)
+    (width, height), tan = place.size, math.tan(place.fov_rad / 2)
+    for u, v in ((0, 0), (160, 0), (0, 90), (160, 90), (70, 50)):
+        x, y = (u - own.cx) / own.fx, (v - own.cy) / own.fy
+        across, down = (x / (tan * aspect) + 1) * width / 2, (y / tan + 1) * height / 2
+        assert abs(across - (u + place.left)) <= 1 and abs(down - (v + place.top)) <= 1
+    assert min(place.left, place.top) >= 0
+    assert place.left + 160 <= width and place.top + 90 <= height
+
+
+def test_a_flight_starts_with_the_recorded_cameras_pixels_and_pose():
+    scene = open_street()
+    own = scene.frames[0].cameras["front"]
+    pose = own.world_from_camera
+    from augment.geometry import quat_from_rotmat
+
+    wxyz = quat_from_rotmat(pose[:3, :3]).tolist()
+    fov = 2 * math.atan(own.height / 2 / own.fy)
+    free = free_camera(own, wxyz, pose[:3, 3].tolist(), fov, own.width / own.height)
+    assert (free.width, free.height) == (own.width, own.height)
+    assert free.fx == pytest.approx(own.fx) and free.timestamp_ns == own.timestamp_ns
+    torch.testing.assert_close(free.camera_from_world, own.camera_from_world)
+    torch.testing.assert_close(invert_rigid(free.camera_from_world), pose)
+
+
+# ---- Pages ---------------------------------------------------------------------------------------
+
+
+def rendered(folder: Path, command: str) -> np.ndarray:
+    """What a command line of the page writes."""
+    words = shlex.split(command)[1:]
+    words[words.index("--out") + 1] = str(folder)
+    assert main([*words, "--no-sheet", "--no-cache"]) == 0
+    (image,) = folder.glob("*/*/images/*/*.png")
+    return cv2.imread(str(image))[..., ::-1]
+
+
+def command_of(page: PageClient, begins: str) -> str:
+    """The command that the page shows, once it begins so."""
+    import html
+    import re
+
+    def look() -> str | None:
+        found = re.search(r"<textarea[^>]*>(.*?)</textarea>", page.status(), re.DOTALL)
+        text = html.unescape(found[1]) if found else ""
+        return text if text.startswith(begins) else None
+
+    return page.wait_for(look, begins)
+
+
+@pytest.mark.long
+def test_the_picture_at_rest_is_the_one_that_render_writes(tmp_path):
+    edits = Edits("clear", SCALE, folder=tmp_path / "views")
+    with served(edits) as (viewer, url), PageClient(url) as page:
+        page.rest(after=0)
+        count = len(page.pictures)
+        page.set("preset", "dense-fog")
+        page.set("smog/visibility_m", 40.0, 1)
+        shown = page.rest(after=count)
+        recipe = dataclasses.replace(edits, source="dense-fog").with_values(
+            {"weather.smog.visibility_m": "40.0"}
+        ).recipe()  # fmt: skip
+        camera = viewer.scene.frames[0].cameras["front"]
+        assert np.array_equal(shown, render_view(viewer.scene, camera, recipe).rgb)
+        copied = command_of(page, "climategs render dense-fog")
+        page.set("name", "mine")
+        page.press("Save picture")
+        saved = command_of(page, f"climategs render {tmp_path}")
+        written = cv2.imread(str(tmp_path / "views" / "mine.png"))[..., ::-1]
+    assert np.array_equal(written, shown)
+    assert np.array_equal(rendered(tmp_path / "copied", copied), shown)
+    assert np.array_equal(rendered(tmp_path / "saved", saved), shown)
+    assert load_recipe(tmp_path / "views" / "mine.yaml").resolve(0).hash != recipe.hash  # its name
+
+
+@pytest.mark.long
+def test_a_flight_is_repeated_by_the_command_line(tmp_path):
+    edits = Edits("clear", SCALE, folder=tmp_path)
+    with served(edits) as (_, url), PageClient(url) as page:
+        page.rest(after=0)
+        count = len(page.pictures)
+        page.move(position=[2.0, 0.5, 2.5], look_at=[12.0, 0.0, 1.0])
+        assert page.picture("while moving", after=count).shape[0] < 100
+        shown = page.rest(after=count)
+        page.press("Save picture")
+        saved = command_of(page, f"climategs render {tmp_path}")
+    picture = cv2.imread(str(tmp_path / "my-weather.png"))[..., ::-1]
+    assert "--camera-path" in saved and np.array_equal(rendered(tmp_path / "out", saved), picture)
+    # Shown before its pose went through a file.
+    assert np.abs(shown.astype(int) - picture).mean() < 0.1
+
+
+@pytest.mark.long
+def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten(tmp_path, dust):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url), PageClient(url) as one:
+        with PageClient(url, (320, 180)) as two:
+            clear, count = two.rest(after=0), len(one.pictures)
+            one.rest(after=0)
+            one.set("dust/on", True)
+            one.set("dust/half_m", 5.0, 0)
+            dusty = one.rest(after=count)
+            assert np.abs(dusty.astype(int) - clear).mean() > 10
+            assert two.widgets["dust/on"][0]["value"] is False
+            one.set("flood/on", True)
+            one.set("flood/waves/components", "[{")
+            one.wait_for(lambda: "color:#c92a2a" in one.status(), "the refusal")
+            count = len(one.pictures)
+            one.press("Undo all changes")
+            assert np.array_equal(one.rest(after=count), clear)
+            assert len(viewer.pages) == 2
+        one.wait_for(lambda: len(viewer.pages) == 1, "the other page to go")
+        count = len(one.pictures)
+        one.set("frame", 1)
+        assert not np.array_equal(one.rest(after=count), clear)
+
+
+@pytest.mark.long
+def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
+    edits = Edits("fresh-snow", folder=tmp_path)
+    with served(edits, LABELLED_STREET) as (viewer, url), PageClient(url) as page:
+        snow = page.rest(after=0)
+        for label in ("boxes", "LiDAR", "cameras"):
+            page.set(f"drawn over the picture/{label}", True)
+        others = [f"/cameras/{name}" for name in viewer.scene.camera_names if name != "front"]
+        wanted = {"/boxes", "/lidar", *others}
+        page.wait_for(lambda: wanted <= page.nodes, "what lies over the picture")
+        assert "/cameras/front" not in page.nodes  # which the window looks out of
+        assert page.pictures[-1][1]["depth_data"] is not None
+        page.set("drawn over the picture/LiDAR", False)
+        page.wait_for(lambda: "/lidar" not in page.nodes, "the returns to go")
+        seen = [snow]
+        for shows in ("depth", "classes", "instances", "splat ids", "mask of snow"):
+            count = len(page.pictures)
+            page.set("shows", shows)
+            seen.append(page.rest(after=count))
+            apart = (np.abs(seen[-1].astype(int) - other).mean() for other in seen[:-1])
+            assert min(apart) > 1, shows
+        count = len(page.pictures)
+        page.set("shows", "picture")
+        page.set("before and after/split", True)
+        both = page.rest(after=count)
+        middle = both.shape[1] // 2
+        assert np.array_equal(both[:, middle + 2 :], snow[:, middle + 2 :])
+        assert not np.array_equal(both[:, : middle - 2], snow[:, : middle - 2])
+        count = len(page.pictures)
+        page.set("play", True)
+        page.wait_for(lambda: page.widgets["frame"][0]["value"] == 1, "the next frame")
+        page.press("Measure the tiers on this view")
+        page.wait_for(
+            lambda: any("| reference |" in str(w) for ws in page.widgets.values() for w in ws),
+            "the tiers",
+        )
+
+
+# ---- The command ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--host", "203.0.113.7"], "no address of this machine"),
+        (["--recipe", "clera"], "clear"),
+        (["--set", "weather.smog.visibility=3"], "visibility_m"),
+        (["--port", "70000"], "port"),
+    ],
+)
+def test_what_cannot_be_viewed_is_refused_before_a_page_opens(options, why, capsys):
+    uri = "procedural:street?seed=3&frames=1&gaussians=60000&parked=0&moving=0&pedestrians=0"
+    assert main(["view", uri, *options]) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_without_viser_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ClimateGSError, match=r"pip install 'climategs\[view\]'"):
+        import_viser()
+
+
+def test_help_loads_neither_torch_nor_viser():
+    code = (
+        "import sys, tools.cli\n"
+        "try: tools.cli.main(['view', '--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'viser'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

@@ -1,0 +1,151 @@
+"""`climategs view` in a headless Chromium: what the browser has got, and what it asks for.
+
+Skipped where there is no Chromium. It draws without a GPU here, slowly.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from streets import SMALL_STREET, open_street
+from test_view import SCALE, rendered, served
+
+from augment.views import render_view
+from tools.view.edits import Edits
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine"),
+]
+WAIT_MS = 120_000
+# The background's image as the page got it, as a PNG in base 64; null while there is none.
+IMAGE = """() => {
+  const own = window.__viserMutable?.backgroundMaterial?.uniforms.colorMap.value?.image;
+  if (!own) return null;
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [own.width, own.height];
+  canvas.getContext("2d").drawImage(own, 0, 0);
+  return canvas.toDataURL("image/png").split(",")[1];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[sync_api.Browser]:
+    with sync_api.sync_playwright() as playwright:
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield browser
+        browser.close()
+
+
+def opened(browser: sync_api.Browser, url: str) -> sync_api.Page:
+    page = browser.new_page(viewport={"width": 1000, "height": 500})
+    page.set_default_timeout(WAIT_MS)
+    page.goto(url)
+    at_rest(page)
+    return page
+
+
+def at_rest(page: sync_api.Page) -> None:
+    page.wait_for_function("() => document.body.innerText.includes('at rest')")
+    page.wait_for_timeout(1500)
+    page.wait_for_function("() => document.body.innerText.includes('at rest')")
+
+
+def image_of(page: sync_api.Page) -> np.ndarray:
+    data = np.frombuffer(base64.b64decode(page.evaluate(IMAGE)), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def within(image: np.ndarray, picture: np.ndarray) -> bool:
+    """Whether the image is the picture with bars around it."""
+    found = cv2.matchTemplate(image, picture, cv2.TM_SQDIFF)
+    top, left = np.unravel_index(found.argmin(), found.shape)
+    height, width = picture.shape[:2]
+    return np.array_equal(image[top : top + height, left : left + width], picture)
+
+
+def test_a_browser_shows_render_views_bytes_and_saves_what_render_repeats(browser, tmp_path):
+    edits = Edits("dense-fog", SCALE, folder=tmp_path / "views")
+    with served(edits) as (viewer, url):
+        page = opened(browser, url)
+        camera = viewer.scene.frames[0].cameras["front"]
+        assert within(image_of(page), render_view(viewer.scene, camera, edits.recipe()).rgb)
+        page.get_by_text("smog", exact=True).click()
+        number = page.get_by_label("visibility_m").nth(1)
+        number.fill("30")
+        number.press("Enter")
+        page.get_by_role("slider").nth(2).press("ArrowRight")  # scatter, at the folder's end
+        at_rest(page)
+        page.get_by_role("tab", name="Save").click()
+        page.get_by_role("button", name="Save picture").click()
+        page.get_by_text("Saved my-weather").wait_for()
+        command = page.locator("textarea").input_value()
+        saved = cv2.imread(str(tmp_path / "views" / "my-weather.png"))[..., ::-1]
+        assert within(image_of(page), saved)
+        page.close()
+    text = (tmp_path / "views" / "my-weather.yaml").read_text()
+    assert "visibility_m: 30" in text
+    assert np.array_equal(rendered(tmp_path / "out", command), saved)
+
+
+def test_two_tabs_fly_apart_and_a_killed_one_leaves_the_other(browser, tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url):
+        one, two = opened(browser, url), opened(browser, url)
+        before = image_of(two)
+        one.mouse.move(300, 250)
+        one.mouse.down()
+        for step in range(10):
+            one.mouse.move(300 + 8 * step, 250)
+        one.mouse.up()
+        at_rest(one)
+        flown = image_of(one)
+        assert flown.shape != before.shape or np.abs(flown.astype(int) - before).mean() > 3
+        assert np.array_equal(image_of(two), before)
+        one.close()
+        for _ in range(600):
+            if len(viewer.pages) == 1:
+                break
+            time.sleep(0.1)
+        assert len(viewer.pages) == 1
+        two.get_by_role("tab", name="View").click()
+        two.get_by_role("slider").first.press("ArrowRight")  # the frame's
+        at_rest(two)
+        assert not np.array_equal(image_of(two), before)
+        two.close()
+
+
+def test_the_command_serves_until_it_is_interrupted(browser, tmp_path):
+    command = [sys.executable, "-m", "tools.cli", "view", SMALL_STREET, "--scale", str(SCALE)]
+    root = Path(__file__).resolve().parents[2]
+    with subprocess.Popen(
+        [*command, "--port", "0", "--no-cache", "--out", str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=root,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        said = []
+        for line in process.stdout:
+            said.append(line)
+            if "Ctrl-C" in line:
+                break
+        url = said[-1].split()[1]
+        page = opened(browser, url)
+        assert image_of(page).shape[0] > 50
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        rest = process.stdout.read()
+        assert "Traceback" not in rest, rest
+        page.close()
+    assert open_street().name in said[-1]

@@ -1,0 +1,158 @@
+"""What a page has changed of a recipe: texts of `--set`, so that a command line says the same."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from augment.jobs.atomic import write_atomic
+from augment.jobs.render_job import copy_files, portable_recipe
+from recipes.errors import RecipeError
+from recipes.fields import found, replaced
+from recipes.job import scaled_recipe
+from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
+from recipes.schema import Recipe, Sensor
+from tools.view.controls import start_of_model
+
+
+def as_yaml(value: Any) -> str:
+    """A plain value on one line, which YAML reads as the same."""
+    return json.dumps(value)
+
+
+@dataclass(frozen=True)
+class Edits:
+    """A recipe and the changes to it.
+
+    source: a preset, or a file's path. scale: resolution relative to the recipe's. values: YAML by
+    dotted path. added: sections that the source lacks, as YAML. absent: sections taken out, whose
+    values are kept for their return. folder: where uploaded files lie, which values name.
+    """
+
+    source: str
+    scale: float = 1.0
+    values: Mapping[str, str] = field(default_factory=dict)
+    added: Mapping[str, str] = field(default_factory=dict)
+    absent: frozenset[str] = frozenset()
+    folder: Path = field(default_factory=Path)
+
+    def with_values(self, values: Mapping[str, str]) -> Edits:
+        return replace(self, values={**self.values, **values})
+
+    def with_tier(self, tier: str | None) -> Edits:
+        """In place of whatever quality the source asks for."""
+        asked = {"tier": as_yaml(tier), "max_flip": "null", "budget_ms": "null"}
+        return self.with_values({f"quality.{name}": text for name, text in asked.items()})
+
+    def with_section(self, section: str) -> Edits:
+        """The effect is there: as it was, as the source has it, or with values to start from."""
+        there = replace(self, absent=self.absent - {section})
+        if found(there.recipe(), section) is not None:
+            return there
+        start = as_yaml(start_of_section(section))
+        return replace(there, added={**self.added, section: start})
+
+    def without_section(self, section: str) -> Edits:
+        return replace(self, absent=self.absent | {section})
+
+    def sets(self) -> list[str]:
+        """FIELD=VALUE as `--set` takes them, in order."""
+        gone = tuple(f"{section}." for section in self.absent)
+        added = {path: text for path, text in self.added.items() if path not in self.absent}
+        values = {path: text for path, text in self.values.items() if not path.startswith(gone)}
+        absent = dict.fromkeys(sorted(self.absent), "null")
+        return [f"{path}={text}" for path, text in {**added, **values, **absent}.items()]
+
+    def recipe(self) -> Recipe:
+        """In numbers.
+
+        Raises:
+            RecipeError: what comes out is no valid recipe.
+        """
+        overrides = read_overrides(self.sets(), "changed", folder=self.folder)
+        return scaled_recipe(load_recipe(self.source, overrides).resolve(0), self.scale)
+
+    def giving_way(self, changed: str, others: tuple[str, ...]) -> Edits:
+        """The edits if they are valid, else without the first of the other fields that contradicts
+        the changed one, such as the other of two densities.
+        """
+        try:
+            self.recipe()
+        except RecipeError:
+            for other in others:
+                edits = self.with_values({other: "null"})
+                try:
+                    edits.recipe()
+                except RecipeError:
+                    continue
+                return edits if other != changed else self
+        return self
+
+    def command(self, where: str) -> str:
+        """The command line that renders this. where: its scene, frames and cameras."""
+        sets = " ".join(f"--set {shlex.quote(text)}" for text in self.sets())
+        scale = "" if self.scale == 1 else f"--scale {self.scale:g}"
+        words = ("climategs render", shlex.quote(self.source), sets, scale, "--variants 1", where)
+        return " ".join(word for word in words if word)
+
+
+def start_of_section(section: str) -> dict[str, Any]:
+    """Values to start an effect with: those of the plainest preset that has it, or else the middle
+    of what its fields allow.
+    """
+    found_in = []
+    for name in preset_names():
+        recipe = load_recipe(name).resolve(0)
+        own = found(recipe, section)
+        if own is not None:
+            start = own.model_dump(mode="json", exclude_defaults=True)
+            found_in.append((len(recipe.sections()), len(start), name, start))
+    if found_in:
+        return _short(min(found_in, key=lambda entry: entry[:3])[3])
+    return start_of_model(section)
+
+
+def _short(value: Any) -> Any:
+    """Floats of three digits: a preset's draws have ten."""
+    if isinstance(value, dict):
+        return {name: _short(below) for name, below in value.items()}
+    if isinstance(value, list):
+        return [_short(item) for item in value]
+    return float(f"{value:.3g}") if isinstance(value, float) else value
+
+
+def without_weather(recipe: Recipe) -> Recipe:
+    """The same picture before any effect, through a clean camera."""
+    for section in recipe.sections():
+        recipe = replaced(recipe, section, None)
+    return recipe.model_copy(update={"camera": Sensor()})
+
+
+def save_recipe(recipe: Recipe, path: Path) -> None:
+    """Writes a recipe in numbers, and its files in a folder of the recipe's name beside it.
+
+    Raises:
+        RecipeError: a file of the recipe cannot be read, or is not that of its digest.
+        OutputError: the folder cannot be written.
+    """
+    beside = path.with_suffix("")
+    portable = portable_recipe(recipe)
+    for section, own in portable.sections().items():
+        for name, file in own.files.items():
+            portable = replaced(portable, f"{section}.{name}", f"{beside.name}/{file}")
+    copy_files(recipe, beside)
+    write_atomic(path, dump_recipe(portable).encode())
+
+
+def free_path(folder: Path, name: str, *endings: str) -> Path:
+    """FOLDER/NAME, or NAME-2, NAME-3, ... where there is already a file with one of the endings."""
+    for number in itertools.count(1):
+        path = folder / (name if number == 1 else f"{name}-{number}")
+        if not any(path.with_name(path.name + ending).exists() for ending in ("", *endings)):
+            return path
+    raise AssertionError

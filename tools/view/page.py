@@ -1,0 +1,547 @@
+"""One client's page: its widgets, what they ask for, and what has been drawn for it."""
+
+from __future__ import annotations
+
+import html
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from augment.cameras import Camera, Frame
+from augment.geometry import quat_from_rotmat
+from augment.scene import Scene
+from augment.trust import unfitted_cameras
+from recipes.errors import RecipeError
+from recipes.fields import found
+from recipes.load import describe_preset, preset_names
+from recipes.schema import TIERS, Recipe
+from tools.view.controls import Control, Group, effect_groups, group_of
+from tools.view.edits import Edits, as_yaml, free_path
+from tools.view.fields import NONE, Field
+from tools.view.pictures import (
+    PICTURE,
+    box_lines,
+    depth_of_page,
+    free_camera,
+    place_in_window,
+    what_can_be_shown,
+)
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+    from tools.view.server import Viewer
+
+REST_S = 0.15  # without a change, after which the whole picture is drawn
+PLAY_S = 0.1  # from frame to frame
+POSE_M, POSE_RAD = 0.01, 0.002  # a camera that is nearer to where it was put has not been moved
+ECHO_S = 3.0  # that a window gets to say that it is where it was put
+LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera around
+FRAME_S = 0.09  # what a picture may take while something moves
+FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
+MAX_NAME = 64
+_TEXT = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
+_ERROR = f"color:#c92a2a;{_TEXT}"
+
+
+@dataclass(frozen=True)
+class FreePose:
+    """Where a flight has got to: world_from_camera."""
+
+    wxyz: tuple[float, ...]
+    position: tuple[float, ...]
+    fov_rad: float
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a page asks to see. frame: a position in the scene's frames. pose: None for the recorded
+    camera's. share: where the line of a split picture stands.
+    """
+
+    edits: Edits
+    frame: int
+    camera: str
+    pose: FreePose | None = None
+    shows: str = PICTURE
+    boxes: bool = False
+    lidar: bool = False
+    frustums: bool = False
+    is_split: bool = False
+    share: float = 0.5
+    every_pixel: bool = False
+    is_playing: bool = False
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether something is drawn over the picture that it can hide."""
+        return self.boxes or self.lidar or self.frustums
+
+
+@dataclass
+class Progress:
+    """What has been drawn of a page's wishes, which count up. last: when the last one came."""
+
+    wished: int = 1
+    drawn: int = 0
+    rested: int = 0
+    last: float = 0.0
+    factor: float = FACTORS[1]
+    tasks: deque[Callable[[], None]] = field(default_factory=deque)
+
+
+class Page:
+    """All methods but those that the viewer's thread calls (`show_*`) are called on the server's
+    event loop.
+    """
+
+    def __init__(self, viewer: Viewer, client: ClientHandle) -> None:
+        self.viewer, self.client, self.gui = viewer, client, client.gui
+        self.progress, self.is_closed = Progress(), False
+        self.wish = Wish(viewer.edits, 0, first_camera(viewer.scene, viewer.frames[0]))
+        self.before: tuple[Any, np.ndarray] | None = None  # the picture without weather, by view
+        self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
+        self._poses: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=30)
+        self._window = (0, 0)
+        self._put_at = 0.0  # when; 0 once the window has said that it is there
+        self.overlaid: Any = None  # what is drawn over the picture
+        self._overlays: dict[str, Any] = {}
+        self._good: Recipe | None = None
+        self._resolved: tuple[Edits, Recipe | RecipeError] | None = None
+        self._fields: dict[str, Field] = {}
+        self._there: dict[str, Any] = {}
+        self._build()
+        self._show_values()
+        self._to_camera()
+        client.camera.on_update(self._on_camera)
+
+    # ---- The recipe ------------------------------------------------------------------------------
+
+    def recipe(self, edits: Edits) -> Recipe:
+        """In numbers; RecipeError where the edits make none."""
+        if self._resolved is None or self._resolved[0] is not edits:
+            try:
+                self._resolved = (edits, edits.recipe())
+            except RecipeError as error:
+                self._resolved = (edits, error)
+        resolved = self._resolved[1]
+        if isinstance(resolved, RecipeError):
+            raise resolved
+        self._good = resolved
+        return resolved
+
+    @property
+    def good_recipe(self) -> Recipe | None:
+        """The last one that was valid."""
+        return self._good
+
+    def camera_of(self, wish: Wish) -> Camera:
+        """Before the recipe's scale."""
+        recorded, pose = self.recorded_camera(wish), wish.pose
+        if pose is None:
+            return recorded
+        return free_camera(recorded, pose.wxyz, pose.position, pose.fov_rad, self.aspect)
+
+    def frame_of(self, wish: Wish) -> Frame:
+        return self.viewer.frames[wish.frame]
+
+    def recorded_camera(self, wish: Wish) -> Camera:
+        cameras = self.frame_of(wish).cameras
+        return cameras.get(wish.camera) or next(iter(cameras.values()))
+
+    @property
+    def aspect(self) -> float:
+        width, height = self._window
+        return width / height if width and height else 16 / 9
+
+    @property
+    def window_height(self) -> int:
+        return self._window[1] or 720
+
+    # ---- Wishes ----------------------------------------------------------------------------------
+
+    def ask(self, **changes: Any) -> None:
+        """Wish for something else; the viewer's thread draws the latest wish."""
+        with self.viewer.changed:
+            self.wish = replace(self.wish, **changes)
+            self.progress.wished += 1
+            self.progress.last = time.monotonic()
+            self.viewer.changed.notify()
+
+    def do(self, task: Callable[[], None]) -> None:
+        """Have the viewer's thread do something between two pictures."""
+        with self.viewer.changed:
+            self.progress.tasks.append(task)
+            self.viewer.changed.notify()
+
+    def edit(self, edits: Edits, *, show: bool = False) -> None:
+        self.ask(edits=edits)
+        if show:
+            self._show_values()
+
+    def _on_change(self, control: Control, text: str) -> None:
+        edits = self.wish.edits.with_values({control.path: text})
+        if not control.nullable or text == "null":
+            self.edit(edits)
+            return
+        section = control.path.rpartition(".")[0]
+        siblings = (f for path, f in self._fields.items() if path.rpartition(".")[0] == section)
+        others = tuple(
+            f.control.path for f in siblings if f.control.nullable and f.control != control
+        )
+        given = edits.giving_way(control.path, others)
+        self.edit(given, show=given != edits)
+
+    def _on_upload(self, control: Control, name: str, content: bytes) -> None:
+        safe = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).name)[-MAX_NAME:].lstrip(".") or "file"
+        path = free_path(self.viewer.out / "uploads", safe)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        relative = str(path.relative_to(self.viewer.out))
+        edits = self.wish.edits.with_values({control.path: as_yaml(relative)})
+        others = tuple(c.path for g in self.groups for c in g.walk() if c.nullable and c != control)
+        section = control.path.rpartition(".")[0]
+        others = tuple(path for path in others if path.rpartition(".")[0] == section)
+        self.edit(edits.giving_way(control.path, others), show=True)
+
+    def _on_open(self, name: str, content: bytes) -> None:
+        stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME] or "recipe"
+        path = free_path(self.viewer.out / "opened", stem, ".yaml").with_suffix(".yaml")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        self._take(str(path))
+
+    def _take(self, source: str) -> None:
+        """Another recipe, without changes."""
+        edits = Edits(source, self.wish.edits.scale, folder=self.viewer.out)
+        self.edit(edits, show=True)
+
+    # ---- The camera ------------------------------------------------------------------------------
+
+    def _to_camera(self) -> None:
+        """Put the window where the recorded camera was."""
+        camera = self.recorded_camera(self.wish)
+        pose = camera.world_from_camera.numpy()
+        own, position = self.client.camera, pose[:3, 3]
+        self._poses.append((position, pose[:3, :3]))
+        self._put_at = time.monotonic()
+        with self.client.atomic():
+            own.position = position
+            own.look_at = position + LOOK_M * pose[:3, 2]
+            own.up_direction = -pose[:3, 1]
+            own.fov = place_in_window(camera, self.aspect).fov_rad
+
+    def _land(self, camera: str) -> None:
+        """End a flight at a recorded camera."""
+        self.ask(camera=camera, pose=None)
+        self._to_camera()
+
+    async def _on_camera(self, camera: Any) -> None:
+        is_resized = self._resize(camera.image_width, camera.image_height)
+        wxyz = np.asarray(camera.wxyz, float)
+        is_put = any(_is_near(wxyz, camera.position, *pose) for pose in self._poses)
+        if self.wish.pose is None and is_put:
+            self._put_at = 0.0
+            if is_resized:
+                self._to_camera()
+                self.ask()
+        elif time.monotonic() - self._put_at > ECHO_S:  # until then it may be from before
+            self._poses.clear()
+            pose = FreePose(tuple(wxyz), tuple(map(float, camera.position)), float(camera.fov))
+            if pose != self.wish.pose or is_resized:
+                self.ask(pose=pose)
+
+    def _resize(self, width: int, height: int) -> bool:
+        """Whether the window has another shape, or more pixels than ever in this shape: a browser
+        that is slow takes fewer for a while.
+        """
+        old_width, old_height = self._window
+        same_shape = abs(width * old_height - height * old_width) <= 2 * max(width, old_width)
+        if same_shape and height <= old_height:
+            return False
+        self._window = (width, height)
+        return True
+
+    # ---- Widgets ---------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        gui = self.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        gui.main_panel.dock_right()  # beside the picture
+        gui.set_panel_label(f"ClimateGS: {self.viewer.scene.name}")
+        self._status = gui.add_html("")
+        self._error = gui.add_html("", visible=False)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Weather"):
+            self._build_recipe()
+            for group in self.groups[:-2]:
+                self._build_group(group)
+        with tabs.add_tab("View"):
+            self._build_view()
+        with tabs.add_tab("Quality"):
+            self._build_quality()
+            for group in self.groups[-2:]:
+                self._build_group(group)
+        with tabs.add_tab("Plan"):
+            self._plan = gui.add_markdown("")
+        with tabs.add_tab("Save"):
+            self._build_save()
+
+    def _build_recipe(self) -> None:
+        gui, names = self.gui, preset_names()
+        hint = "; ".join(f"{name}: {describe_preset(name)}" for name in names)
+        source = self.wish.edits.source
+        options = names if source in names else (source, *names)
+        preset = gui.add_dropdown("preset", options, initial_value=source, hint=hint)
+        opened = gui.add_upload_button("Open a recipe", mime_type=".yaml,.yml")
+        undo = gui.add_button("Undo all changes")
+        self._seed = gui.add_number("seed", 0, min=0, max=2**53 - 1, step=1)
+        hint = "Which draw from the recipe's ranges."
+        self._variant = gui.add_number("variant", 0, min=0, max=2**31 - 1, step=1, hint=hint)
+
+        @preset.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._take(event.target.value)
+
+        @undo.on_click
+        async def _(_: Any) -> None:
+            self._take(self.wish.edits.source)
+
+        @opened.on_upload
+        async def _(event: Any) -> None:
+            self._on_open(event.target.value.name, event.target.value.content)
+
+        for name, part in (("seed", self._seed), ("variant", self._variant)):
+
+            @part.on_update
+            async def _(event: Any, name: str = name) -> None:
+                if event.client is not None:
+                    number = as_yaml(int(event.target.value))
+                    self.edit(self.wish.edits.with_values({name: number}), show=name == "variant")
+
+    def _build_group(self, group: Group) -> None:
+        """A folder; of an effect with a switch."""
+        gui = self.gui
+        with gui.add_folder(group.label, expand_by_default=False):
+            if group.optional:
+                switch = self._there[group.path] = gui.add_checkbox("on", False, hint=group.hint)
+
+                @switch.on_update
+                async def _(event: Any) -> None:
+                    if event.client is not None:
+                        edits, path = self.wish.edits, group.path
+                        there = event.target.value
+                        change = edits.with_section if there else edits.without_section
+                        self.edit(change(path), show=there)
+
+            for control in group.controls:
+                own = Field(gui, control, self._on_change, self._on_upload)
+                self._fields[control.path] = own
+            for inner in group.groups:
+                self._build_group(inner)
+
+    def _build_view(self) -> None:
+        gui, frames = self.gui, self.viewer.frames
+        last = max(len(frames) - 1, 1)
+        hint = "Which frame of the drive, counted from 0."
+        self._time = gui.add_slider("frame", 0, last, 1, 0, hint=hint, disabled=len(frames) == 1)
+        play = gui.add_checkbox("play", False)
+        camera = gui.add_dropdown("camera", self.viewer.scene.camera_names)
+        camera.value = self.wish.camera
+        back = gui.add_button("Back to the camera")
+        shows = gui.add_dropdown("shows", what_can_be_shown())
+        gui.add_markdown(
+            "Fly: drag to turn, right drag to move, wheel to go ahead; **W A S D**, **Q E** and "
+            "the arrow keys."
+        )
+
+        @self._time.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self.go_to_frame(event.target.value)
+
+        @camera.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._land(event.target.value)
+
+        @back.on_click
+        async def _(_: Any) -> None:
+            self._land(self.wish.camera)
+
+        with gui.add_folder("before and after"):
+            self._toggle("split", "is_split", "Left of the line the scene without its weather.")
+            line = gui.add_slider("line", 0.0, 1.0, 0.005, self.wish.share)
+        with gui.add_folder("drawn over the picture"):
+            self._toggle("boxes", "boxes", "Labelled boxes of the frame.")
+            hint = "The sweep as the weather leaves it. Cyan: unchanged; yellow: attenuated; "
+            self._toggle("LiDAR", "lidar", hint + "red: scattered by the air; magenta: moved.")
+            self._toggle("cameras", "frustums", "The frame's cameras.")
+        hint = "Draw what `climategs render` writes, though the window shows less."
+        self._toggle("every pixel", "every_pixel", hint)
+        self._hear(play, "is_playing")
+        self._hear(shows, "shows")
+        self._hear(line, "share")
+
+    def _toggle(self, label: str, name: str, hint: str) -> None:
+        self._hear(self.gui.add_checkbox(label, False, hint=hint), name)
+
+    def _hear(self, part: Any, name: str) -> None:
+        @part.on_update
+        async def _(event: Any) -> None:
+            self.ask(**{name: event.target.value})
+
+    def _build_quality(self) -> None:
+        gui = self.gui
+        hint = "Settings of all that trades speed for accuracy and that the recipe does not give."
+        self._tier = gui.add_dropdown("tier", (NONE, *TIERS, "reference"), hint=hint)
+        measure = gui.add_button("Measure the tiers on this view")
+        self._tiers = gui.add_markdown("")
+
+        @self._tier.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                word = event.target.value
+                self.edit(self.wish.edits.with_tier(None if word == NONE else word), show=True)
+
+        @measure.on_click
+        async def _(_: Any) -> None:
+            self._tiers.content = "measuring"
+            self.do(lambda: self.viewer.measure_tiers(self))
+
+    def _build_save(self) -> None:
+        gui = self.gui
+        self._name = gui.add_text("name", "my-weather", hint="Of the recipe and of its files.")
+        recipe = gui.add_button("Save recipe")
+        picture = gui.add_button("Save picture")
+        gui.add_markdown(f"Into the folder `{self.viewer.out}`. Nothing is replaced.")
+        self._saved = gui.add_html("")
+        self._command = gui.add_html("")
+
+        @recipe.on_click
+        async def _(_: Any) -> None:
+            self.do(lambda: self.viewer.save(self, self._name.value, with_picture=False))
+
+        @picture.on_click
+        async def _(_: Any) -> None:
+            self.do(lambda: self.viewer.save(self, self._name.value, with_picture=True))
+
+    def go_to_frame(self, number: int) -> None:
+        self.ask(frame=number)
+        if self.wish.pose is None:
+            self._to_camera()
+
+    def _show_values(self) -> None:
+        """Have all widgets stand at the recipe's values."""
+        try:
+            recipe = self.recipe(self.wish.edits)
+        except RecipeError as error:
+            self.show_error(str(error))
+            return
+        for path, switch in self._there.items():
+            switch.value = found(recipe, path) is not None
+        for path, own in self._fields.items():
+            if found(recipe, path.rpartition(".")[0]) is not None:
+                own.show(found(recipe, path))
+        self._seed.value = min(recipe.seed, 2**53 - 1)
+        self._variant.value = recipe.variant
+        self._tier.value = recipe.quality.tier or NONE
+
+    # ---- Shown by the viewer's thread ------------------------------------------------------------
+
+    def show_status(self, text: str) -> None:
+        self._status.content = f'<b style="padding:0 0.7em">{html.escape(text)}</b>'
+
+    def show_error(self, text: str | None) -> None:
+        """None: there is none any more."""
+        if text is None and not self._error.visible:
+            return
+        lines = "<br>".join(map(html.escape, (text or "").splitlines()))
+        self._error.content = f'<div style="{_ERROR}">{lines}</div>'
+        self._error.visible = text is not None
+
+    def show_plan(self, text: str) -> None:
+        if self._plan.content != text:
+            self._plan.content = text
+
+    def show_tiers(self, text: str) -> None:
+        self._tiers.content = text
+
+    def show_saved(self, text: str, command: str) -> None:
+        self._saved.content = f'<p style="{_TEXT}">{html.escape(text)}</p>'
+        self.show_command(command)
+
+    def show_command(self, command: str) -> None:
+        content = (
+            f'<div style="{_TEXT}">'
+            '<textarea readonly rows="6" style="width:100%;font:11px monospace">'
+            f"{html.escape(command)}</textarea>"
+            '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.value)">'
+            "Copy command</button></div>"
+        )
+        if self._command.content != content:
+            self._command.content = content
+
+    def show_picture(self, rgb: np.ndarray, depth_m: np.ndarray | None, *, moving: bool) -> None:
+        """Lossless at rest."""
+        depth = None if depth_m is None else depth_of_page(depth_m)
+        kind = "jpeg" if moving else "png"
+        self.client.scene.set_background_image(rgb, kind, jpeg_quality=80, depth=depth)
+
+    def show_overlays(self, wish: Wish, points: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Boxes, cameras and LiDAR returns over the picture, or none of them."""
+        scene, frame = self.viewer.scene, self.frame_of(wish)
+        for handle in self._overlays.values():
+            handle.remove()
+        self._overlays = {}
+        api = self.client.scene
+        if wish.boxes:
+            lines, colors = box_lines(scene, frame)
+            if len(lines):
+                own = {"thickness": 2.0, "thickness_units": "screen"}
+                self._overlays["boxes"] = api.add_line_segments("/boxes", lines, colors, **own)
+        if points is not None:
+            own = {"point_size": 0.02, "precision": "float32", "point_shading": "flat"}
+            self._overlays["lidar"] = api.add_point_cloud("/lidar", *points, **own)
+        for name, camera in frame.cameras.items() if wish.frustums else ():
+            if wish.pose is None and camera is self.recorded_camera(wish):
+                continue  # the window looks out of it
+            pose = camera.world_from_camera
+            self._overlays[name] = api.add_camera_frustum(
+                f"/cameras/{name}",
+                fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
+                aspect=camera.width / camera.height,
+                scale=0.5,
+                thickness=0.01,
+                color=(255, 160, 0),
+                wxyz=quat_from_rotmat(pose[:3, :3]).numpy(),
+                position=pose[:3, 3].numpy(),
+            )
+
+    def advance(self) -> None:
+        """To the next frame of a drive that is played."""
+        number = (self.wish.frame + 1) % len(self.viewer.frames)
+        self._time.value = number
+        self.go_to_frame(number)
+
+
+def first_camera(scene: Scene, frame: Frame) -> str:
+    """The one that looks ahead, of those that the scene was made from."""
+    left_out = unfitted_cameras(scene)
+    names = [name for name in frame.cameras if name not in left_out] or list(frame.cameras)
+    return min(names, key=lambda name: ("front" not in name, len(name)))
+
+
+def _is_near(wxyz: np.ndarray, position: np.ndarray, put_at: np.ndarray, put: np.ndarray) -> bool:
+    """Whether a pose is within POSE_M and POSE_RAD of one that the window was put at."""
+    w, x, y, z = wxyz
+    ahead = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    turned = float(np.linalg.norm(ahead - put[:, 2]))
+    return float(np.linalg.norm(position - put_at)) < POSE_M and turned < POSE_RAD

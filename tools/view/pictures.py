@@ -1,0 +1,255 @@
+"""What a page shows: the camera behind a window, pictures of a view, and what lies over them."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from augment import effects
+from augment.boxes import EDGES, PlacedBoxes
+from augment.cameras import Camera, Frame
+from augment.effects.lidar.codes import CODE_COLUMN, drop_lost
+from augment.effects.lidar.sweep import weathered_sweep
+from augment.geometry import invert_rigid, rigid, rotmat_from_quat
+from augment.jobs.layout import TRUST
+from augment.plan import make_plan
+from augment.render.buffers import AUTO, SPLAT_IDS
+from augment.scene import Scene
+from augment.semantics import SemanticClass
+from augment.views import render_buffers, render_view
+from recipes.fields import replaced
+from recipes.schema import Recipe
+
+FAR_M = 167.0  # the most that the page's depth can say
+BAR, BAR_M = 24, 0.05  # of what a recorded camera does not show: its grey; it hides all beyond
+MAX_DEPTH_M = 100.0  # the end of the colours of depth
+PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS = (
+    "picture", "depth", "classes", "instances", "splat ids",
+)  # fmt: skip
+MOVING = {"transmittance_stop": 0.01, "radius_clip_px": 1.0}  # at least, while something moves
+
+
+# ---- Which camera is behind the window -----------------------------------------------------------
+
+
+class Place(NamedTuple):
+    """Where a camera's image lies in a window. fov_rad: the window's, vertical. size: of the window
+    in pixels of the image, width first. left, top: of the image in it.
+    """
+
+    fov_rad: float
+    size: tuple[int, int]
+    left: int
+    top: int
+
+
+def place_in_window(camera: Camera, aspect: float) -> Place:
+    """The smallest window that holds the camera's whole image, looking along its axis.
+
+    A window's principal point is its middle and a camera's need not be, so there are bars; then
+    what is drawn over the image in the window is where the image shows it. aspect: width by height.
+    """
+    tan_x = max(camera.cx, camera.width - camera.cx) / camera.fx
+    tan_y = max(camera.cy, camera.height - camera.cy) / camera.fy
+    tan = max(tan_y, tan_x / aspect)
+    width = max(camera.width, round(2 * tan * aspect * camera.fx))
+    height = max(camera.height, round(2 * tan * camera.fy))
+    left = min(max(round(width / 2 - camera.cx), 0), width - camera.width)
+    top = min(max(round(height / 2 - camera.cy), 0), height - camera.height)
+    return Place(2 * math.atan(tan), (width, height), left, top)
+
+
+def free_camera(
+    recorded: Camera,
+    wxyz: Iterable[float],
+    position: Iterable[float],
+    fov_rad: float,
+    aspect: float,
+) -> Camera:
+    """A camera at any pose, with the pixels, the colours and the moment of a recorded one.
+
+    wxyz, position: world_from_camera of the scene's world, OpenCV axes. fov_rad: vertical.
+    """
+    quat = torch.tensor([*wxyz], dtype=torch.float64)
+    pose = rigid(rotmat_from_quat(quat), torch.tensor([*position], dtype=torch.float64))
+    tan = math.tan(fov_rad / 2)
+    height = max(1, round(2 * tan * recorded.fy))
+    width = max(1, round(height * aspect))
+    focal = height / 2 / tan
+    return replace(
+        recorded,
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        camera_from_world=invert_rigid(pose),
+    )
+
+
+# ---- Pictures ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """rgb: uint8 [H, W, 3], the picture or what stands for it. depth_m: z, 0 where there is none;
+    None where nobody asked.
+    """
+
+    rgb: np.ndarray
+    depth_m: np.ndarray | None
+
+
+def what_can_be_shown() -> tuple[str, ...]:
+    masks = (f"mask of {e.mask}" for e in effects.EFFECTS if e.mask is not None)
+    return (PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS, *masks, f"mask of {TRUST}")
+
+
+def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: float) -> Recipe:
+    """The recipe with what is shown in its output, at `factor` times its resolution; the picture
+    has the same bits, at factor 1.
+    """
+    output = recipe.output
+    depth = output.depth if output.depth != "none" else "median"
+    output = output.model_copy(
+        update={
+            "depth": depth if with_depth or shows == DEPTH else "none",
+            "semantic": shows == CLASSES,
+            "instance": shows == INSTANCES,
+            "labels": shows == INSTANCES,
+            "trust": shows == f"mask of {TRUST}",
+        }
+    )
+    recipe = recipe.model_copy(update={"output": output})
+    return replaced(recipe, "render.scale", recipe.render.scale * factor)
+
+
+def coarse(recipe: Recipe) -> Recipe:
+    """The recipe with the shortcuts of the rasteriser that a moving picture hides; none that has
+    anything prepared anew.
+    """
+    for name, value in MOVING.items():
+        value = max(value, getattr(recipe.render, name))
+        recipe = replaced(recipe, f"render.{name}", value)
+    return recipe
+
+
+def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO) -> Shown:
+    """camera: before recipe.render.scale. recipe: of recipe_to_show."""
+    if shows == SPLATS:
+        return _draw_splat_ids(scene, camera, recipe, backend)
+    view = render_view(scene, camera, recipe, backend=backend)
+    rgb = view.rgb
+    if shows == DEPTH and view.depth_m is not None:
+        rgb = color_depth(view.depth_m)
+    elif shows == CLASSES and view.semantic is not None:
+        rgb = _CLASS_COLORS[view.semantic]
+    elif shows == INSTANCES and view.instance is not None:
+        rgb = np.where(view.instance[..., None] > 0, color_numbers(view.instance), rgb // 3)
+    elif shows.startswith("mask of "):
+        mask = view.masks.get(shows.removeprefix("mask of "))
+        rgb = rgb // 3 if mask is None else np.where(mask[..., None] > 0, rgb, rgb // 3)
+    return Shown(rgb, view.depth_m)
+
+
+def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> Shown:
+    plan = make_plan(replaced(recipe, "output.semantic", True), scene)
+    view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
+    ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
+    rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)
+    depth = None if view.depth_m is None else view.depth_m.float().cpu().numpy()
+    return Shown(rgb, depth)
+
+
+def color_depth(depth_m: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3]: near is red, 100 m and more blue, by the logarithm; black where none is."""
+    share = np.log(np.maximum(depth_m, 1.0)) / math.log(MAX_DEPTH_M)
+    grey = (255 * (1 - np.clip(share, 0, 1))).astype(np.uint8)
+    rgb = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    return np.where(depth_m[..., None] > 0, rgb, 0)
+
+
+def color_numbers(numbers: np.ndarray) -> np.ndarray:
+    """uint8 [..., 3]: neighbours in number are far apart in colour."""
+    hashed = numbers.astype(np.uint32) * np.uint32(2654435761)
+    hashed ^= hashed >> np.uint32(15)
+    return np.stack([64 + (hashed >> np.uint32(s)) % 192 for s in (0, 8, 16)], -1).astype(np.uint8)
+
+
+def _class_colors() -> np.ndarray:
+    """[256, 3]: of every class its own hue; grey where it is not known."""
+    colors = np.full((256, 3), 90)
+    for number, kind in enumerate(kinds := list(SemanticClass)[1:]):
+        hue = number / len(kinds)
+        rgb = colorsys.hsv_to_rgb(hue, 0.75 - 0.35 * (number % 2), 0.95)
+        colors[int(kind)] = [round(255 * channel) for channel in rgb]
+    return colors.astype(np.uint8)
+
+
+_CLASS_COLORS = _class_colors()
+
+
+def in_window(shown: Shown, place: Place) -> Shown:
+    """The image with the window's bars around it."""
+    height, width = shown.rgb.shape[:2]
+    right, bottom = place.size[0] - place.left - width, place.size[1] - place.top - height
+    sides = (place.top, bottom, place.left, right)
+    if not any(sides):
+        return shown
+    rgb = cv2.copyMakeBorder(shown.rgb, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
+    depth = shown.depth_m
+    if depth is not None:
+        depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=BAR_M)
+    return Shown(rgb, depth)
+
+
+def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
+    """The one picture to the left of a line and the other to its right."""
+    at = round(share * after.shape[1])
+    both = after.copy()
+    both[:, :at] = before[:, :at]
+    both[:, max(at - 1, 0) : at + 1] = 255
+    return both
+
+
+def depth_of_page(depth_m: np.ndarray) -> np.ndarray:
+    """Where there is no surface there is nothing that hides."""
+    return np.where(depth_m > 0, np.minimum(depth_m, FAR_M), FAR_M)
+
+
+# ---- What the page draws over them ---------------------------------------------------------------
+
+# By a return's weather_code: unchanged, attenuated, scattered, lost, moved.
+_CODE_COLORS = np.array([[0, 220, 255], [255, 220, 60], [255, 70, 70], [0, 0, 0], [255, 120, 255]])
+
+
+def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
+    boxes = scene.boxes(frame.index)
+    placed = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    lines = placed.corners_m[placed.is_finite][:, EDGES].reshape(-1, 2, 3)
+    labels = np.array([sum(map(ord, label)) for label in boxes.labels], np.uint32)
+    colors = color_numbers(labels[placed.is_finite])
+    return lines, np.broadcast_to(np.repeat(colors, len(EDGES), 0)[:, None], lines.shape)
+
+
+def lidar_points(
+    scene: Scene, frame: Frame, recipe: Recipe
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The frame's returns as the recipe's weather leaves them, [N, 3] in the scene's world, and
+    colours by what it did to them; None where the frame has no sweep.
+    """
+    sweep = scene.lidar(frame.index)
+    if sweep is None:
+        return None
+    sweep = drop_lost(weathered_sweep(scene, recipe, frame.index, sweep))
+    points = sweep.points_m - np.asarray(scene.world_origin_m)
+    return points, _CODE_COLORS[np.minimum(sweep.columns[CODE_COLUMN], 4)].astype(np.uint8)

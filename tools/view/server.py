@@ -1,0 +1,446 @@
+"""The server behind the pages: one thread draws what each asks for last, first for those that move.
+
+While a camera or a slider moves, pictures are small and rough, and only the latest wish counts; at
+rest the picture is the one that `climategs render` writes. A page that is slow to take pictures
+waits in its own connection, and a closed one is forgotten.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import shlex
+import socket
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from adapters.base import open_scene
+from adapters.camera_files.paths import frames_from_path_file
+from augment.cameras import Camera
+from augment.errors import ClimateGSError
+from augment.jobs.atomic import write_atomic
+from augment.jobs.files import check_frames, encode_image
+from augment.jobs.processes import choose_backend
+from augment.plan import make_plan, plan_view
+from augment.scene import Scene
+from augment.timing import stopwatch
+from augment.views import render_view
+from recipes.errors import RecipeError
+from recipes.schema import TIERS, Recipe
+from tools.output import compiling_noted, print_note
+from tools.render import kernel_modules
+from tools.view.edits import Edits, free_path, save_recipe, without_weather
+from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
+from tools.view.pictures import (
+    Shown,
+    coarse,
+    draw,
+    in_window,
+    lidar_points,
+    place_in_window,
+    recipe_to_show,
+    split,
+)
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, ViserServer
+
+    from tools.cli import ViewOptions
+
+_LOG = logging.getLogger(__name__)
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+JOIN_S = 10.0  # that the picture being drawn gets when the server ends
+
+
+def view_scene(options: ViewOptions) -> int:
+    """Serves pages until it is interrupted. Returns the exit code."""
+    viser = import_viser()
+    scene = open_scene(options.scene)
+    check_frames(scene)
+    given = (text.partition("=") for text in options.overrides)
+    values = {path.strip(): value for path, _, value in given}
+    edits = Edits(options.recipe, options.scale, values, folder=options.out)
+    make_plan(edits.recipe(), scene)  # refuse before a page opens
+    backend = choose_backend(options.backend, scene)
+    viewer = Viewer(scene, options.scene, edits, options.out, backend)
+    with serve(viser, viewer, options.host, options.port) as url:
+        print(f"{scene.name}: {url}   (Ctrl-C ends it)", flush=True)
+        if options.host not in LOOPBACK:
+            print_note(
+                f"note: whoever reaches {options.host} sees this scene, and can have recipes and "
+                f"pictures written to {options.out}: there is no password"
+            )
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    return 0
+
+
+def import_viser() -> Any:
+    """The module.
+
+    Raises:
+        ClimateGSError: it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():  # of what it imports
+            warnings.simplefilter("ignore")
+            import viser
+    except ModuleNotFoundError as error:
+        raise ClimateGSError(
+            f"climategs view needs viser, which is not installed ({error}): "
+            f"pip install 'climategs[view]'"
+        ) from error
+    return viser
+
+
+@contextlib.contextmanager
+def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
+    """Pages at an address, as long as it lasts; its URL. The next free port, where one is taken.
+
+    Raises:
+        ClimateGSError: the address is none of this machine's.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise ClimateGSError(
+            f"--host {host}: no address of this machine ({error}); 127.0.0.1 is for browsers on "
+            f"it, 0.0.0.0 for all that reach it"
+        ) from error
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    with contextlib.redirect_stdout(io.StringIO()):  # it says what we say
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    viewer.start()
+
+    @server.on_client_connect
+    async def _(client: ClientHandle) -> None:
+        viewer.open_page(client)
+
+    @server.on_client_disconnect
+    async def _(client: ClientHandle) -> None:
+        viewer.close_page(client)
+
+    shown = "localhost" if host in LOOPBACK else host
+    try:
+        yield f"http://{shown}:{server.get_port()}"
+    finally:
+        viewer.stop()
+        _stop(server)
+
+
+def _stop(server: ViserServer) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+class Viewer:
+    """A scene, its pages, and the thread that draws for them."""
+
+    def __init__(self, scene: Scene, uri: str, edits: Edits, out: Path, backend: str) -> None:
+        self.scene, self.uri, self.edits, self.out = scene, uri, edits, out
+        self.backend = backend
+        self.frames = tuple(frame for frame in scene.frames if frame.cameras)
+        self.changed = threading.Condition()
+        self.pages: list[Page] = []
+        self._is_ending = False
+        self._known: set[tuple[str, ...]] = set()  # kernels that have run
+        self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        with self.changed:
+            self._is_ending = True
+            self.changed.notify()
+        self._thread.join(JOIN_S)
+
+    def open_page(self, client: ClientHandle) -> None:
+        page = Page(self, client)
+        with self.changed:
+            self.pages.append(page)
+            self.changed.notify()
+
+    def close_page(self, client: ClientHandle) -> None:
+        with self.changed:
+            for page in self.pages:
+                page.is_closed = page.is_closed or page.client.client_id == client.client_id
+            self.pages = [page for page in self.pages if not page.is_closed]
+
+    # ---- The thread ------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self.changed:
+                page, work = self._next()
+                while page is None and not self._is_ending:
+                    self.changed.wait(work)
+                    page, work = self._next()
+                if self._is_ending:
+                    return
+                # The others come first next time.
+                self.pages.sort(key=lambda other: other is page)
+            assert page is not None
+            try:
+                self._work(page, work)
+            except Exception as error:
+                if page.is_closed:
+                    continue
+                if not isinstance(error, ClimateGSError | RecipeError):
+                    _LOG.error("a picture failed\n%s", traceback.format_exc())
+                page.show_error(f"{type(error).__name__}: {error}")
+                page.show_status("not drawn")
+
+    def _next(self) -> tuple[Page | None, Any]:
+        """The page that waits for longest and what to do for it; or None, and how long there is
+        nothing to do.
+        """
+        now, pause = time.monotonic(), None
+        for page in self.pages:
+            if page.progress.tasks:
+                return page, page.progress.tasks.popleft()
+        for page in self.pages:
+            own = page.progress
+            if own.drawn < own.wished and (now - own.last < REST_S or page.wish.is_playing):
+                return page, "moving"
+        for page in self.pages:
+            own = page.progress
+            if own.rested < own.wished:
+                left = own.last + REST_S - now
+                if left <= 0 and not page.wish.is_playing:
+                    return page, "rest"
+                pause = left if pause is None else min(pause, left)
+            elif page.wish.is_playing:
+                return page, "advance"
+        return None, None if pause is None else max(pause, 0.001)
+
+    def _work(self, page: Page, work: Any) -> None:
+        if callable(work):
+            work()
+            return
+        with self.changed:
+            wish, wished = page.wish, page.progress.wished
+        moving = work == "moving"
+        started = time.perf_counter()
+        try:
+            self._draw(page, wish, moving=moving)
+        finally:  # what failed is not tried again before something changes
+            page.progress.drawn = wished
+            if not moving:
+                page.progress.rested = wished
+        if wish.is_playing:
+            time.sleep(max(0.0, started + PLAY_S - time.perf_counter()))
+            page.advance()
+
+    # ---- One picture -----------------------------------------------------------------------------
+
+    def _draw(self, page: Page, wish: Wish, *, moving: bool) -> None:
+        refusal = None
+        try:
+            recipe = page.recipe(wish.edits)
+        except RecipeError as error:
+            refusal, recipe = str(error), page.good_recipe
+            if recipe is None:
+                raise
+        camera = page.camera_of(wish)
+        factor = self._factor(page, wish, recipe, camera)
+        if moving:
+            factor *= page.progress.factor
+        elif page.progress.rested == 0 or self._is_new(recipe):
+            page.show_status("preparing")
+        started = time.perf_counter()
+        with self._kernels(recipe):
+            shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
+        height, width = shown.rgb.shape[:2]
+        if wish.pose is None:
+            shown = in_window(shown, place_in_window(camera.resized(width, height), page.aspect))
+        took = time.perf_counter() - started
+        if page.is_closed:
+            return
+        page.show_picture(shown.rgb, shown.depth_m, moving=moving)
+        if moving:
+            page.progress.factor = _paced(page.progress.factor, took)
+        what = "while moving" if moving else "at rest"
+        page.show_status(f"{width} x {height} {what}, {1000 * took:.0f} ms")
+        page.show_error(refusal)
+        if not moving:
+            self._finish(page, wish, recipe, camera, seconds)
+
+    def _picture(
+        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
+    ) -> tuple[Shown, dict[str, float]]:
+        """The picture without bars; seconds of its passes."""
+
+        def drawn(recipe: Recipe) -> Shown:
+            asked = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
+            asked = coarse(asked) if moving else asked
+            return draw(self.scene, camera, asked, wish.shows, backend=self.backend)
+
+        if moving:
+            shown, seconds = drawn(recipe), {}
+        else:
+            with stopwatch() as seconds:
+                shown = drawn(recipe)
+        if wish.is_split:
+            clear = without_weather(recipe)
+            size = shown.rgb.shape
+            key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
+            if page.before is None or page.before[0] != key:
+                page.before = (key, drawn(clear).rgb)
+            shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
+        return shown, seconds
+
+    def _factor(self, page: Page, wish: Wish, recipe: Recipe, camera: Camera) -> float:
+        """How much smaller than the recipe's picture the window is."""
+        if wish.every_pixel:
+            return 1.0
+        height = camera.height * recipe.render.scale
+        if wish.pose is None:
+            height *= place_in_window(camera, page.aspect).size[1] / camera.height
+        return min(1.0, page.window_height / height)
+
+    def _finish(
+        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, seconds: dict[str, float]
+    ) -> None:
+        """What follows the picture at rest."""
+        points = None
+        if wish.lidar:
+            points = lidar_points(self.scene, page.frame_of(wish), recipe)
+        own = wish.frustums and (wish.camera if wish.pose is None else "flight")
+        key = (wish.frame, wish.boxes, own, wish.lidar and recipe)
+        if page.overlaid != key:
+            page.show_overlays(wish, points)
+            page.overlaid = key
+        steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
+        lines = [
+            f"| {'**' if step.runs else ''}{step.name}{'**' if step.runs else ''} | "
+            f"{_milliseconds(seconds.get(step.name))} | {step.why} |".replace("\n", " ")
+            for step in steps
+        ]
+        page.show_plan("\n".join(["| pass | ms | why, or why not |", "|---|---|---|", *lines]))
+        page.show_command(self._command(page, wish))
+
+    @contextlib.contextmanager
+    def _kernels(self, recipe: Recipe) -> Iterator[None]:
+        """Has the kernels of effects that are new compiled on all cores."""
+        if not self._is_new(recipe):
+            yield
+            return
+        with compiling_noted(kernel_modules([recipe], self.backend)):
+            yield
+        self._known.add(tuple(recipe.sections()))
+
+    def _is_new(self, recipe: Recipe) -> bool:
+        return tuple(recipe.sections()) not in self._known
+
+    # ---- What pages have done --------------------------------------------------------------------
+
+    def measure_tiers(self, page: Page) -> None:
+        """The time of the view at rest in each tier, and how far it is from reference."""
+        wish = page.wish
+        camera = page.camera_of(wish)
+        pictures: dict[str, tuple[float, np.ndarray]] = {}
+        for tier in (*TIERS, "reference"):
+            recipe = wish.edits.with_tier(tier).recipe()
+            recipe = recipe_to_show(recipe, wish.shows, with_depth=False, factor=1.0)
+            rgb = render_view(self.scene, camera, recipe, backend=self.backend).rgb
+            times = []  # without what is prepared once
+            for _ in range(2):
+                started = time.perf_counter()
+                render_view(self.scene, camera, recipe, backend=self.backend)
+                times.append(time.perf_counter() - started)
+            pictures[tier] = (min(times), rgb)
+        best = pictures["reference"][1].astype(float)
+        lines = ["| tier | size | ms | mean difference, of 255 |", "|---|---|---|---|"]
+        for tier, (seconds, rgb) in pictures.items():
+            height, width = rgb.shape[:2]
+            enlarged = cv2.resize(rgb, best.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+            off = f"{np.abs(enlarged - best).mean():.2f}"
+            lines.append(f"| {tier} | {width} x {height} | {1000 * seconds:.0f} | {off} |")
+        page.show_tiers("\n".join(lines))
+
+    def save(self, page: Page, name: str, *, with_picture: bool) -> None:
+        """The recipe, with a picture where asked for; and, of a flight, its camera."""
+        wish = page.wish
+        named = Recipe.model_validate({**page.recipe(wish.edits).model_dump(), "name": name})
+        endings = (".yaml", ".camera.json", f".{named.output.image}")
+        path = free_path(self.out, name, *endings)
+        save_recipe(named, path.with_name(path.name + ".yaml"))
+        written = [path.name + ".yaml"]
+        camera, where = page.recorded_camera(wish), self._where(wish, camera_path=None)
+        if wish.pose is not None:
+            camera_path = path.with_name(path.name + ".camera.json")
+            self._write_path(page.camera_of(wish), camera_path)
+            # As the file says it, to the bit.
+            (frame,) = frames_from_path_file(camera_path, self.scene)
+            camera = frame.cameras[camera.name]
+            written.append(camera_path.name)
+            where = self._where(wish, camera_path=camera_path)
+        if with_picture:
+            view = render_view(self.scene, camera, named, backend=self.backend)
+            picture = path.with_name(f"{path.name}.{named.output.image}")
+            write_atomic(picture, encode_image(view.rgb, named.output))
+            written.append(picture.name)
+        source = shlex.quote(str(path.with_name(path.name + ".yaml")))
+        out = shlex.quote(str(path.with_name(path.name + "-images")))
+        page.show_saved(
+            f"Saved {', '.join(written)} in {self.out}",
+            f"climategs render {source} {where} --out {out}",
+        )
+
+    def _write_path(self, camera: Camera, path: Path) -> None:
+        pose = camera.world_from_camera.clone().numpy()
+        pose[:3, 3] += np.asarray(self.scene.world_origin_m)
+        start_ns = self.scene.frames[0].timestamp_ns
+        sizes = {
+            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
+        }
+        frame = {
+            "timestamp_s": (camera.timestamp_ns - start_ns) / 1e9,
+            "camera": camera.name,
+            "world_from_camera": pose.tolist(),
+        }
+        write_atomic(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
+
+    def _where(self, wish: Wish, camera_path: Path | None) -> str:
+        """The scene and the view in words of the command line."""
+        scene = f"--scene {shlex.quote(self.uri)}"
+        if camera_path is not None:
+            return f"{scene} --camera-path {shlex.quote(str(camera_path))}"
+        return (
+            f"{scene} --frames {self.frames[wish.frame].index} --cameras {shlex.quote(wish.camera)}"
+        )
+
+    def _command(self, page: Page, wish: Wish) -> str:
+        """What renders the view without anything saved; says so where that is not possible."""
+        files = any(path.endswith(("image", "mask", "checkpoint")) for path in wish.edits.values)
+        if files or wish.pose is not None:
+            what = "a flight" if wish.pose is not None else "an uploaded file"
+            return f"# {what}: save the recipe first, and the command will stand here"
+        return wish.edits.command(f"{self._where(wish, None)} --out out/view")
+
+
+def _paced(factor: float, seconds: float) -> float:
+    """The resolution of the next picture while something moves."""
+    if seconds > FRAME_S:
+        factor *= max(0.7, FRAME_S / seconds)
+    elif seconds < FRAME_S / 2:
+        factor *= 1.15
+    return min(max(factor, FACTORS[0]), FACTORS[1])
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1000 * seconds:.1f}"
