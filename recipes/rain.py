@@ -36,15 +36,17 @@ class Rain(EffectModel):
             "mm/h",
             absent=0.0,
             shows="nonzero",
+            refutes=False,
             label="rain",
             caption="rain {rain_rate_mm_h:.3g} mm/h",
         ),
         Column(
-            "ground_wetness",
+            "rain_wetness",
             lambda it: it.ground_wetness,
             "Wetness of the ground",
             absent=0.0,
             shows="nonzero",
+            refutes=False,
             linear=True,
         ),
     )
