@@ -267,6 +267,7 @@ class Photo:
         assert raster.rgb is not None and raster.alpha is not None
         land, sky, level = self.colors(raster, parts, camera)
         surface = land if level is None else mix(land, sky, level)
+        surface = self._without_sun(surface, raster, camera)
         if shown is not None:
             weight = shown if camera is self.camera else shown * self._inside(camera)
             own = (1 - weight)[..., None] * raster.rgb
@@ -284,6 +285,7 @@ class Photo:
         `prepare` gives.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
+        rgb = self._without_sun(rgb, raster, self.camera)
         if raster.overlay is None:
             return rgb
         assert raster.rgb is not None
@@ -348,9 +350,6 @@ class Photo:
         clamped.
         """
         land, style, level = self._cut(self._land, camera), self.style, None
-        gain = None if self.faded is None else self._shadow_gain(self.faded, raster, camera)
-        if gain is not None:
-            land = land * gain
         if style is None:
             return land, self.sky_colors(camera), None
         if len(style.splats) > 1:
@@ -361,7 +360,6 @@ class Photo:
             for value in torch.unique(classes).tolist():
                 if value and not torch.equal(style.splats[value], style.splats[0]):
                     own = self._cut(self._in_colors(style.splats[value]), camera)
-                    own = own if gain is None else own * gain
                     land = torch.where((classes == value)[..., None], own, land)
         if style.levels is not None:
             assert raster.splat_ids is not None
@@ -369,13 +367,13 @@ class Photo:
             level = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
         return land, self.sky_colors(camera), level
 
-    def _shadow_gain(
-        self, faded: FadedShadows, raster: RenderOutput, camera: Camera
-    ) -> Float[Tensor, "H W 3"] | None:
-        """What colours are multiplied by, so that the shadows on the ground fade."""
+    def _without_sun(
+        self, rgb: Float[Tensor, "H W 3"], raster: RenderOutput, camera: Camera
+    ) -> Float[Tensor, "H W 3"]:
+        """What surfaces show, with the shadows on the ground faded."""
         depth, alpha = raster.expected_depth, raster.alpha
-        if depth is None or alpha is None:
-            return None
+        if self.faded is None or depth is None or alpha is None:
+            return rgb
         small = camera.resized(*_at_most(camera, ALIGNED_PX))
         z, shown = (
             cv2.resize(
@@ -387,12 +385,12 @@ class Photo:
         )
         points = z[..., None] * small.ray_directions().numpy() + camera.centre.numpy()
         points[shown < 0.5] = math.inf
-        lit, factors = faded.gains(points.astype(np.float32))
+        lit, factors = self.faded.gains(points.astype(np.float32))
         lit = cv2.resize(lit, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
         if camera is self.camera:
             lit = self.sharpen(torch.from_numpy(lit), WIDER).numpy()
         steps = cv2.merge([np.rint(lit * 255).astype(np.uint8)] * 3)
-        return torch.from_numpy(cv2.LUT(steps, factors[None])).to(depth.device)
+        return rgb * torch.from_numpy(cv2.LUT(steps, factors[None])).to(rgb.device)
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """What the sky shows at the pixels of a window."""

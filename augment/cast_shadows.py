@@ -434,8 +434,9 @@ class FadedShadows:
         mean, which changes nothing; and factors of encoded colours by steps of that share.
         """
         lit = _lit_near(self.shadows, *np.moveaxis(points_m, -1, 0))
-        steps = np.linspace(0, 1, 256)
-        return lit.astype(np.float32), _factors(self.shadows, self.transmittance, steps)
+        factors = _factors(self.shadows, self.transmittance, np.linspace(0, 1, 256))
+        factors[round(255 * self.shadows.lit_share)] = 1
+        return lit.astype(np.float32), factors
 
 
 def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
