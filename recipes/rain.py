@@ -7,7 +7,7 @@ import math
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Angle, Colour, Number, Unit
+from recipes.fields import Angle, Colour, Flag, Number, Unit
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
@@ -71,6 +71,9 @@ class Rain(EffectModel):
     puddles: Unit | None = None
     """Share of that ground on which water stands, in its hollows first; null follows from the rate;
     none where wetness is 0."""
+    spray: Flag = True
+    """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
+    wetness."""
 
     @property
     def changes(self) -> bool:

@@ -33,18 +33,19 @@ from augment.effects.smog import fog_echoes
 from augment.effects.wet.ground import CELL_M, WetGround
 from augment.effects.wet.kernels import CHANNELS, HOLLOW, OPEN
 from augment.effects.wet.lidar import film_gain, wet_echoes
-from augment.jobs.files import visibility
+from augment.jobs.files import box_tables, visibility
 from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.fog import Fog
-from recipes.schema import Output, Rain, Recipe, Snow, Weather
+from recipes.schema import Output, Rain, Recipe, Snow, Snowfall, Weather
 from tests.lidar_sweeps import (
     SENSOR_M,
     WORLD_ORIGIN_M,
     ground_points,
+    ranges_of,
     some_points,
     street,
     sweep_of,
@@ -280,6 +281,20 @@ def test_a_recipes_rain_is_on_its_sweeps_and_at_rate_0_is_not() -> None:
     for name, column in sweep.columns.items():
         np.testing.assert_array_equal(dry.columns[name], column)
     assert not dry.columns["weather_code"].any()
+
+
+def test_flakes_end_more_beams_than_drops_of_the_same_rate() -> None:
+    sweep, output = sweep_of(some_points(3000), 0.05), Output(lidar="weather")
+    falls = Rain(rate_mm_h=2.0, wetness=0.0), Snowfall(rate_mm_h=2.0)
+    shares, ranges = [], []
+    for each in (Weather(rain=falls[0]), Weather(snowfall=falls[1])):
+        out = weathered_sweep(street(), Recipe(weather=each, output=output), 0, sweep)
+        drops = out.columns["weather_code"] == PRECIPITATION
+        shares.append(drops.mean())
+        ranges.append(ranges_of(out)[drops])
+    assert shares[0] < 0.01 < 0.1 < shares[1]
+    assert 2 < np.median(ranges[1]) < 15
+    assert box_tables()["box_snowfall"].sampled == ("snowfall_transmittance", "flake_fraction")
 
 
 def test_manifests_know_rain_by_what_falls_or_lies() -> None:

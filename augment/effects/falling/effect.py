@@ -62,7 +62,7 @@ class RainEffect(FallingEffect):
         falling = Falling(
             "rain",
             rain.rate_mm_h,
-            _blows_to(rain.wind_mps, rain.wind_from_deg),
+            blows_to(rain.wind_mps, rain.wind_from_deg),
             0.0,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
@@ -94,7 +94,7 @@ class SnowfallEffect(FallingEffect):
         falling = Falling(
             "snow",
             snowfall.rate_mm_h,
-            _blows_to(snowfall.wind_mps, snowfall.wind_from_deg),
+            blows_to(snowfall.wind_mps, snowfall.wind_from_deg),
             snowfall.turbulence_mps,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
@@ -107,7 +107,8 @@ class SnowfallEffect(FallingEffect):
         return _fallen(own, drawn, camera, FLAKES, "snowfall")
 
 
-def _blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+    """A wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
     angle = math.radians(from_deg)
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
