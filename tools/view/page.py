@@ -86,12 +86,15 @@ class Wish:
 
 @dataclass
 class Progress:
-    """What has been drawn of a page's wishes, which count up. last: when the last one came."""
+    """What has been drawn of a page's wishes, which count up. last: when the last one came. due:
+    when a drive that is played goes on.
+    """
 
     wished: int = 1
     drawn: int = 0
     rested: int = 0
     last: float = 0.0
+    due: float = 0.0
     factor: float = FACTORS[1]
     tasks: deque[Callable[[], None]] = field(default_factory=deque)
 
@@ -125,16 +128,17 @@ class Page:
 
     def recipe(self, edits: Edits) -> Recipe:
         """In numbers; RecipeError where the edits make none."""
-        if self._resolved is None or self._resolved[0] is not edits:
+        known = self._resolved  # two threads come here
+        if known is None or known[0] is not edits:
             try:
-                self._resolved = (edits, edits.recipe())
+                known = (edits, edits.recipe())
             except RecipeError as error:
-                self._resolved = (edits, error)
-        resolved = self._resolved[1]
-        if isinstance(resolved, RecipeError):
-            raise resolved
-        self._good = resolved
-        return resolved
+                known = (edits, error)
+            self._resolved = known
+        if isinstance(known[1], RecipeError):
+            raise known[1]
+        self._good = known[1]
+        return known[1]
 
     @property
     def good_recipe(self) -> Recipe | None:

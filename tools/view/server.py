@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import logging
+import math
 import shlex
 import socket
 import threading
@@ -255,33 +256,39 @@ class Viewer:
             if own.drawn < own.wished and (now - own.last < REST_S or page.wish.is_playing):
                 return page, "moving"
         for page in self.pages:
-            own = page.progress
-            if own.rested < own.wished:
-                left = own.last + REST_S - now
-                if left <= 0 and not page.wish.is_playing:
-                    return page, "rest"
+            own, playing = page.progress, page.wish.is_playing
+            if not playing and own.rested == own.wished:
+                continue
+            left = (own.due if playing else own.last + REST_S) - now
+            if left <= 0:
+                return page, "advance" if playing else "rest"
+            if left < math.inf:
                 pause = left if pause is None else min(pause, left)
-            elif page.wish.is_playing:
-                return page, "advance"
-        return None, None if pause is None else max(pause, 0.001)
+        return None, pause
 
     def _work(self, page: Page, work: Any) -> None:
         if callable(work):
             work()
             return
+        if work == "advance":
+            page.advance()
+            return
         with self.changed:
             wish, wished = page.wish, page.progress.wished
         moving = work == "moving"
-        started = time.perf_counter()
+        own = page.progress
+        own.due = math.inf
+        due = time.monotonic() + PLAY_S
         try:
             self._draw(page, wish, moving=moving)
+            own.due = due
+        except Exception:
+            page.show_status("not drawn")
+            raise
         finally:  # what failed is not tried again before something changes
-            page.progress.drawn = wished
+            own.drawn = wished
             if not moving:
-                page.progress.rested = wished
-        if wish.is_playing:
-            time.sleep(max(0.0, started + PLAY_S - time.perf_counter()))
-            page.advance()
+                own.rested = wished
 
     # ---- One picture -----------------------------------------------------------------------------
 
