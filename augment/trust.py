@@ -580,6 +580,15 @@ def _is_away(nearest: Nearest) -> bool:
     return nearest.distance_m > MAX_DISTANCE_M or nearest.angle_rad > MAX_ANGLE_RAD
 
 
+_LACKS = {  # by figure of ViewTrust
+    "ground_open": "{share} of the ground has no surface{where}: fog and water stand in the holes",
+    "ground_leaks": f"{{share}} of the ground lets more than {100 * MAX_TRANSMITTANCE:g} % of the "
+    "light behind it through{where}",
+    "sky_covered": f"{{share}} of the sky has a surface nearer than {SKY_FROM_M:.0f} m{{where}}: "
+    "it stands as a pane in fog",
+}
+
+
 def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
     found = []
     if own.nearest is not None and (is_unfitted or own.away):
@@ -592,25 +601,16 @@ def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
                 f"{len(own.away)} of {frames} frames stand away from all images that the scene was "
                 f"made from, up to {where} (limit {limits}): {_listed(own.away)}"
             )
-    worst = _worst(own.views, "ground_open")
-    if worst is not None and worst[1] > MAX_GROUND_OPEN:
-        found.append(
-            f"{_percent(worst[1])} of the ground has no surface{_where(own, worst)}: fog and water "
-            f"stand in the holes"
-        )
-    leaks = _worst(own.views, "ground_leaks")
-    open_too = worst is not None and leaks is not None and leaks[1] < 2 * worst[1]
-    if leaks is not None and leaks[1] > MAX_GROUND_OPEN and not open_too:
-        found.append(
-            f"{_percent(leaks[1])} of the ground lets more than {_percent(MAX_TRANSMITTANCE)} of "
-            f"the light behind it through{_where(own, leaks)}"
-        )
-    covered = _worst(own.views, "sky_covered")
-    if covered is not None and covered[1] > MAX_SKY_COVERED:
-        found.append(
-            f"{_percent(covered[1])} of the sky has a surface nearer than {SKY_FROM_M:.0f} m"
-            f"{_where(own, covered)}: it stands as a pane in fog"
-        )
+    worst = {figure: _worst(own.views, figure) for figure in _LACKS}
+    hole, leak = worst["ground_open"], worst["ground_leaks"]
+    if hole is not None and leak is not None and leak[1] < 2 * hole[1]:
+        del worst["ground_leaks"]  # it is mostly the holes
+    for figure, largest in worst.items():
+        limit = MAX_SKY_COVERED if figure == "sky_covered" else MAX_GROUND_OPEN
+        if largest is not None and largest[1] > limit:
+            where = f" in frame {largest[0]}, the worst of {len(own.views)}"
+            where += f" (limit {_percent(limit)})"
+            found.append(_LACKS[figure].format(share=_percent(largest[1]), where=where))
     return found
 
 
@@ -618,12 +618,6 @@ def _worst(views: Sequence[ViewTrust], figure: str) -> tuple[int, float] | None:
     """Frame and value of the largest."""
     known = [(view.frame, getattr(view, figure)) for view in views]
     return max(((f, v) for f, v in known if v is not None), key=lambda pair: pair[1], default=None)
-
-
-def _where(own: CameraTrust, worst: tuple[int, float]) -> str:
-    return (
-        f" in frame {worst[0]}, the worst of {len(own.views)} (limit {_percent(MAX_GROUND_OPEN)})"
-    )
 
 
 def _percent(share: float) -> str:

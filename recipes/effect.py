@@ -47,7 +47,8 @@ class Column:
     """A column of manifests, and how people are told what it holds.
 
     value: of a section; NaN and null are absent. absent: without the section; None makes it a
-    column of words. shows: which numbers say that the effect is there: all, or all but 0. title,
+    column of words. shows: which numbers say that the effect is there: all, or all but 0. refutes:
+    whether the others say that it is not, whatever further columns say. title,
     unit: of the number shown, which is `factor` times the column's or `over` over it. linear: its
     axis is not logarithmic, however far it is spread. label: before it, where an image's weather is
     told in a few words. caption: of a contact sheet, from all shown numbers by column.
@@ -59,6 +60,7 @@ class Column:
     unit: str = ""
     absent: float | None = math.nan
     shows: Literal["all", "nonzero", None] = None
+    refutes: bool = True
     factor: float = 1.0
     over: float | None = None
     linear: bool = False

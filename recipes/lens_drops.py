@@ -28,9 +28,9 @@ class LensDrops(EffectModel):
         ),
     )
 
-    count: Whole = Field(ge=0, le=500)
+    count: Whole | None = Field(default=None, ge=0, le=500)
     """Drops on the part of the glass that the camera looks through; with a wiper, just before it
-    wipes."""
+    wipes. null for as many as the recipe's rain brings, none without rain."""
     radius_mm: Number = Field(default=1.0, gt=0, le=20)
     """Median radius of a drop on the glass."""
     radius_spread: Number = Field(default=0.4, ge=0, le=1.5)
@@ -47,7 +47,7 @@ class LensDrops(EffectModel):
 
     @property
     def changes(self) -> bool:
-        return self.count > 0
+        return self.count != 0
 
     @property
     def aperture_m(self) -> float:

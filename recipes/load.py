@@ -77,8 +77,8 @@ def parse_recipe(
 def read_overrides(
     texts: Iterable[str], option: str = "--set", folder: Path | None = None
 ) -> dict[str, Node]:
-    """Of a command line: `weather.smog.visibility_m=60`. Files are named from the folder, by default
-    the working folder.
+    """Of a command line: `weather.smog.visibility_m=60`. Files are named from `folder`, or else the
+    working folder.
 
     Raises:
         RecipeError: one is not PATH=VALUE, or its value is no YAML.

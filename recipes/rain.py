@@ -7,7 +7,7 @@ import math
 from pydantic import Field
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Angle, Colour, Number, Unit
+from recipes.fields import Angle, Colour, Flag, Number, Unit
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
@@ -27,7 +27,9 @@ class Rain(EffectModel):
         ("wetness", "wet wet_road wet_ground"),
         ("puddles", "puddle standing_water"),
     )
-    knobs = (Knob("min_width_px", (1.0, 0.5, 0.25), "drops drawn one by one; the rest is veil", 7),)
+    knobs = (
+        Knob("min_width_px", (1.0, 0.5, 0.35, 0.25), "drops drawn one by one; the rest is veil", 7),
+    )
     columns = (
         Column(
             "rain_rate_mm_h",
@@ -36,15 +38,17 @@ class Rain(EffectModel):
             "mm/h",
             absent=0.0,
             shows="nonzero",
+            refutes=False,
             label="rain",
             caption="rain {rain_rate_mm_h:.3g} mm/h",
         ),
         Column(
-            "ground_wetness",
+            "rain_wetness",
             lambda it: it.ground_wetness,
             "Wetness of the ground",
             absent=0.0,
             shows="nonzero",
+            refutes=False,
             linear=True,
         ),
     )
@@ -57,7 +61,7 @@ class Rain(EffectModel):
     """Where the wind comes from: 0 is world +x, 90 is +y."""
     color: Colour | None = None
     """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
-    min_width_px: Number = Field(default=0.25, ge=0.1, le=16)
+    min_width_px: Number = Field(default=0.35, ge=0.1, le=16)
     """Drops are drawn one by one up to where they are this wide, pixels of the rendered picture;
     farther ones are the veil."""
 
@@ -67,6 +71,9 @@ class Rain(EffectModel):
     puddles: Unit | None = None
     """Share of that ground on which water stands, in its hollows first; null follows from the rate;
     none where wetness is 0."""
+    spray: Flag = True
+    """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
+    wetness."""
 
     @property
     def changes(self) -> bool:

@@ -25,6 +25,7 @@ from recipes.lens_drops import LensDrops
 from recipes.rain import Rain
 from recipes.smog import Smog
 from recipes.snow import Snow
+from recipes.snowfall import Snowfall
 from recipes.style import Style
 
 # ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------
@@ -151,6 +152,7 @@ class Weather(Closed):
     flood: Flood | None = None
     snow: Snow | None = None
     rain: Rain | None = None
+    snowfall: Snowfall | None = None
 
 
 class Render(Section):
@@ -383,6 +385,7 @@ SECTIONS: dict[str, type[EffectModel]] = {
     "weather.flood": Flood,
     "weather.snow": Snow,
     "weather.rain": Rain,
+    "weather.snowfall": Snowfall,
     "style": Style,
     "camera.lens_drops": LensDrops,
 }

@@ -354,7 +354,7 @@ class ViewOptions(RecipeCommand):
     Recipes and pictures that the page saves are repeated by render, to the byte (docs/viewer.md).
 
     Args:
-        scene: The scene, as for render.
+        scene: The scene, as for render; or a folder that render or generate wrote, to look through.
         recipe: A recipe file or the name of a preset to start with.
         out: The folder that recipes and pictures are saved in.
         scale: Resolution relative to the recipe's, as for render.

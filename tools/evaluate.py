@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import ValidationError
 from tqdm import tqdm
 
 from augment.cameras import Camera
@@ -24,7 +25,7 @@ from augment.dataset.weather_dataset import RowReader, Rows
 from augment.errors import OutputError
 from augment.geometry import invert_rigid
 from augment.jobs.files import depth_in_metres
-from augment.jobs.layout import folder_name
+from augment.jobs.layout import folder_name, variant_folder
 from augment.jobs.manifest import OK, read_finished
 from augment.jobs.store import Store, open_store
 from augment.jobs.tables import read_boxes
@@ -37,6 +38,11 @@ from augment.metrics.consistency import (
     find_warp,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
+from augment.render.sensor import noise_variance
+from recipes.errors import RecipeError
+from recipes.schema import Output, Sensor
+from recipes.template import readable
+from recipes.yaml_tree import read_plain
 from tools.drawing import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
 from tools.options import names_in
 from tools.report_pictures import evenly
@@ -54,7 +60,7 @@ _BUFFERS = ("image", "depth", "water", "instance", *PASSING)
 _KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mostly 6 or 7
 MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
 ALL, DRY, WATER = "all", "dry", "water"
-_NUMBERS = ("rmse", "relative", "share")
+_NUMBERS = ("rmse", "relative", "share", "noise")
 PANEL_PX = 640  # wide
 ERROR_GAIN = 5.0  # of the error's picture: white is a fifth of the range
 # Of the mask: what counts, went along with a box, shows water; what does not count is black.
@@ -159,6 +165,7 @@ class Views:
         self._store = store
         self._reader = RowReader(store, verify=False)
         self.view = functools.lru_cache(_KEPT)(self._read)
+        self._noise = functools.cache(self._read_noise)
 
     def drives(self) -> list[Drive]:
         """In the manifest's order."""
@@ -195,6 +202,28 @@ class Views:
                 f"{found['frame']}, camera {record.name!r}: {error}); delete it and run "
                 f"the job again, which makes it anew"
             ) from error
+
+    def noise(self, row: int) -> float:
+        """Sigma of the noise that the row's recipe gives its camera; 0 of JPEG, which loses some of
+        it, and of a variant without its recipe.
+        """
+        found = self.rows.row(row)
+        return self._noise(f"{variant_folder(found['scene'], found['variant'])}/recipe.yaml")
+
+    def _read_noise(self, path: str) -> float:
+        if not self._store.exists(path):
+            return 0.0
+        try:
+            recipe: Any = read_plain(self._store.read(path).decode(), source=path)
+            output = Output.model_validate(recipe.get("output", {}))
+            sensor = Sensor.model_validate(recipe.get("camera", {}))
+        except (AttributeError, ValueError, RecipeError) as error:
+            why = "; ".join(readable(error)) if isinstance(error, ValidationError) else error
+            raise OutputError(
+                f"{self._store.uri}: {path} is damaged ({why}); delete it and run the job again, "
+                f"which makes it anew"
+            ) from error
+        return sensor.noise if output.image == "png" else 0.0
 
     def paths(self, row: int) -> ActorPaths:
         """Where the boxes of the row's drive are; none where it has no labels."""
@@ -265,6 +294,7 @@ def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
 class Compared(NamedTuple):
     """B warped into A. warped: float64 [H, W, 3]. warp: which pixels count. moved: bool [H, W],
     carried along with a box. water: bool [H, W], where either shows water; None where no file says.
+    noise: float64 [H, W, 2], variance of the cameras' in A and in `warped`; None without any.
     """
 
     a: View
@@ -272,6 +302,7 @@ class Compared(NamedTuple):
     warp: Warp
     moved: np.ndarray
     water: np.ndarray | None
+    noise: np.ndarray | None
 
 
 def compare(views: Views, pair: Pair) -> Compared:
@@ -290,7 +321,14 @@ def compare(views: Views, pair: Pair) -> Compared:
         # Bilinear: above 0 where any of the four neighbours is water.
         in_b = warp.sample(other.shows_water[..., None].astype(np.float64))[..., 0] > 0
         water = one.shows_water | in_b
-    return Compared(one, warp.sample(b.picture), warp, carried.moved & warp.counts, water)
+    warped, moved = warp.sample(b.picture), carried.moved & warp.counts
+    noise, sigma = None, views.noise(pair.a)
+    if sigma > 0:
+        noise, whole = np.zeros((*warp.counts.shape, 2)), np.zeros(len(warp.rows))
+        places = warp.rows % 1, warp.columns % 1
+        noise[warp.counts, 0] = noise_variance(a.picture[warp.counts], whole, whole, sigma)
+        noise[warp.counts, 1] = noise_variance(warped[warp.counts], *places, sigma)
+    return Compared(one, warped, warp, moved, water, noise)
 
 
 def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> dict[str, Any]:
@@ -315,12 +353,13 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
         "rows": pair,
     }
     for name, part in parts.items():
-        each = consistency_of(seen.a.depth_view, seen.warped, part)
+        each = consistency_of(seen.a.depth_view, seen.warped, part, seen.noise)
         enough = each.share >= MIN_SHARE
         record[name] = {
             "share": each.share,
             "rmse": each.rmse if enough else None,
             "relative": each.relative if enough and not math.isnan(each.relative) else None,
+            "noise": each.noise if enough and seen.noise is not None else None,
         }
     if network is not None and record[ALL]["rmse"] is not None:
         distance = picture_lpips(network, seen.warped, seen.a.depth_view.picture, counts)
@@ -426,6 +465,9 @@ def evaluation_text(facts: dict[str, Any]) -> str:
     lines = []
     for kind, title in (*apart.items(), (CAMERAS, "Neighbouring cameras")):
         lines += [title, "", *_table(facts, kind, with_lpips), ""]
+    noises = _noises(facts)
+    if noises:
+        lines += [f"The cameras' noise is taken out of RMSE and relative: {noises}.", ""]
     if with_lpips:
         lines += [
             f"LPIPS is of {facts['lpips']}, over the whole picture, in which pixels that do not "
@@ -433,6 +475,16 @@ def evaluation_text(facts: dict[str, Any]) -> str:
             "",
         ]
     return "\n".join(lines).rstrip()
+
+
+def _noises(facts: dict[str, Any]) -> str:
+    """Its root mean square in a pair, by recipe."""
+    found = []
+    for row in facts["recipes"]:
+        parts = [row[kind][ALL] for kind in KINDS if row[kind] is not None]
+        each = [p["noise"]["mean"] for p in parts if p is not None and "noise" in p]
+        found += [f"{row['recipe']} {np.mean(each):.4f}"] if each else []
+    return ", ".join(found)
 
 
 def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:

@@ -41,7 +41,7 @@ from augment.semantics import SemanticClass, class_of_label
 from augment.view_images import SURFACE_ALPHA
 
 _WIDTH = 480  # columns of the images that are drawn
-_CELL_PX = 2  # of those, from one new disc to the next
+_CELL_PX, _MAX_CELL_PX = 2, 8  # of those, from one new disc to the next; larger ones hide the sky
 _IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # that images are decoded at
 _STEP_M = 1.2  # images are taken that far apart on the way
 _MIN_FRAMES, _FRAMES_PART = 4, 1 / 3  # and no more frames than these
@@ -79,7 +79,7 @@ def close_parts(
 
     parts: the world's, then those of the tracks, in their frames. still: boxes of objects that are
     part of the world. points: of the world, the ground among them. max_gaussians: of all parts;
-    where they come near it, discs are larger and fewer."""
+    where they come near it, discs are larger, and those far away are left out."""
     parts = list(parts)
     ground = _GroundMap.of(points)
     standing = [
@@ -108,11 +108,11 @@ def close_parts(
             cells = drawn.cells(side_px)
             # Of a nearer box after, and so over, those of a further one.
             discs = _discs(cells, photo.resized(cells.camera), ground, boxes)
-            if len(discs.part) <= most or min(cells.is_open.shape) == 1:
+            if len(discs.part) <= most or side_px >= _MAX_CELL_PX:
                 break
             side_px *= 2
-        if len(discs.part) > most:
-            break
+        if len(discs.part) > most:  # what is near shows in fog and water
+            discs = discs.select(np.sort(np.argsort(discs.depth, kind="stable")[:most]))
         for number in np.unique(discs.part):
             own = discs.select(discs.part == number)
             new = own.gaussians(cells.camera, posed[int(number)])

@@ -1,9 +1,13 @@
-"""What reconstruction starts from: the scene of a recording, and the recording car's own body.
+"""What reconstruction starts from: the scene of a recording, and what its LiDAR left out.
 
-Its bonnet or roof stands before some cameras. It becomes an actor that travels with the camera:
-else it would be learnt into the road below, anew in every frame. It stands still in the image, so
-its true distance cannot be told from the images, and need not be: it is put near the camera, where
-nothing else is and other cameras do not look.
+Walls and crowns go on above the LiDAR's view, and behind glass: what images show there, and what is
+no sky, stands straight over the surface below it. Else it would be learnt into the sky, where fog
+swallows it.
+
+The recording car's own bonnet or roof stands before some cameras. It becomes an actor that travels
+with the camera: else it would be learnt into the road below, anew in every frame. It stands still
+in the image, so its true distance cannot be told from the images, and need not be: it is put near
+the camera, where nothing else is and other cameras do not look.
 """
 
 from __future__ import annotations
@@ -12,19 +16,26 @@ import dataclasses
 import logging
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
+from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
+from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.labels import EGO_VEHICLE
 from augment.reconstruct.view import ViewSource
+from augment.recorded_sky import TOP_MARGIN_RAD
+from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS
+from augment.render.rasterize import rasterize
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
+from augment.view_images import SURFACE_ALPHA
 
 logger = logging.getLogger(__name__)
 
@@ -39,16 +50,114 @@ _MIN_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than th
 _MARGIN_M = 0.01
 _BODY_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
+_WALLS = (
+    SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.VEGETATION, SemanticClass.UNKNOWN,
+)  # fmt: skip
+_WALL_COLUMNS = 240  # of the images in which walls are continued: one disc a pixel
+_MAX_WALL_IMAGES = 48
+_MAX_WALL_M = 80.0  # beyond, a LiDAR's channels lie so far apart that a surface's end is unknown
+_MAX_WALL_SPLATS = 60_000
+_WALL_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
+
 # Camera axes (x right, y down, z forward) to an actor's (x forward, y left, z up).
 _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
-    """The scene with a body of the recording car for every camera that sees it, from training
-    views alone."""
+    """The scene with the upper walls that the LiDAR does not see, and a body of the recording car
+    for every camera that sees it, from training views alone."""
+    scene = dataclasses.replace(scene, background=continue_walls(scene, views))
     bodies = [ego_body(scene, name, mask, views) for name, mask in views.ego_masks.items()]
     actors = (*scene.actors, *(body for body in bodies if body is not None))
     return dataclasses.replace(scene, actors=actors)
+
+
+def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
+    """The background with discs where training views show neither sky nor a surface, straight over
+    a wall or a crown that reaches the LiDAR's highest view, or that goes on above them."""
+    background = scene.background
+    if views.lidar_top_rad is None or background.semantic is None:
+        return background
+    classes = background.semantic.numpy()
+    room = _MAX_WALL_SPLATS
+    for key in spread(views.train, _MAX_WALL_IMAGES):
+        view = views.load(key)
+        camera = view.camera.scaled(min(1.0, _WALL_COLUMNS / view.camera.width))
+        drawn = dataclasses.replace(scene, background=background).parts_for(camera)
+        raster = rasterize(drawn, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+        assert raster.alpha is not None
+        assert raster.median_depth is not None and raster.splat_ids is not None
+        ids = raster.splat_ids.numpy()
+        in_background = (ids >= 0) & (ids < len(background))
+        semantic = classes[np.where(in_background, ids, 0)]
+        size = (camera.width, camera.height)
+        closed = view.sky | views.own_car(key)
+        found = _above_walls(
+            camera,
+            np.where(raster.alpha.numpy() >= SURFACE_ALPHA, raster.median_depth.numpy(), np.inf),
+            in_background & np.isin(semantic, _WALLS),
+            cv2.resize(closed.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0,
+            views.lidar_top_rad - TOP_MARGIN_RAD,
+        )
+        rows, columns = np.nonzero(found.depth > 0)
+        room -= len(rows)
+        if room < 0:
+            break
+        rays = camera.ray_directions(torch.float64).numpy()[rows, columns]
+        depth = found.depth[rows, columns]
+        normals = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        major = np.cross([0.0, 0.0, 1.0], normals)
+        major /= np.maximum(np.linalg.norm(major, axis=1, keepdims=True), 1e-9)
+        points = camera.centre.numpy() + depth[:, None] * rays
+        rgb = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA)
+        new = gaussians_from_surfels(
+            Surfels.discs(points, normals, major, depth / camera.fx),
+            (rgb[rows, columns] / 255).astype(np.float32),
+            semantic[found.base[rows, columns], columns],
+            _WALL_SHAPE,
+        )
+        background = join_gaussians([background, new])
+        classes = np.append(classes, semantic[found.base[rows, columns], columns])
+    logger.info("%d splats above walls", len(background) - len(scene.background))
+    return background
+
+
+class _AboveWalls(NamedTuple):
+    """depth: float64 [H, W], z of new surface, 0 where there is none. base: int64 [H, W], the row
+    of the surface below."""
+
+    depth: np.ndarray
+    base: np.ndarray
+
+
+def _above_walls(
+    camera: Camera, depth: np.ndarray, is_wall: np.ndarray, closed: np.ndarray, top_rad: float
+) -> _AboveWalls:
+    """depth: of surfaces, infinite where there is none. closed: sky and the recording car."""
+    height = camera.height
+    row = np.arange(height)[:, None]
+    solid = np.isfinite(depth)
+
+    def below(mask: np.ndarray) -> np.ndarray:
+        """Of each pixel the nearest row of the mask at or below it; height where there is none."""
+        rows = np.where(mask, row, height)
+        return np.minimum.accumulate(rows[::-1], axis=0)[::-1]
+
+    def above(mask: np.ndarray) -> np.ndarray:
+        return np.maximum.accumulate(np.where(mask, row, -1), axis=0)
+
+    base = below(solid)
+    goes_on = ~solid & (base < height) & (below(closed) > base)
+    base = np.minimum(base, height - 1)
+    columns = np.arange(camera.width)[None]
+    rays = camera.ray_directions(torch.float64).numpy()
+    level = np.hypot(rays[..., 0], rays[..., 1])  # metres on the plan for a metre of depth
+    rise_rad = np.arctan2(rays[..., 2], level)
+    distance_m = np.where(solid, depth, 0.0)[base, columns] * level[base, columns]
+    goes_on &= (rise_rad > 0) & is_wall[base, columns] & (distance_m < _MAX_WALL_M)
+    is_enclosed = above(solid) > above(closed)
+    goes_on &= is_enclosed | (rise_rad[base, columns] > top_rad)
+    return _AboveWalls(np.where(goes_on, distance_m / np.maximum(level, 1e-9), 0.0), base)
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:

@@ -13,18 +13,13 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
-from adapters.training_views.masks import (
-    find_ego_mask,
-    lidar_top_rad,
-    moving_frames,
-    read_ego_mask,
-    sky_mask,
-)
+from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
 from augment.reconstruct.view import RecordedView, ViewKey
+from augment.recorded_sky import lidar_top_rad, sky_mask
 from augment.scene import Scene
 
 NONE = "none"
@@ -55,7 +50,8 @@ class RecordedViews:
 
     Every image is decoded once at the start. Unusable ones are left out and named in `problems`.
     ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
-    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind."""
+    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind.
+    lidar_top_rad: highest elevation that the LiDAR looks at; None where that is unknown."""
 
     def __init__(
         self,
@@ -93,7 +89,7 @@ class RecordedViews:
         self._depth = DepthSource(
             scene, self._cameras, depth, cache_bytes=cache_bytes // 2, reference=reference_depth
         )
-        self._lidar_top_rad = self._measure_lidar_top()
+        self.lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
         self.ego_masks = self._find_ego(names, masks_dir)
 
@@ -136,6 +132,12 @@ class RecordedViews:
         weight = np.ones(sky.shape, np.float32)
         return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
 
+    def own_car(self, key: ViewKey) -> np.ndarray:
+        """Where a view shows the recording car, bool [H, W]."""
+        camera = self.camera(key)
+        mask = self._ego(camera)
+        return np.zeros((camera.height, camera.width), np.bool_) if mask is None else mask
+
     def _ego(self, camera: Camera) -> np.ndarray | None:
         """Where the camera sees the recording car; None if it does not."""
         mask = self.ego_masks.get(camera.name)
@@ -145,7 +147,7 @@ class RecordedViews:
         size = (camera.height, camera.width)
         if key not in self._skies:
             returns = self._depth.lidar(key).pixels
-            mask = sky_mask(self._scene, camera, rgb, returns, self._lidar_top_rad)
+            mask = sky_mask(self._scene, camera, rgb, returns, self.lidar_top_rad)
             ego = self._ego(camera)
             self._skies[key] = np.packbits(mask if ego is None else mask & ~ego)
         bits = np.unpackbits(self._skies[key], count=camera.height * camera.width)

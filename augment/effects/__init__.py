@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from augment.effects.effect import Effect, Sharing
-from augment.effects.falling.effect import RainEffect
+from augment.effects.falling.effect import RainEffect, SnowfallEffect
 from augment.effects.flood.effect import FloodEffect
 from augment.effects.lens_drops.effect import LensDropsEffect
 from augment.effects.smog import SmogEffect
 from augment.effects.snow.effect import SnowEffect
+from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
-# water over it, what falls before all of it, and last the camera's own glass.
+# water over it, spray, what falls before all of it, and last the camera's own glass.
 EFFECTS: tuple[Effect, ...] = (
     StyleEffect(),
     WetEffect(),
     SmogEffect(),
     SnowEffect(),
     FloodEffect(),
+    SprayEffect(),
     RainEffect(),
+    SnowfallEffect(),
     LensDropsEffect(),
 )
 

@@ -100,7 +100,7 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
                 values = numbers[column.name].astype(np.float64)
                 present = column.is_present(values)
                 there |= present
-                refuted |= ~present & ~np.isnan(values)
+                refuted |= ~present & ~np.isnan(values) & column.refutes
         masks[path.rpartition(".")[2]] = there & ~refuted
     other, known = np.zeros(rows, bool), columns_of_effects()
     for name, values in numbers.items():

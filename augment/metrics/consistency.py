@@ -66,11 +66,13 @@ class DepthView:
 class Consistency:
     """rmse: over the pixels that count, NaN where there are none. spread: standard deviation of
     A's colours over the same pixels, about each channel's mean. share: of A's pixels that count.
+    noise: of the cameras, root of the mean square; taken out of rmse and spread.
     """
 
     rmse: float
     spread: float
     share: float
+    noise: float = 0.0
 
     @property
     def relative(self) -> float:
@@ -108,15 +110,22 @@ def warped_consistency(a: DepthView, b: DepthView) -> Consistency:
     return consistency_of(a, *warp_view(a, b))
 
 
-def consistency_of(a: DepthView, warped: np.ndarray, counts: np.ndarray) -> Consistency:
-    """The error of a warped picture [H, W, 3] against A's own over some pixels, bool [H, W]."""
+def consistency_of(
+    a: DepthView, warped: np.ndarray, counts: np.ndarray, noise: np.ndarray | None = None
+) -> Consistency:
+    """The error of a warped picture [H, W, 3] against A's own over some pixels, bool [H, W].
+
+    noise: [H, W, 2], expected squares of independent noise in A and in the warped picture.
+    """
     share = float(counts.mean())
     if not counts.any():
         return Consistency(math.nan, math.nan, share)
     own = a.picture[counts].astype(np.float64)
-    rmse = math.sqrt(float(((warped[counts] - own) ** 2).mean()))
-    spread = math.sqrt(float(own.var(axis=0).mean()))
-    return Consistency(rmse, spread, share)
+    in_a, in_b = (0.0, 0.0) if noise is None else noise[counts].mean(0)
+    square = float(((warped[counts] - own) ** 2).mean()) - in_a - in_b
+    variance = float(own.var(axis=0).mean()) - in_a
+    rmse, spread = (math.sqrt(max(0.0, own)) for own in (square, variance))
+    return Consistency(rmse, spread, share, math.sqrt(in_a + in_b))
 
 
 def warp_view(a: DepthView, b: DepthView) -> tuple[np.ndarray, np.ndarray]:

@@ -109,6 +109,47 @@ def draw_noise(camera: Camera, *, seed: int, scene: str) -> UInt8[np.ndarray, "H
     return np.ascontiguousarray(demosaiced[: camera.height, : camera.width])
 
 
+def noise_variance(
+    rgb: Float[np.ndarray, "K 3"],
+    down: Float[np.ndarray, " K"],
+    across: Float[np.ndarray, " K"],
+    noise: float,
+) -> Float[np.ndarray, " K"]:
+    """Variance of `add_noise` in colours sampled bilinearly, the mean over channels.
+
+    down, across: 0 to 1, of the way from one pixel's centre to the next. Neighbours have noise in
+    common, as demosaicing leaves it.
+    """
+    a, b = np.stack([1 - down, down]), np.stack([1 - across, across])
+    # How far the weights of both directions reach: lags 0 and 1.
+    rows = (a**2).sum(0), a[0] * a[1]
+    columns = (b**2).sum(0), b[0] * b[1]
+    shared = noise_covariance()
+    kept = sum(
+        shared[:, 1 + i, 1 + j] * (rows[abs(i)] * columns[abs(j)])[:, None]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+    )
+    levels = np.rint(rgb.clip(0, 1) * 255).astype(np.uint8)
+    return ((noise * noise_sigmas()[levels]) ** 2 * kept).mean(1)
+
+
+@functools.cache
+def noise_covariance() -> Float[np.ndarray, "3 3 3"]:
+    """Of a channel's noise with that of the pixels around (rows, columns: one before to one after),
+    over the channels' mean variance; the mean over the places in a Bayer pattern.
+    """
+    found, unit = np.zeros((3, 3, 3)), 64
+    for row, column in ((3, 3), (3, 4), (4, 3), (4, 4)):
+        sites = np.zeros((8, 8), np.uint8)
+        sites[row, column] = unit
+        own = cv2.cvtColor(sites, cv2.COLOR_BayerRG2RGB).astype(np.float64) / unit
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                found[:, 1 + i, 1 + j] += (own * np.roll(own, (i, j), (0, 1))).sum((0, 1)) / 4
+    return found / _LEFT**2
+
+
 @functools.cache
 def _quantiles() -> UInt8[np.ndarray, "256"]:
     """A normal number for every byte."""

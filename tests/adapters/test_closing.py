@@ -101,13 +101,20 @@ def empty() -> Gaussians:
 
 def test_a_budget_makes_discs_larger_and_is_kept(tmp_path):
     background, points = road(6.0)
-    most = len(background) + 60
-    view = photo(tmp_path / "a.png", RED)
-    (closed,) = close_parts([background], (), (), [view], points, max_gaussians=most)
-    assert len(background) < len(closed) <= most
-    new = closed.scales[len(background) :, 0]
-    (fine,) = close_parts([background], (), (), [view], points, max_gaussians=10**6)
-    assert new.median() > 1.5 * fine.scales[len(background) :, 0].median()
+    view, count = photo(tmp_path / "a.png", RED), len(background)
+    fine, coarse, fewest = (
+        close_parts([background], (), (), [view], points, max_gaussians=count + more)[0]
+        for more in (10**6, 60, 6)
+    )
+    assert len(fine) > len(coarse) > count and len(coarse) <= count + 60
+    size_m = [own.scales[count:].max(1).values for own in (fine, coarse, fewest)]
+    assert size_m[1].median() > 1.5 * size_m[0].median()
+    # No disc becomes so large that it stands before the sky (8 pixels are 1.5 m at 6 m); what is
+    # nearest is closed first.
+    assert 1 <= len(size_m[2]) <= 6 and size_m[2].max() < 1.5
+    assert (
+        fewest.means[count:, :2].norm(dim=1) < fine.means[count:, :2].norm(dim=1).median()
+    ).all()
 
 
 def test_a_raw_scene_has_no_openings_below_the_horizon(tmp_path):
@@ -117,5 +124,8 @@ def test_a_raw_scene_has_no_openings_below_the_horizon(tmp_path):
         for own in frame.cameras.values():
             alpha = rasterize(scene.parts_for(own), own, buffers=(ALPHA,)).alpha
             alpha = alpha[own.ray_directions()[..., 2] < 0]
-            assert (alpha < 0.5).float().mean() < 0.002, (frame.index, own.name)
-            assert (alpha < 0.98).float().mean() < 0.03, (frame.index, own.name)
+            # Frame 1 lies between those that are closed. As measured by the LiDAR alone the front
+            # camera has 10 % of openings, and 14 to 26 % of both cameras' pixels leak: through 2 %
+            # of leaking white fog shine 5 of 255 levels, and 1 in 200 such pixels is no patch.
+            assert (alpha >= 0.5).all(), (frame.index, own.name)
+            assert (alpha < 0.98).float().mean() < 0.005, (frame.index, own.name)

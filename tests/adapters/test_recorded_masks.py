@@ -7,17 +7,11 @@ import drives
 import numpy as np
 import pytest
 
-from adapters.training_views.masks import (
-    find_ego_mask,
-    lidar_top_rad,
-    looks_like_sky,
-    moving_frames,
-    read_ego_mask,
-    sky_mask,
-)
+from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
+from augment.recorded_sky import lidar_top_rad, looks_like_sky, sky_mask
 
 NO_RETURNS = np.zeros(0, np.int32)
 SIZE = (160, 120)

@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.falling import kernels, reference
+from augment.effects.falling import air, kernels, reference
 from augment.effects.falling.air import (
     Falling,
     Glow,
     draw_falling,
     drawn_depths_m,
     find_drops,
+    left_clear,
     veil_of,
     walk_of,
 )
@@ -32,6 +33,7 @@ from augment.scene import Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
 from recipes.schema import Rain, Recipe, Sensor, Weather
+from recipes.snowfall import Snowfall
 from tests.scenes import camera_ahead, random_gaussians
 
 RAIN = Falling("rain", 20.0, (3.0, -1.0), 0.0, 7, 0.005, 0.25)
@@ -69,6 +71,14 @@ def test_rain_falls_at_its_rate_and_veils_as_measured(rate):
     sizes = sizes_of("rain", rate)
     assert sizes.rate_mm_h == pytest.approx(rate, rel=1e-9)
     assert 1000 * sizes.extinction_per_m == pytest.approx(0.312 * rate**0.67, rel=0.15)
+
+
+def test_a_millimetre_an_hour_of_snow_lets_see_a_kilometre():
+    """Moderate snow by the meteorological optical range, where contrast falls to 5 %."""
+    sizes = sizes_of("snow", 1.0)
+    assert sizes.rate_mm_h == pytest.approx(1.0)
+    assert math.log(20) / sizes.extinction_per_m == pytest.approx(1000, rel=0.2)
+    assert 0.6 < sizes.speeds_mps.min() < sizes.speeds_mps.max() < 2
 
 
 def test_sizes_are_numbers_at_any_rate():
@@ -151,13 +161,12 @@ def test_kernels_equal_their_reference(kind):
     rng = np.random.default_rng(0)
     alpha, depth, rgb = (rng.random(s, np.float32) for s in ((120, 160), (120, 160), (120, 160, 3)))
     depth *= 8 * (depth > 0.2)
-    clear = np.ones((120, 160), np.float32)
-    kernels.cover_pixels(drops, alpha, depth, clear)
+    clear = left_clear(drops, alpha, depth)
     np.testing.assert_allclose(clear, reference.cover_by_numpy(drops, alpha, depth), atol=1e-5)
     veil = veil_of(falling, camera, GLOW)
     tensors = [torch.from_numpy(image.copy()) for image in (rgb, alpha, depth, clear)]
     expected = reference.blend_by_torch(*tensors, veil).numpy()
-    kernels.blend_falling(rgb, alpha, depth, clear, *veil)
+    kernels.blend_falling(rgb, alpha, depth, clear, *veil._replace(upwards=veil.upwards[()]))
     np.testing.assert_allclose(rgb, expected, atol=1e-4)
 
 
@@ -168,13 +177,14 @@ def test_a_streak_takes_twice_its_drops_cross_section():
     inside &= (drops[:, [1, 3]] < 110).all(1)
     shape = (120, 160)
     for drop in drops[inside][:60]:
-        clear = np.ones(shape, np.float32)
-        kernels.cover_pixels(drop[None], np.zeros(shape, np.float32), clear * 0, clear)
+        nothing = np.zeros(shape, np.float32)
+        clear = left_clear(drop[None], nothing, nothing)
         length = math.hypot(drop[2] - drop[0], drop[3] - drop[1])
         i, o = drop[6], drop[7]
-        area = length * (o + i) + math.pi / 3 * (o * o + o * i + i * i)
-        # A disc of two pixels across is sampled at four points or so.
-        assert (1 - clear).sum() == pytest.approx(drop[8] * area, rel=0.2)
+        area = length * (2 * i + (2 * o + i) * (o - i) / (1.5 * (o + i)))
+        area += math.pi / 2 * (o * o + i * i)
+        # The smallest disc is sampled at five points or so.
+        assert (1 - clear).sum() == pytest.approx(drop[8] * area, rel=0.1)
 
 
 def test_what_is_not_drawn_is_veil():
@@ -192,8 +202,8 @@ def test_what_is_not_drawn_is_veil():
         )
         clear = torch.from_numpy(np.ones(shape, np.float32))
         rgb, clear = draw_falling(white, solid, far, camera, own, scene=scene, motion=FORWARD)
-        veil = veil_of(own, camera, GLOW)
-        tau = float(veil.far[0]) * 400 - float(veil.far[1])
+        extinction, _, grows, _, whole = veil_of(own, camera, GLOW).bands.astype(np.float64).T
+        tau = float((extinction * (400 - whole + grows / 2)).sum())
         means.append(tau - math.log(float(clear.mean())))
         assert torch.isfinite(rgb).all()
     assert means[0] > means[2] * 0.99
@@ -202,9 +212,17 @@ def test_what_is_not_drawn_is_veil():
 
 def test_drops_behind_a_surface_are_hidden():
     drops, shape = find_drops(walk_of(RAIN, view(), STANDING, "x")), (120, 160)
-    clear, near = np.ones(shape, np.float32), np.full(shape, 0.1, np.float32)
-    kernels.cover_pixels(drops, np.ones(shape, np.float32), near, clear)
-    assert (clear == 1).all()
+    near = np.full(shape, 0.1, np.float32)
+    assert (left_clear(drops, np.ones(shape, np.float32), near) == 1).all()
+
+
+def test_eddies_carry_flakes_at_their_speed_and_bring_them_back():
+    at, phase = np.random.default_rng(0).normal(0, 10, (500, 3)), np.linspace(0, 1, 500)
+    times = np.arange(0, 20, 0.01)
+    path = np.stack([reference.sway(at, t, phase, 0.3) for t in times])
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) / 0.01
+    assert 0.2 < speed.mean() < 0.5
+    assert np.linalg.norm(path, axis=-1).max() < 0.3 * air.SWAY_REACH_S
 
 
 # ---- In a picture --------------------------------------------------------------------------------
@@ -213,9 +231,11 @@ def test_drops_behind_a_surface_are_hidden():
 def test_nothing_falls_at_rate_0():
     scene = drive()
     camera = scene.frames[1].cameras["front"]
-    clean, dry = (render_view(scene, camera, r) for r in (Recipe(), rain(0.0)))
+    weather = Weather(rain=Rain(rate_mm_h=0.0), snowfall=Snowfall(rate_mm_h=0.0))
+    clean, dry = (render_view(scene, camera, r) for r in (Recipe(), Recipe(weather=weather)))
     assert (clean.rgb == dry.rgb).all()
-    assert not make_plan(rain(0.0), scene).placed["rain"].steps[0].runs
+    placed = make_plan(Recipe(weather=weather), scene).placed
+    assert not any(s.runs for name in ("rain", "snowfall") for s in placed[name].steps)
 
 
 def test_the_same_bytes_from_any_number_of_threads_alone_or_among_others():

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from augment import effects
@@ -25,19 +26,30 @@ from augment.effects.falling.lidar import (
     sphere_reflectance,
     strongest_drops,
 )
-from augment.effects.lidar import ATTENUATED, LOST, PRECIPITATION, UNCHANGED
+from augment.effects.lidar import ATTENUATED, LOST, MOVED, PRECIPITATION, UNCHANGED
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import fog_echoes
-from augment.jobs.files import visibility
-from augment.jobs.manifest import read_manifest
+from augment.effects.wet.ground import CELL_M, WetGround
+from augment.effects.wet.kernels import CHANNELS, HOLLOW, OPEN
+from augment.effects.wet.lidar import film_gain, wet_echoes
+from augment.jobs.files import box_tables, visibility
+from augment.jobs.manifest import effect_masks, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.fog import Fog
-from recipes.schema import Output, Rain, Recipe, Snow, Weather
-from tests.lidar_sweeps import SENSOR_M, WORLD_ORIGIN_M, some_points, street, sweep_of
+from recipes.schema import Output, Rain, Recipe, Snow, Snowfall, Weather
+from tests.lidar_sweeps import (
+    SENSOR_M,
+    WORLD_ORIGIN_M,
+    ground_points,
+    ranges_of,
+    some_points,
+    street,
+    sweep_of,
+)
 from tests.scenes import camera_ahead
 from tests.streets import LABELLED_STREET, open_street
 
@@ -190,11 +202,68 @@ def test_precipitation_of_every_density_stays_finite() -> None:
         assert np.isfinite(found.columns["intensity"][:-2]).all()
 
 
+# ---- Wet ground ----------------------------------------------------------------------------------
+
+
+def ground_of(open_: float = 1.0, hollow: float = 0.0) -> WetGround:
+    """Level ground at z = 0, 60 m about the origin."""
+    side = round(120 / CELL_M)
+    channels = torch.zeros(side, side, CHANNELS)
+    channels[..., OPEN], channels[..., HOLLOW] = open_, hollow
+    flat = torch.zeros(side, side)
+    return WetGround(-60.0, -60.0, channels, flat, flat + 1, np.array([-1.0, 0.0, 1.0], np.float32))
+
+
+def test_water_takes_what_fresnel_and_the_film_take() -> None:
+    """By hand, straight down (1 - R0)^2 / (n^2 (1 - p a)); less the flatter."""
+    p = 1 - (1 - 0.0659) / 1.33**2
+    down = 0.9799**2 / (1.33**2 * (1 - p * 0.3))
+    one, flat = np.ones(1), np.array([0.2])
+    for puddle in (0 * one, one):
+        assert film_gain(one, 0.3 * one, puddle)[0] == pytest.approx(down, rel=0.005)
+    cosines = np.linspace(0, 1, 300)
+    for puddle in (np.zeros(300), np.ones(300)):
+        gains = film_gain(cosines, 0.1 * cosines, puddle)
+        assert (np.diff(gains) > -1e-6).all() and (gains >= 0).all() and gains[-1] < 0.6
+    rs, rp = (float(np.square(r)) for r in fresnel(0.2, 1.33))
+    mirrored = (1 - (rs + rp) / 2) ** 2 / (1.33**2 * (1 - p * 0.1))
+    assert film_gain(flat, 0.1 * flat, one)[0] == pytest.approx(mirrored, rel=0.02)
+
+
+def fresnel(cosine: float, index: float) -> tuple[float, float]:
+    inside = math.sqrt(1 - (1 - cosine**2) / index**2)
+    s = (cosine - index * inside) / (cosine + index * inside)
+    p = (index * cosine - inside) / (index * cosine + inside)
+    return s, p
+
+
+def test_wet_ground_returns_less_and_nothing_else_does() -> None:
+    high = np.array([[8.0, 0.0, 1.0], [20.0, 3.0, 2.5], [200.0, 0.0, 0.0]])
+    points = np.vstack([ground_points(np.linspace(2, 40, 50)), high])
+
+    def gains(ground: WetGround, wetness: float = 1.0, puddles: float = 0.0) -> np.ndarray:
+        echoes = echoes_of(points, 0.02)
+        wet_echoes(echoes, ground, wetness, puddles)
+        return echoes.gain
+
+    soaked, damp = gains(ground_of()), gains(ground_of(), wetness=0.5)
+    assert (soaked[:50] < damp[:50]).all() and (damp[:50] < 1).all()
+    assert (soaked[50:] == 1).all()  # a wall, a sign, what lies beyond the map
+    assert (gains(ground_of(open_=0.0)) == 1).all() and (gains(ground_of(), wetness=0.0) == 1).all()
+    standing = gains(ground_of(hollow=2.0), puddles=0.3)
+    assert (standing[20:50] < 0.7 * soaked[20:50]).all()
+    assert (gains(ground_of(hollow=-2.0), puddles=0.3) == soaked).all()
+    covered = echoes_of(points, 0.02)
+    covered.codes[:] = MOVED  # onto snow
+    wet_echoes(covered, ground_of(), 1.0, 0.0)
+    assert (covered.gain == 1).all()
+
+
 # ---- By a recipe ---------------------------------------------------------------------------------
 
 
 def wet(rate_mm_h: float, **weather) -> Recipe:
-    fields = {"rain": Rain(rate_mm_h=rate_mm_h), **weather}
+    fields = {"rain": Rain(rate_mm_h=rate_mm_h, wetness=0.0), **weather}
     return Recipe(weather=Weather(**fields), output=Output(lidar="weather"))
 
 
@@ -212,6 +281,27 @@ def test_a_recipes_rain_is_on_its_sweeps_and_at_rate_0_is_not() -> None:
     for name, column in sweep.columns.items():
         np.testing.assert_array_equal(dry.columns[name], column)
     assert not dry.columns["weather_code"].any()
+
+
+def test_flakes_end_more_beams_than_drops_of_the_same_rate() -> None:
+    sweep, output = sweep_of(some_points(3000), 0.05), Output(lidar="weather")
+    falls = Rain(rate_mm_h=2.0, wetness=0.0), Snowfall(rate_mm_h=2.0)
+    shares, ranges = [], []
+    for each in (Weather(rain=falls[0]), Weather(snowfall=falls[1])):
+        out = weathered_sweep(street(), Recipe(weather=each, output=output), 0, sweep)
+        drops = out.columns["weather_code"] == PRECIPITATION
+        shares.append(drops.mean())
+        ranges.append(ranges_of(out)[drops])
+    assert shares[0] < 0.01 < 0.1 < shares[1]
+    assert 2 < np.median(ranges[1]) < 15
+    assert box_tables()["box_snowfall"].sampled == ("snowfall_transmittance", "flake_fraction")
+
+
+def test_manifests_know_rain_by_what_falls_or_lies() -> None:
+    columns = {"rain_rate_mm_h": [0, 0, 5, 5, 0], "rain_wetness": [0, 0.6, 0, 1, np.nan]}
+    masks = effect_masks({n: np.array(c, np.float64) for n, c in columns.items()}, 5)
+    assert masks["rain"].tolist() == [False, True, True, True, False]
+    assert not masks["other"].any()
 
 
 def test_auto_leaves_sweeps_as_recorded_unless_the_weather_has_surfaces() -> None:

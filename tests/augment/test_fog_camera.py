@@ -25,7 +25,7 @@ from augment.render.scatter import (
     scatter_forward,
     scattered,
 )
-from augment.render.sensor import add_noise, blur_lens, draw_noise, noise_sigmas
+from augment.render.sensor import add_noise, blur_lens, draw_noise, noise_sigmas, noise_variance
 from augment.views import render_view
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Render, Sensor, Smog, Weather
@@ -291,3 +291,16 @@ def test_fields_of_fog_and_camera_are_limited():
     with pytest.raises(ValueError):
         Smog(visibility_m=80, scatter=-0.1)
     assert Recipe(camera=Sensor()).hash == Recipe().hash != Recipe(camera=Sensor(noise=0.01)).hash
+
+
+@pytest.mark.parametrize(("down", "across"), [(0.0, 0.0), (0.3, 0.8), (0.5, 0.5)])
+def test_the_variance_of_sampled_noise_is_known(down: float, across: float):
+    """Which is less than a pixel's between pixels, and more than if neighbours were independent."""
+    grey, sigma = torch.full((400, 400, 3), 0.35), 0.02
+    seen = add_noise(grey.clone(), sigma, camera(400, 400), seed=4, scene="x").double().numpy()
+    rows = (1 - down) * seen[:-1] + down * seen[1:]
+    sampled = (1 - across) * rows[:, :-1] + across * rows[:, 1:]
+    one = np.ones(1)
+    expected = noise_variance(grey.numpy()[0, :1], down * one, across * one, sigma)[0]
+    # The draws hold 256 numbers, rounded twice.
+    assert sampled.reshape(-1, 3).var(0).mean() == pytest.approx(expected, rel=0.03)

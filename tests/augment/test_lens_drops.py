@@ -23,7 +23,7 @@ from augment.render.buffers import CPU, REFERENCE
 from augment.scene import Scene
 from augment.views import render_view
 from recipes.lens_drops import LensDrops
-from recipes.schema import Output, Recipe, Render, Sensor, Smog, Weather
+from recipes.schema import Output, Rain, Recipe, Render, Sensor, Smog, Weather
 from tests.streets import LABELLED_STREET, open_street
 
 GLASS_M = 0.05
@@ -58,7 +58,7 @@ def driving(scene: Scene, speed_mps: float) -> Scene:
 
 def placed(**fields) -> PlacedDrops:
     drops = LensDrops(**{"count": 200, "radius_mm": 2.0} | fields)
-    return PlacedDrops(drops, drops.count, seed=5)
+    return PlacedDrops(drops, seed=5)
 
 
 # ---- Optics --------------------------------------------------------------------------------------
@@ -154,6 +154,20 @@ def test_fewer_drops_are_the_first_of_more():
     assert abs(np.median(logs)) < 0.06 and logs.std() == pytest.approx(0.4, rel=0.1)
 
 
+def test_rain_brings_drops_by_its_rate_and_none_without_it():
+    own = LensDrops(wiper_s=4.0)
+    counts = [PlacedDrops(own, 0, rate).count_on(camera()) for rate in (0.0, 2.5, 10.0, 100.0)]
+    area_m2, flux = (GLASS_M / 490) ** 2 * 480 * 270, (0, 1381, 3114, 9743)  # by the integral
+    assert counts == pytest.approx([4 * area_m2 * f for f in flux], rel=0.08)
+    assert PlacedDrops(own, 0, 300.0).count_on(camera().scaled(2.0)) <= 500
+    scene = open_street(LABELLED_STREET)
+    dry, wet = Recipe(), Recipe(weather=Weather(rain=Rain(rate_mm_h=20.0)))
+    for recipe, runs in ((dry, False), (wet, True)):
+        recipe = recipe.model_copy(update={"camera": Sensor(lens_drops=own)})
+        steps = {step.name: step for step in make_plan(recipe, scene).steps}
+        assert (steps["lens drops"].runs == runs and "rain" in steps["lens drops"].why) or runs
+
+
 def test_a_wiper_clears_the_glass_and_drops_come_back_one_by_one():
     scene, wiped = driving(open_street(), 10), placed(wiper_s=2.0)
     counts = np.array(
@@ -189,7 +203,7 @@ def test_numbers_stay_finite_at_the_extremes():
     ):
         own = LensDrops(**fields)
         view = camera(2**62, 60, 40)
-        drops = drops_at(PlacedDrops(own, own.count, 2**62), scene, view)
+        drops = drops_at(PlacedDrops(own, 2**62), scene, view)
         around = map_surroundings(rgb, view, None, level=False)
         drawn = draw_drops(drops, around, view, glass_m=own.glass_m, aperture_m=own.aperture_m)
         seen, _ = blend_drops(rgb.clone(), *drawn, backend=CPU)
@@ -243,7 +257,7 @@ def test_a_job_writes_the_mask_and_its_share(tmp_path):
 
 def test_fields_are_limited_and_old_hashes_stay():
     for wrong in (
-        {}, {"count": -1}, {"count": 501}, {"count": 2.5}, {"count": 3, "radius_mm": 0},
+        {"count": -1}, {"count": 501}, {"count": 2.5}, {"count": 3, "radius_mm": 0},
         {"count": 3, "glass_m": 0.0}, {"count": 3, "wiper_s": 0.0}, {"count": 3, "f_number": 0.1},
         {"count": 3, "focal_mm": math.nan}, {"count": 3, "radius_spread": -0.1}, {"drops": 3},
     ):  # fmt: skip

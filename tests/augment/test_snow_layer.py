@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
+from augment.cast_shadows import linear_from_display
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.kernels import BARE_M, FARTHEST_M, FOLIAGE_MOST_M
 from augment.effects.snow.layer import (
@@ -24,13 +25,7 @@ from augment.effects.snow.layer import (
     profile_of,
     share_covered,
 )
-from augment.effects.snow.light import (
-    Illumination,
-    display_from_linear,
-    illumination_of,
-    light_of,
-    linear_from_display,
-)
+from augment.effects.snow.light import Illumination, display_from_linear, illumination_of, light_of
 from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
 from augment.geometry import rigid
@@ -528,7 +523,7 @@ def grained(view: Camera, *, height_m=2.0, hidden=None, carriers=(), backend="cp
     size = (view.height, view.width)
     args = {"grain": GRAIN, "snow": torch.ones(size), "extinction_per_m": 0.0} | options
     grain, snow = args.pop("grain"), args.pop("snow")
-    even, depth = torch.full((*size, 3), 0.7), torch.full(size, height_m)
+    even, depth = torch.full((*size, 3), 0.7), args.pop("depth", torch.full(size, height_m))
     sun = tuple(CLOSE_SUN.tolist())
     return add_grain(
         *(even, depth, snow, hidden, view, grain, sun, carriers), backend=backend, **args
@@ -578,6 +573,8 @@ def test_no_grain_where_nothing_shows_it():
     ]
     for options in cases:
         assert torch.equal(grained(view, **options), even), options
+    steep = 2.0 + 0.04 * torch.arange(view.width).expand(size).contiguous()
+    assert torch.equal(grained(view, depth=steep), even)  # 4 cm from pixel to pixel
     level = Grain(1.0, 1.0, 5)
     for sun in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
         out = add_grain(
@@ -589,7 +586,8 @@ def test_no_grain_where_nothing_shows_it():
 def test_the_kernel_adds_grain_as_its_definition_does():
     view = looking((0.0, 0.0, 1.5), (4.0, 0.5, 0.0), 160, 120, 150.0)
     rng = torch.Generator().manual_seed(2)
-    depth = 1.0 + 12 * torch.rand(120, 160, generator=rng)
+    depth = 1.5 / (-view.ray_directions()[..., 2]).clamp_min(0.1)  # level, with bumps
+    depth *= 1 + torch.rand(120, 160, generator=rng) ** 8 / 50
     snow, hidden = torch.rand(120, 160, generator=rng), torch.rand(120, 160, generator=rng) < 0.1
     boxes = [
         Carrier(np.linalg.inv(yawed(0.7, x, 0.5).numpy()), np.full(3, -1.0), np.full(3, 1.0))

@@ -137,7 +137,7 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         ("weather: {smog: {visibility_m: {choice: [100, null]}}}", "needs a density: give visibil"),
         ("weather: {smog: {visibility_m: {uniform: [0.01, 100]}}}", "means an extinction of 391/m"),
         ("snow: {depth_m: 0.1}", "snow: unknown field here; did you mean weather.snow?"),
-        ("weather: {snowfall: 1}", "weather.snowfall: unknown field; did you mean snow?"),
+        ("weather: {snows: 1}", "weather.snows: unknown field; did you mean snow?"),
         ("weather: {snow: 0.1}", "weather.snow = 0.1: must be a mapping, with depth_m, coverage"),
         ("weather: {depth_m: 0.1}", "did you mean weather.snow.depth_m or weather.flood.level_m?"),
         ("weather: {wind: {}}", "did you mean weather.snow.wind or weather.flood.waves?"),

@@ -24,6 +24,7 @@ from recipes.ranges import words
 from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
 from recipes.schema import Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
+from recipes.snowfall import Snowfall
 from recipes.style import Style, style_preset_names
 
 FIELDS = [
@@ -51,6 +52,13 @@ REFUSED: dict[type, list[dict[str, Any]]] = {
         {"rate_mm_h": 5.0, "min_width_px": 0},
         {"rate_mm_h": 5.0, "wetness": 1.01},
         {"rate_mm_h": 5.0, "puddles": -0.1},
+    ],
+    Snowfall: [
+        {},
+        {"rate_mm_h": -1.0},
+        {"rate_mm_h": 51.0},
+        {"rate_mm_h": 1.0, "turbulence_mps": -0.1},
+        {"rate_mm_h": 1.0, "wind_mps": math.inf},
     ],
     Sensor: [{"exposure_ms": 0}, {"exposure_ms": -5.0}, {"exposure_ms": 100.1}],
     Smog: [
@@ -211,14 +219,19 @@ def test_every_field_changes_the_hash() -> None:
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
     rain = Rain(rate_mm_h=5.0)
-    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain)
+    snowfall = Snowfall(rate_mm_h=1.0)
+    weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall)
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
     base = Recipe(weather=weather, style=style, camera=camera)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
     hashes.add(base.model_copy(update={"camera": Sensor()}).hash)
-    hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain)).hash)
+    hashes.add(
+        Recipe(
+            weather=Weather(smog=smog, flood=cleared, snow=snow, rain=rain, snowfall=snowfall)
+        ).hash
+    )
     hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
     hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changed = [spec for spec in FIELDS if spec.path not in ELSEWHERE]

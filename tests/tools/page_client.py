@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0  # kernels may have to be compiled
 Found = TypeVar("Found")
 
 
@@ -26,10 +26,13 @@ class PageClient:
     where the server puts it.
     """
 
-    def __init__(self, url: str, size: tuple[int, int] = (640, 360)) -> None:
+    def __init__(
+        self, url: str, size: tuple[int, int] = (640, 360), origin: str | None = None
+    ) -> None:
         address = url.replace("http", "ws").replace("localhost", "127.0.0.1")
+        own: dict[str, Any] = {"max_size": None, "compression": None}
         protocol = Subprotocol(f"viser-v{viser.__version__}")
-        self._socket = connect(address, subprotocols=[protocol], max_size=None, compression=None)
+        self._socket = connect(address, origin=origin, subprotocols=[protocol], **own)
         self.size, self.widgets, self.pictures = size, dict[str, list[dict[str, Any]]](), []
         self.nodes: set[str] = set()
         self.pose: dict[str, Any] = {
@@ -39,11 +42,21 @@ class PageClient:
         self._by_uuid: dict[str, dict[str, Any]] = {}
         self._folders: dict[str, str] = {}
         self._html: dict[str, str] = {}
+        self._is_deaf = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
         self.send_camera()
 
+    @property
+    def is_listening(self) -> bool:
+        return self._thread.is_alive()
+
+    def stop_listening(self) -> None:
+        """Take no more from the connection, which stays."""
+        self._is_deaf = True
+
     def close(self) -> None:
+        self._is_deaf = False
         self._socket.close()
         self._thread.join()
 
@@ -65,6 +78,13 @@ class PageClient:
 
     def press(self, path: str) -> None:
         self.set(path, True)
+
+    def upload(self, path: str, name: str, content: bytes) -> None:
+        widget = self.wait_for(lambda: self.widgets.get(path), path)[-1]
+        own = {"source_component_uuid": widget["uuid"], "transfer_uuid": name}
+        said = {"filename": name, "mime_type": "", "part_count": 1, "size_bytes": len(content)}
+        self._send({"type": "FileTransferStartUpload", **own, **said})
+        self._send({"type": "FileTransferPart", **own, "part_index": 0, "content": content})
 
     def move(self, **pose: Any) -> None:
         self.pose |= pose
@@ -128,6 +148,8 @@ class PageClient:
     def _listen(self) -> None:
         try:
             for raw in self._socket:
+                while self._is_deaf:
+                    time.sleep(0.05)
                 assert isinstance(raw, bytes)
                 length = int.from_bytes(raw[8:16], "little")
                 packed = zstandard.ZstdDecompressor().decompress(
@@ -157,7 +179,7 @@ class PageClient:
             path = above + (own.get("label") or "")
             self.widgets.setdefault(path, []).append(own)
             if kind == "GuiFolderMessage":
-                self._folders[message["uuid"]] = f"{path}/"
+                self._folders[message["uuid"]] = f"{path}/" if own["label"] else above
         elif kind == "RemoveSceneNodeMessage":
             self.nodes.discard(message["name"])
         elif kind in ("LineSegmentsMessage", "PointCloudMessage", "CameraFrustumMessage"):

@@ -18,14 +18,17 @@ from augment.jobs.files import encode_depth, encode_ids, encode_image, encode_ma
 from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
-from recipes.schema import Output
+from augment.render.sensor import add_noise
+from recipes.load import dump_recipe
+from recipes.schema import Output, Recipe, Sensor
 from tools.cli import EvaluateOptions
-from tools.evaluate import evaluate_output
+from tools.evaluate import evaluate_output, evaluation_text
 from tools.output import write_json
 
 FRAMES = 8
 CAMERAS = {"ahead": 0.0, "left": 0.5, "behind": math.pi}  # name: yaw, radians
 FLICKER = 8 / 255
+NOISE = 0.03
 
 
 def camera_of(name, frame):
@@ -62,6 +65,9 @@ def write_image(out, row, *, depth=True, instance=False):
     if row["recipe"] == "flood":
         wet[len(wet) // 2 :] = True
         picture[wet] += FLICKER * (row["frame"] % 2)
+    if row["recipe"] == "noisy":
+        camera, noisy = camera_of(row["camera"], row["frame"]), torch.from_numpy(picture).float()
+        picture = add_noise(noisy, NOISE, camera, seed=1, scene="wall").numpy()
     streaks = (
         np.random.default_rng([row["frame"], *row["camera"].encode()]).random(wet.shape) < 0.02
     )
@@ -94,6 +100,7 @@ def write_walls(out, recipes=("clear",), frames=range(FRAMES), **kwargs):
         "flood": {"flood_level_m": 0.3},
         "fog": {"smog_extinction_per_m": 0.1},
         "rain": {"rain_rate_mm_h": 20.0},
+        "noisy": {},
     }
     rows = [
         make_row("wall", recipe, 0, frame, camera, **weather[recipe], **size)
@@ -146,6 +153,30 @@ def test_water_is_reported_apart(facts):
     assert worst["all"]["rmse"] == max(
         p["all"]["rmse"] or 0 for p in facts["pairs"] if p["recipe"] == "flood"
     )
+
+
+def test_noise_of_the_camera_is_taken_out(facts, tmp_path):
+    out = write_walls(tmp_path, ("noisy",))
+    with_it = measure(out)["recipes"][0]["short"]["all"]
+    assert "noise" not in with_it and with_it["rmse"]["mean"] > NOISE  # no recipe says so
+    recipe = Recipe(name="noisy", camera=Sensor(noise=NOISE))
+    file = out / "wall" / "noisy-000" / "recipe.yaml"
+    file.write_text(dump_recipe(recipe))
+    found = measure(out)
+    clear, short = facts["recipes"][0]["short"]["all"], found["recipes"][0]["short"]["all"]
+    assert short["noise"]["mean"] == pytest.approx(with_it["rmse"]["mean"], rel=0.05)
+    # What is left of a variance after an estimate of a few hundred independent pixels.
+    assert short["rmse"]["mean"] < 0.3 * NOISE
+    assert short["relative"]["mean"] < with_it["relative"]["mean"] / 3
+    assert clear["rmse"]["mean"] < 0.3 * NOISE
+    said = evaluation_text(found)
+    assert f"taken out of RMSE and relative: noisy {short['noise']['mean']:.2f}"[:-1] in said
+    jpg = recipe.model_copy(update={"output": Output(image="jpg")})
+    file.write_text(dump_recipe(jpg))
+    assert measure(out)["recipes"][0]["short"]["all"] == with_it
+    file.write_text("camera: {noise: -1}")
+    with pytest.raises(OutputError, match=r"recipe\.yaml is damaged.*run the job again"):
+        measure(out)
 
 
 def test_streaks_are_no_inconsistency(facts, tmp_path):

@@ -9,6 +9,7 @@ import math
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,7 @@ from tests.augment.dust import DustEffect
 from tools.cli import main
 from tools.view.controls import effect_groups, group_of
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
+from tools.view.outputs import OutputViewer
 from tools.view.pictures import free_camera, place_in_window
 from tools.view.server import Viewer, import_viser, serve
 
@@ -248,7 +250,11 @@ def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten
             assert two.widgets["dust/on"][0]["value"] is False
             one.set("flood/on", True)
             one.set("flood/waves/components", "[{")
-            one.wait_for(lambda: "color:#c92a2a" in one.status(), "the refusal")
+            one.wait_for(lambda: "flood.waves.components" in one.status(), "the refusal")
+            one.set("render/base", "recorded")  # the street has no photos
+            one.press("Undo all changes")
+            one.set("render/base", "recorded")
+            one.wait_for(lambda: "SceneError" in one.status(), "the scene's refusal")
             count = len(one.pictures)
             one.press("Undo all changes")
             assert np.array_equal(one.rest(after=count), clear)
@@ -295,6 +301,83 @@ def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
             lambda: any("| reference |" in str(w) for ws in page.widgets.values() for w in ws),
             "the tiers",
         )
+
+
+@pytest.mark.long
+def test_a_photo_and_a_recipe_are_uploaded_and_saved(tmp_path):
+    colors = np.random.default_rng(0).integers(0, 255, (20, 20, 3)) * [1.0, 0.6, 0.2]
+    photo = cv2.imencode(".png", colors.astype(np.uint8))[1].tobytes()
+    edits = Edits("clear", SCALE, folder=tmp_path / "views")
+    with served(edits) as (_, url), PageClient(url) as page:
+        clear, count = page.rest(after=0), len(page.pictures)
+        page.set("style/on", True)
+        page.upload("style/upload image", "../../warm photo.png", photo)
+        warm = page.rest(after=count)
+        assert np.abs(warm.astype(int) - clear).mean() > 2
+        assert "save the recipe first" in page.status()
+        page.press("Save recipe")
+        saved = command_of(page, f"climategs render {tmp_path}")
+        assert np.array_equal(rendered(tmp_path / "out", saved), warm)
+        count = len(page.pictures)
+        page.upload("Open a recipe", "fog.yaml", b"weather: {smog: {visibility_m: 20}}")
+        assert np.abs(page.rest(after=count).astype(int) - clear).mean() > 5
+        page.upload("Open a recipe", "fog.yaml", b"weather: {smoke: 1}")
+        page.wait_for(lambda: "weather.smoke" in page.status(), "the refusal")
+    assert sorted(p.name for p in (tmp_path / "views" / "opened").iterdir()) == [
+        "fog-2.yaml", "fog.yaml",
+    ]  # fmt: skip
+    assert [p.name for p in (tmp_path / "views" / "uploads").iterdir()] == ["warm_photo.png"]
+
+
+@pytest.mark.long
+def test_a_page_that_takes_nothing_holds_up_no_other_and_other_sites_get_none(tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url), PageClient(url) as page:
+        page.rest(after=0)
+        with PageClient(url, origin="http://elsewhere.example") as other:
+            other.wait_for(lambda: not other.is_listening, "the server to hang up")
+            assert not other.widgets
+        assert len(viewer.pages) == 1
+        deaf = PageClient(url)
+        deaf.wait_for(lambda: len(deaf.pictures), "a picture")
+        deaf.stop_listening()
+        for step in range(60):
+            deaf.move(position=[0.1 * step, 0.0, 2.0], look_at=[20.0, 0.0, 1.0])
+            page.move(position=[0.1 * step, 1.0, 2.0], look_at=[20.0, 0.0, 1.0])
+            time.sleep(0.02)
+        count = len(page.pictures)
+        page.move(position=[0.0, 0.0, 2.0], look_at=[20.0, 0.0, 1.0])
+        assert page.rest(after=count).shape[0] > 50
+        deaf.close()
+
+
+@pytest.mark.long
+def test_an_output_is_looked_through_by_its_numbers(tmp_path):
+    out = tmp_path / "out"
+    where = ["--scene", SMALL_STREET, "--cameras", "front", "--scale", str(SCALE), "--no-cache"]
+    sets = ["--set", "weather.smog.visibility_m={uniform: [20, 80]}", "--variants", "2"]
+    assert main(["render", "dense-fog", *where, *sets, "--out", str(out), "--no-sheet"]) == 0
+    assert main(["render", "clear", *where, "--out", str(out), "--no-sheet"]) == 0
+    viewer = OutputViewer(out)
+    images = {(row["variant"], row["frame"]): viewer.picture(row, "image") for row in viewer.rows}
+    assert len(images) == 6
+    own = (192, 108)
+    with serve(import_viser(), viewer, "127.0.0.1", 0) as url, PageClient(url, own) as page:
+        variants = viewer.values("variant")
+        page.wait_for(lambda: page.pictures, "a picture")
+        for variant in variants:
+            count = len(page.pictures)
+            page.set("variant", variant)
+            page.set("frame", 1)
+            shown = page.rest(after=count) if variant != variants[0] else None
+            assert shown is None or np.array_equal(shown, images[variant, 1])
+        (name,) = (n for n in viewer.numbers if n == "smog_extinction_per_m")
+        least, middle, most = viewer.values(name)
+        assert least == 0
+        page.set(f"only images with/{name}", [(middle + most) / 2, most])
+        page.wait_for(lambda: len(page.widgets["variant"][0]["options"]) == 1, "the thickest")
+        count = len(page.pictures)
+        page.set("shows", "depth")
+        assert page.rest(after=count).std() > 10
 
 
 # ---- The command ---------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class Edits:
     def with_section(self, section: str) -> Edits:
         """The effect is there: as it was, as the source has it, or with values to start from."""
         there = replace(self, absent=self.absent - {section})
-        if found(there.recipe(), section) is not None:
+        if found(replace(there, values={}).recipe(), section) is not None:
             return there
         start = as_yaml(start_of_section(section))
         return replace(there, added={**self.added, section: start})

@@ -16,17 +16,20 @@ MAX_EXACT = 2**53 - 1  # the largest whole number that a browser tells from its 
 WAY = 100.0  # of a slider that does not stand for its values themselves
 NONE = "(none)"
 
+When = Callable[..., None]
 Changed = Callable[[Control, str], None]
 Uploaded = Callable[[Control, str, bytes], None]
 
 
 class Field:
-    """One control on a page. changed: hears a field's new value as YAML, from whoever moved it on
-    the page; uploaded: a file's name and content.
+    """One control on a page. when: has a function told what people do to a widget. changed: hears
+    the field's new value as YAML; uploaded: a file's name and content.
     """
 
-    def __init__(self, gui: GuiApi, control: Control, changed: Changed, uploaded: Uploaded) -> None:
-        self.control, self._gui, self._changed = control, gui, changed
+    def __init__(
+        self, gui: GuiApi, control: Control, when: When, changed: Changed, uploaded: Uploaded
+    ) -> None:
+        self.control, self._when, self._changed = control, when, changed
         self._given: Any = None
         self._parts: list[Any] = []
         make = getattr(self, f"_make_{control.kind}")
@@ -36,10 +39,7 @@ class Field:
         make(gui, control)
         if control.kind == "file":
             button = gui.add_upload_button(f"upload {control.label}")
-
-            @button.on_upload
-            async def _(event: Any) -> None:
-                uploaded(control, event.target.value.name, event.target.value.content)
+            when(button, lambda file: uploaded(control, file.name, file.content), "on_upload")
 
     def show(self, value: Any) -> None:
         """Stand at a value; telling nobody."""
@@ -76,17 +76,14 @@ class Field:
         self._hear(part, value_of)
 
     def _hear(self, part: Any, value_of: Callable[[Any], Any]) -> None:
-        """Have what people do to a widget told."""
-
-        @part.on_update
-        async def _(event: Any) -> None:
-            if event.client is None:  # set by `show`
-                return
-            value = value_of(event.target.value)
+        def heard(shown: Any) -> None:
+            value = value_of(shown)
             if part is self._given or self.control.way != "linear":
                 self.show(value)
             text = value if self.control.kind == "list" and value else as_yaml(value)
             self._changed(self.control, text)
+
+        self._when(part, heard)
 
     # ---- One for every kind of control
 

@@ -86,12 +86,15 @@ class Wish:
 
 @dataclass
 class Progress:
-    """What has been drawn of a page's wishes, which count up. last: when the last one came."""
+    """What has been drawn of a page's wishes, which count up. last: when the last one came. due:
+    when a drive that is played goes on.
+    """
 
     wished: int = 1
     drawn: int = 0
     rested: int = 0
     last: float = 0.0
+    due: float = 0.0
     factor: float = FACTORS[1]
     tasks: deque[Callable[[], None]] = field(default_factory=deque)
 
@@ -115,7 +118,7 @@ class Page:
         self._good: Recipe | None = None
         self._resolved: tuple[Edits, Recipe | RecipeError] | None = None
         self._fields: dict[str, Field] = {}
-        self._there: dict[str, Any] = {}
+        self._effects: dict[str, tuple[Any, Any]] = {}
         self._build()
         self._show_values()
         self._to_camera()
@@ -125,16 +128,17 @@ class Page:
 
     def recipe(self, edits: Edits) -> Recipe:
         """In numbers; RecipeError where the edits make none."""
-        if self._resolved is None or self._resolved[0] is not edits:
+        known = self._resolved  # two threads come here
+        if known is None or known[0] is not edits:
             try:
-                self._resolved = (edits, edits.recipe())
+                known = (edits, edits.recipe())
             except RecipeError as error:
-                self._resolved = (edits, error)
-        resolved = self._resolved[1]
-        if isinstance(resolved, RecipeError):
-            raise resolved
-        self._good = resolved
-        return resolved
+                known = (edits, error)
+            self._resolved = known
+        if isinstance(known[1], RecipeError):
+            raise known[1]
+        self._good = known[1]
+        return known[1]
 
     @property
     def good_recipe(self) -> Recipe | None:
@@ -305,47 +309,40 @@ class Page:
         hint = "Which draw from the recipe's ranges."
         self._variant = gui.add_number("variant", 0, min=0, max=2**31 - 1, step=1, hint=hint)
 
-        @preset.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self._take(event.target.value)
+        self._when(preset, self._take)
+        self._when(undo, lambda _: self._take(self.wish.edits.source), "on_click")
+        self._when(opened, lambda file: self._on_open(file.name, file.content), "on_upload")
+        self._when(self._seed, lambda number: self._set("seed", int(number)))
+        self._when(self._variant, lambda number: self._set("variant", int(number)))
 
-        @undo.on_click
-        async def _(_: Any) -> None:
-            self._take(self.wish.edits.source)
-
-        @opened.on_upload
-        async def _(event: Any) -> None:
-            self._on_open(event.target.value.name, event.target.value.content)
-
-        for name, part in (("seed", self._seed), ("variant", self._variant)):
-
-            @part.on_update
-            async def _(event: Any, name: str = name) -> None:
-                if event.client is not None:
-                    number = as_yaml(int(event.target.value))
-                    self.edit(self.wish.edits.with_values({name: number}), show=name == "variant")
+    def _set(self, path: str, value: Any) -> None:
+        """A field that others may follow."""
+        self.edit(self.wish.edits.with_values({path: as_yaml(value)}), show=True)
 
     def _build_group(self, group: Group) -> None:
-        """A folder; of an effect with a switch."""
+        """A folder; of an effect with a switch, below which its fields are while it is on."""
         gui = self.gui
         with gui.add_folder(group.label, expand_by_default=False):
-            if group.optional:
-                switch = self._there[group.path] = gui.add_checkbox("on", False, hint=group.hint)
+            if not group.optional:
+                self._build_fields(group)
+                return
+            switch = gui.add_checkbox("on", False, hint=group.hint)
+            self._when(switch, lambda there: self._switch(group.path, there))
+            with gui.add_folder(None, visible=False) as below:
+                self._build_fields(group)
+            self._effects[group.path] = (switch, below)
 
-                @switch.on_update
-                async def _(event: Any) -> None:
-                    if event.client is not None:
-                        edits, path = self.wish.edits, group.path
-                        there = event.target.value
-                        change = edits.with_section if there else edits.without_section
-                        self.edit(change(path), show=there)
+    def _build_fields(self, group: Group) -> None:
+        for control in group.controls:
+            own = Field(self.gui, control, self._when, self._on_change, self._on_upload)
+            self._fields[control.path] = own
+        for inner in group.groups:
+            self._build_group(inner)
 
-            for control in group.controls:
-                own = Field(gui, control, self._on_change, self._on_upload)
-                self._fields[control.path] = own
-            for inner in group.groups:
-                self._build_group(inner)
+    def _switch(self, section: str, there: bool) -> None:
+        edits = self.wish.edits
+        change = edits.with_section if there else edits.without_section
+        self.edit(change(section), show=True)
 
     def _build_view(self) -> None:
         gui, frames = self.gui, self.viewer.frames
@@ -362,20 +359,9 @@ class Page:
             "the arrow keys."
         )
 
-        @self._time.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self.go_to_frame(event.target.value)
-
-        @camera.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self._land(event.target.value)
-
-        @back.on_click
-        async def _(_: Any) -> None:
-            self._land(self.wish.camera)
-
+        self._when(self._time, self.go_to_frame)
+        self._when(camera, self._land)
+        self._when(back, lambda _: self._land(self.wish.camera), "on_click")
         with gui.add_folder("before and after"):
             self._toggle("split", "is_split", "Left of the line the scene without its weather.")
             line = gui.add_slider("line", 0.0, 1.0, 0.005, self.wish.share)
@@ -394,9 +380,20 @@ class Page:
         self._hear(self.gui.add_checkbox(label, False, hint=hint), name)
 
     def _hear(self, part: Any, name: str) -> None:
-        @part.on_update
-        async def _(event: Any) -> None:
-            self.ask(**{name: event.target.value})
+        self._when(part, lambda value: self.ask(**{name: value}))
+
+    def _when(self, part: Any, act: Callable[[Any], None], kind: str = "on_update") -> None:
+        """Have `act` told what people do to a widget. What it raises is said on the page."""
+
+        async def heard(event: Any) -> None:
+            if event.client is None:  # not people, but `_show_values`
+                return
+            try:
+                act(event.target.value)
+            except Exception as error:
+                self.viewer.report(self, error)
+
+        getattr(part, kind)(heard)
 
     def _build_quality(self) -> None:
         gui = self.gui
@@ -405,16 +402,15 @@ class Page:
         measure = gui.add_button("Measure the tiers on this view")
         self._tiers = gui.add_markdown("")
 
-        @self._tier.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                word = event.target.value
-                self.edit(self.wish.edits.with_tier(None if word == NONE else word), show=True)
+        self._when(self._tier, self._choose_tier)
+        self._when(measure, lambda _: self._measure(), "on_click")
 
-        @measure.on_click
-        async def _(_: Any) -> None:
-            self._tiers.content = "measuring"
-            self.do(lambda: self.viewer.measure_tiers(self))
+    def _choose_tier(self, word: str) -> None:
+        self.edit(self.wish.edits.with_tier(None if word == NONE else word), show=True)
+
+    def _measure(self) -> None:
+        self._tiers.content = "measuring"
+        self.do(lambda: self.viewer.measure_tiers(self))
 
     def _build_save(self) -> None:
         gui = self.gui
@@ -425,13 +421,11 @@ class Page:
         self._saved = gui.add_html("")
         self._command = gui.add_html("")
 
-        @recipe.on_click
-        async def _(_: Any) -> None:
-            self.do(lambda: self.viewer.save(self, self._name.value, with_picture=False))
+        self._when(recipe, lambda _: self._save(with_picture=False), "on_click")
+        self._when(picture, lambda _: self._save(with_picture=True), "on_click")
 
-        @picture.on_click
-        async def _(_: Any) -> None:
-            self.do(lambda: self.viewer.save(self, self._name.value, with_picture=True))
+    def _save(self, *, with_picture: bool) -> None:
+        self.do(lambda: self.viewer.save(self, self._name.value, with_picture=with_picture))
 
     def go_to_frame(self, number: int) -> None:
         self.ask(frame=number)
@@ -445,8 +439,8 @@ class Page:
         except RecipeError as error:
             self.show_error(str(error))
             return
-        for path, switch in self._there.items():
-            switch.value = found(recipe, path) is not None
+        for path, (switch, below) in self._effects.items():
+            switch.value = below.visible = found(recipe, path) is not None
         for path, own in self._fields.items():
             if found(recipe, path.rpartition(".")[0]) is not None:
                 own.show(found(recipe, path))

@@ -151,7 +151,7 @@ def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: s
     if shows == DEPTH and view.depth_m is not None:
         rgb = color_depth(view.depth_m)
     elif shows == CLASSES and view.semantic is not None:
-        rgb = _CLASS_COLORS[view.semantic]
+        rgb = color_classes(view.semantic)
     elif shows == INSTANCES and view.instance is not None:
         rgb = np.where(view.instance[..., None] > 0, color_numbers(view.instance), rgb // 3)
     elif shows.startswith("mask of "):
@@ -182,6 +182,11 @@ def color_numbers(numbers: np.ndarray) -> np.ndarray:
     hashed = numbers.astype(np.uint32) * np.uint32(2654435761)
     hashed ^= hashed >> np.uint32(15)
     return np.stack([64 + (hashed >> np.uint32(s)) % 192 for s in (0, 8, 16)], -1).astype(np.uint8)
+
+
+def color_classes(classes: np.ndarray) -> np.ndarray:
+    """uint8 [..., 3] of uint8 numbers of SemanticClass."""
+    return _CLASS_COLORS[classes]
 
 
 def _class_colors() -> np.ndarray:

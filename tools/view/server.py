@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import logging
+import math
 import shlex
 import socket
 import threading
@@ -19,7 +20,8 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -40,6 +42,7 @@ from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.edits import Edits, free_path, save_recipe, without_weather
+from tools.view.outputs import OutputViewer, is_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
@@ -65,6 +68,8 @@ JOIN_S = 10.0  # that the picture being drawn gets when the server ends
 def view_scene(options: ViewOptions) -> int:
     """Serves pages until it is interrupted. Returns the exit code."""
     viser = import_viser()
+    if is_output(options.scene):
+        return _serve_until_interrupted(viser, OutputViewer(Path(options.scene)), options)
     scene = open_scene(options.scene)
     check_frames(scene)
     given = (text.partition("=") for text in options.overrides)
@@ -73,16 +78,32 @@ def view_scene(options: ViewOptions) -> int:
     make_plan(edits.recipe(), scene)  # refuse before a page opens
     backend = choose_backend(options.backend, scene)
     viewer = Viewer(scene, options.scene, edits, options.out, backend)
+    return _serve_until_interrupted(viser, viewer, options)
+
+
+def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) -> int:
     with serve(viser, viewer, options.host, options.port) as url:
-        print(f"{scene.name}: {url}   (Ctrl-C ends it)", flush=True)
+        print(f"{options.scene}: {url}   (Ctrl-C ends it)", flush=True)
         if options.host not in LOOPBACK:
             print_note(
-                f"note: whoever reaches {options.host} sees this scene, and can have recipes and "
-                f"pictures written to {options.out}: there is no password"
+                f"note: whoever reaches {options.host} sees what is shown here, and can have files "
+                f"written to {options.out}: there is no password"
             )
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
     return 0
+
+
+class Pages(Protocol):
+    """What is served."""
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def open_page(self, client: ClientHandle) -> None: ...
+
+    def close_page(self, client: ClientHandle) -> None: ...
 
 
 def import_viser() -> Any:
@@ -104,7 +125,7 @@ def import_viser() -> Any:
 
 
 @contextlib.contextmanager
-def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
+def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
     """Pages at an address, as long as it lasts; its URL. The next free port, where one is taken.
 
     Raises:
@@ -127,7 +148,11 @@ def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
 
     @server.on_client_connect
     async def _(client: ClientHandle) -> None:
-        viewer.open_page(client)
+        connection = server._websock_server._live_connections[client.client_id]
+        if _is_ours(connection.request.headers, host):
+            viewer.open_page(client)
+        else:
+            await connection.close(1008, "pages of other sites have no business here")
 
     @server.on_client_disconnect
     async def _(client: ClientHandle) -> None:
@@ -139,6 +164,17 @@ def serve(viser: Any, viewer: Viewer, host: str, port: int) -> Iterator[str]:
     finally:
         viewer.stop()
         _stop(server)
+
+
+def _is_ours(headers: Any, host: str) -> bool:
+    """Whether a connection comes from our own page, or from no browser. Any site that someone
+    visits can have the browser connect to this machine, also by a name that it points here.
+    """
+    origin, asked = headers.get("Origin"), headers.get("Host", "")
+    if origin is None:
+        return True
+    name = urlsplit(f"//{asked}").hostname
+    return urlsplit(origin).netloc == asked and (host not in LOOPBACK or name in LOOPBACK)
 
 
 def _stop(server: ViserServer) -> None:
@@ -180,6 +216,14 @@ class Viewer:
                 page.is_closed = page.is_closed or page.client.client_id == client.client_id
             self.pages = [page for page in self.pages if not page.is_closed]
 
+    def report(self, page: Page, error: Exception) -> None:
+        """Says on the page what went wrong; of a defect, in the log where."""
+        if page.is_closed:
+            return
+        if not isinstance(error, ClimateGSError | RecipeError):
+            _LOG.error("%s", "".join(traceback.format_exception(error)))
+        page.show_error(f"{type(error).__name__}: {error}")
+
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -197,12 +241,7 @@ class Viewer:
             try:
                 self._work(page, work)
             except Exception as error:
-                if page.is_closed:
-                    continue
-                if not isinstance(error, ClimateGSError | RecipeError):
-                    _LOG.error("a picture failed\n%s", traceback.format_exc())
-                page.show_error(f"{type(error).__name__}: {error}")
-                page.show_status("not drawn")
+                self.report(page, error)
 
     def _next(self) -> tuple[Page | None, Any]:
         """The page that waits for longest and what to do for it; or None, and how long there is
@@ -217,33 +256,39 @@ class Viewer:
             if own.drawn < own.wished and (now - own.last < REST_S or page.wish.is_playing):
                 return page, "moving"
         for page in self.pages:
-            own = page.progress
-            if own.rested < own.wished:
-                left = own.last + REST_S - now
-                if left <= 0 and not page.wish.is_playing:
-                    return page, "rest"
+            own, playing = page.progress, page.wish.is_playing
+            if not playing and own.rested == own.wished:
+                continue
+            left = (own.due if playing else own.last + REST_S) - now
+            if left <= 0:
+                return page, "advance" if playing else "rest"
+            if left < math.inf:
                 pause = left if pause is None else min(pause, left)
-            elif page.wish.is_playing:
-                return page, "advance"
-        return None, None if pause is None else max(pause, 0.001)
+        return None, pause
 
     def _work(self, page: Page, work: Any) -> None:
         if callable(work):
             work()
             return
+        if work == "advance":
+            page.advance()
+            return
         with self.changed:
             wish, wished = page.wish, page.progress.wished
         moving = work == "moving"
-        started = time.perf_counter()
+        own = page.progress
+        own.due = math.inf
+        due = time.monotonic() + PLAY_S
         try:
             self._draw(page, wish, moving=moving)
+            own.due = due
+        except Exception:
+            page.show_status("not drawn")
+            raise
         finally:  # what failed is not tried again before something changes
-            page.progress.drawn = wished
+            own.drawn = wished
             if not moving:
-                page.progress.rested = wished
-        if wish.is_playing:
-            time.sleep(max(0.0, started + PLAY_S - time.perf_counter()))
-            page.advance()
+                own.rested = wished
 
     # ---- One picture -----------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ from augment.scene import Scene
 from augment.sky import is_stand_in
 
 LAYER_M = 1000.0  # from which rain and snow fall
-MAX_DROPS = 120_000  # drawn in a picture; what is beyond is veil sooner
+MAX_DROPS = 50_000  # drawn in a picture; what is beyond is veil sooner
 APERTURE_M, FOCUS_M = 3e-3, 6.0  # a lens of 6 mm at f/2, as cars have
 NEAR_M = 0.2  # no drop is closer
 UNKNOWN_AIRLIGHT = (0.76, 0.78, 0.80)  # display-encoded, of scenes that know no sky
@@ -49,7 +49,8 @@ _HORIZON_SINE = math.sin(math.radians(15.0))  # up to here is "above the horizon
 _SAMPLES = 4096  # of directions
 _AROUND_M = 30.0  # how far away most of what lights a drop is
 _REFRACTED, _SCATTERED = 0.94, 0.5  # how much of its light a drop, or a flake, has from behind it
-_SWAY_REACH_S = 2.5  # kernels._sway moves no flake farther than its speed in so long
+_AMONG_FLAKES = 0.5  # of a flake's light, which the flakes around it have scattered
+SWAY_REACH_S = 1.3  # kernels._sway moves no flake farther than its speed in so long
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,6 @@ class Walk(NamedTuple):
     cells: np.ndarray
     keys: np.ndarray
     moves: np.ndarray
-    times: np.ndarray
     sways: np.ndarray
     quantiles: np.ndarray
     shares: np.ndarray
@@ -171,7 +171,7 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     speeds = np.linalg.norm(velocity - motion.velocity_mps, axis=1)
     speeds += np.linalg.norm(motion.turn_radps) * farthest
     reach = cells_m * math.sqrt(0.75) + half_s * speeds + APERTURE_M / 2
-    reach += sizes.quantiles_m[:, -1] + _SWAY_REACH_S * falling.sway_mps
+    reach += sizes.quantiles_m[:, -1] + SWAY_REACH_S * falling.sway_mps
     # Of the image's sides, inwards; then of its front.
     normals = np.array([
         [camera.fx, 0, camera.cx], [-camera.fx, 0, camera.width - camera.cx],
@@ -190,8 +190,7 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
         np.stack([cells_m, reach, farthest], 1),
         rng.integers(0, 2**64, len(farthest), np.uint64),
         moves,
-        times[[0, 2]],
-        np.array([falling.sway_mps]),
+        np.array([falling.sway_mps, seconds]),
         sizes.quantiles_m,
         cell_counts(),
         planes,
@@ -234,6 +233,26 @@ def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
     return found
 
 
+def left_clear(
+    drops: Float32[np.ndarray, "N 9"], alpha: np.ndarray, depth: np.ndarray
+) -> Float32[np.ndarray, "H W"]:
+    """Share of each pixel that none of the drops covers. alpha, depth: float32 [H, W]."""
+    clear = np.ones_like(depth)
+    bands = -(-len(depth) // kernels.ROWS)
+    tops = np.minimum(drops[:, 1], drops[:, 3]) - drops[:, 7]
+    ends = np.maximum(drops[:, 1], drops[:, 3]) + drops[:, 7]
+    edges = np.clip(np.stack([tops, ends]) / kernels.ROWS, 0, bands - 1).astype(np.int64)
+    counts = edges[1] - edges[0] + 1
+    of_drops = np.repeat(np.arange(len(drops)), counts)
+    within = np.arange(len(of_drops)) - np.repeat(np.cumsum(counts) - counts, counts)
+    of_bands = (edges[0][of_drops] + within).astype(np.int16)
+    listed = of_drops[np.argsort(of_bands, kind="stable")]
+    begins = np.append(0, np.cumsum(np.bincount(of_bands, minlength=bands)))
+    with kernel_threads(1):
+        kernels.cover_pixels(drops, listed, begins, alpha, depth, clear)
+    return clear
+
+
 # ---- On a picture --------------------------------------------------------------------------------
 
 
@@ -243,7 +262,7 @@ class Veil(NamedTuple):
     rays: np.ndarray
     climb: np.ndarray
     bands: np.ndarray
-    far: np.ndarray
+    upwards: np.ndarray
     airlight: np.ndarray
     glow: np.ndarray
 
@@ -252,20 +271,23 @@ def veil_of(falling: Falling, camera: Camera, glow: Glow) -> Veil:
     """What of the extinction is not drawn, and what light it gives."""
     extinctions, whole = falling.sizes.extinctions_per_m, drawn_depths_m(falling, camera)
     begin = kernels.FADE * whole
-    total = float(extinctions.sum())
-    far = (total, float((extinctions * (begin + whole) / 2).sum()), total * LAYER_M)
+    grows = whole - begin
+    half_inverse = np.divide(0.5, grows, out=np.zeros_like(grows), where=grows > 0)
     world = camera.world_from_camera[:3, :3].numpy()
     from_behind = _REFRACTED if falling.kind == "rain" else _SCATTERED
     airlight = glow.airlight if falling.color is None else np.asarray(falling.color) ** 2
+    mean = glow.mean
+    if falling.kind == "snow":
+        mean = mean + _AMONG_FLAKES * (airlight - mean)
     numbers = (
         (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
         world[2],
-        np.stack([extinctions, begin, whole], 1),
-        far,
+        np.stack([extinctions, begin, grows, half_inverse, whole], 1),
+        float(extinctions.sum()) * LAYER_M,
         airlight,
-        np.concatenate([from_behind * glow.slope @ world, glow.mean[:, None]], 1),
+        np.concatenate([from_behind * glow.slope @ world, mean[:, None]], 1),
     )
-    return Veil(*(np.ascontiguousarray(n, np.float32) for n in numbers))
+    return Veil(*(np.asarray(n, np.float32, order="C") for n in numbers))
 
 
 def draw_falling(
@@ -286,11 +308,9 @@ def draw_falling(
     well. backend: on the CPU pixels go through a kernel, equal to the definition in
     augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
-    clear = np.ones((camera.height, camera.width), np.float32)
     surfaces = [t.detach().float().cpu().contiguous().numpy() for t in (alpha, depth)]
     drops = find_drops(walk_of(falling, camera, motion, scene.name))
-    with kernel_threads(1):
-        kernels.cover_pixels(drops, *surfaces, clear)
+    clear = left_clear(drops, *surfaces)
     extinction = falling.sizes.extinction_per_m
     glow = _in_fog(glow_of(scene), fog, float(camera.centre[2]), extinction)
     veil = veil_of(falling, camera, glow)
@@ -301,5 +321,5 @@ def draw_falling(
         return blend_by_torch(rgb, alpha, depth, left, veil), left
     sharp = rgb.detach().contiguous().numpy()
     with kernel_threads(ROWS):
-        kernels.blend_falling(sharp, *surfaces, clear, *veil)
+        kernels.blend_falling(sharp, *surfaces, clear, *veil._replace(upwards=veil.upwards[()]))
     return torch.from_numpy(sharp), torch.from_numpy(clear)

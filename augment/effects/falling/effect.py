@@ -23,8 +23,9 @@ from augment.scene import Scene
 from augment.timing import timed
 from recipes.rain import Rain
 from recipes.schema import Recipe
+from recipes.snowfall import Snowfall
 
-STREAKS = "rain streaks and veil"
+STREAKS, FLAKES = "rain streaks and veil", "snowflakes and veil"
 MASK_SHARE = 0.05  # of a pixel, covered by near drops: from here on it is the mask's
 
 
@@ -61,7 +62,7 @@ class RainEffect(FallingEffect):
         falling = Falling(
             "rain",
             rain.rate_mm_h,
-            _blows_to(rain.wind_mps, rain.wind_from_deg),
+            blows_to(rain.wind_mps, rain.wind_from_deg),
             0.0,
             recipe.seed,
             recipe.camera.exposure_ms / 1000,
@@ -74,7 +75,40 @@ class RainEffect(FallingEffect):
         return _fallen(own, drawn, camera, STREAKS, "rain")
 
 
-def _blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+class SnowfallEffect(FallingEffect):
+    """Snow in the air."""
+
+    name, section, model, mask = "snowfall", "weather.snowfall", Snowfall, "snowfall"
+    table = falling_table("snowfall", "flake")
+
+    def kernels(self, section: Snowfall) -> Any:
+        return section.changes or None
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        snowfall = self.of(recipe)
+        if snowfall is None or not snowfall.changes:
+            why = "the recipe has no snowfall"
+            if snowfall is not None:
+                why = "weather.snowfall.rate_mm_h is 0"
+            return Placed(None, skipped((FLAKES,), why, PICTURE))
+        falling = Falling(
+            "snow",
+            snowfall.rate_mm_h,
+            blows_to(snowfall.wind_mps, snowfall.wind_from_deg),
+            snowfall.turbulence_mps,
+            recipe.seed,
+            recipe.camera.exposure_ms / 1000,
+            snowfall.min_width_px,
+            snowfall.color,
+        )
+        return _placed(falling, FLAKES, scene)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        return _fallen(own, drawn, camera, FLAKES, "snowfall")
+
+
+def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:
+    """A wind's velocity along x and y. from_deg: 0 comes from +x, 90 from +y."""
     angle = math.radians(from_deg)
     return -speed_mps * math.cos(angle), -speed_mps * math.sin(angle)
 
@@ -90,7 +124,7 @@ def _placed(falling: Falling, step: str, scene: Scene) -> Placed:
         )
     why = (
         f"{falling.rate_mm_h:g} mm/h: extinction {1000 * falling.sizes.extinction_per_m:.3g}/km, "
-        f"streaks of {falling.exposure_s * 1000:g} ms"
+        f"shutter open for {falling.exposure_s * 1000:g} ms"
     )
     if interval is None:
         why += "; the cameras' speed is not known, so they stand"

@@ -7,12 +7,14 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL
+from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL, NUM_CLASSES
 from augment.render.cpu.jit import inner, kernel
+from augment.render.layout import U
 
-ROWS = 16  # image rows a thread takes at a time
+ROWS = 16  # image rows of a band, which a thread draws at a time
 FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
-SOFT_M = 0.1  # drops this far behind a surface are hidden
+SOFT = 0.03  # of its depth: so far behind a surface a drop is hidden
+LEAST_RADIUS = 1.25  # pixels; a smaller one would show where pixels lie
 NUM_NUMBERS = 9  # of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
@@ -43,11 +45,11 @@ def _sway(out, point, time, phase, sway):
     x, y, z = point[0], point[1], point[2]
     for wave in range(3):
         along = x if wave == 0 else y if wave == 1 else z
-        turn = (0.9 + 0.3 * wave) * time
-        angle = (1.1 + 0.4 * wave) * along
-        size = sway / (0.9 + 0.3 * wave) * 0.6
-        out[(wave + 1) % 3] += size * math.sin(angle + turn)
-        out[(wave + 2) % 3] += size * math.cos(1.3 * angle - turn)
+        pace = 2.0 + 0.7 * wave
+        angle = (1.1 + 0.4 * wave) * along + pace * time
+        size = 0.6 * sway / pace
+        out[(wave + 1) % 3] += size * math.sin(angle)
+        out[(wave + 2) % 3] += size * math.cos(angle)
     pace = 4 + 8 * phase
     out[0] += sway / pace * math.sin(pace * time + 50 * phase)
     out[1] += sway / pace * math.cos(pace * time + 50 * phase)
@@ -55,19 +57,20 @@ def _sway(out, point, time, phase, sway):
 
 @kernel
 def find_drops(
-    slabs, columns, cells, keys, moves, times, sways, quantiles, shares, planes, shutter, lens,
+    slabs, columns, cells, keys, moves, sways, quantiles, shares, planes, shutter, lens,
     offsets, counts, found,
 ):  # fmt: skip
     """counts [S]: drops of each slab of cells that may be seen. found [N, NUM_NUMBERS]: theirs from
-    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius to which it covers
-    nothing less, radius beyond which nothing, covered share. Empty: they are counted only.
+    offsets [S] on: column and row at both ends of a streak, 1 / z there, radius up to which it
+    covers as much as in its middle, radius beyond which nothing, covered share. Empty: they are
+    counted only.
 
     slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 3]: size, how far a
     drop can be from its cell's middle, depth to which the class is drawn. keys [B]: of the hashes.
     moves [B, 3, 3]: where the lattice has moved to as the shutter opens, between, as it closes.
-    times [2]: of opening and closing, for sways [1]. quantiles [B, Q]. shares: as
-    drops.cell_counts. planes [5, 4]: inwards normal and offset of the view's sides and its front.
-    shutter [2, 3, 4]: camera_from_world at both times. lens: fx, fy, cx, cy, width, height, least
+    sways: their speed, and the time. quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]:
+    inwards normal and offset of the view's sides and its front. shutter [2, 3, 4]:
+    camera_from_world as the shutter opens and closes. lens: fx, fy, cx, cy, width, height, least
     depth, diameter of the aperture, depth in focus. All float64 but for the integers and found.
     """
     is_counting = len(found) == 0
@@ -109,15 +112,16 @@ def find_drops(
                     bits = _mix(cell + np.uint64(drop + 1) * _GOLDEN)
                     more = _mix(bits ^ _GOLDEN)
                     ok = True
+                    at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 0, 0]
+                    at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 0, 1]
+                    at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 0, 2]
+                    if sways[0] > 0:  # which moves it less than its size while the shutter is open
+                        ends[0, 0], ends[0, 1], ends[0, 2] = at[0], at[1], at[2]
+                        _sway(at, ends[0], sways[1], _unit(more, 21), sways[0])
                     for end in range(2):
-                        m = 2 * end
-                        at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, m, 0]
-                        at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, m, 1]
-                        at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, m, 2]
-                        if sways[0] > 0:
+                        if end == 1:
                             for c in range(3):
-                                ends[end, c] = at[c]
-                            _sway(at, ends[end], times[end], _unit(more, 21), sways[0])
+                                at[c] += moves[b, 2, c] - moves[b, 0, c]
                         for c in range(3):
                             ends[end, c] = (
                                 shutter[end, c, 0] * at[0]
@@ -146,7 +150,7 @@ def find_drops(
                     focal = math.sqrt(lens[0] * lens[1])
                     wide = across / z * focal
                     blur = lens[7] * abs(1 / z - 1 / lens[8]) * focal
-                    outside = max(0.5 * (wide + blur) + 0.5, 1.0)
+                    outside = max(0.5 * (wide + blur) + 0.5, LEAST_RADIUS)
                     inside = max(0.5 * abs(wide - blur) - 0.5, 0.0)
                     u0 = lens[0] * ends[0, 0] / z0 + lens[2]
                     v0 = lens[1] * ends[0, 1] / z0 + lens[3]
@@ -163,11 +167,9 @@ def find_drops(
                         continue
                     if not is_counting:
                         length = math.sqrt((u1 - u0) ** 2 + (v1 - v0) ** 2)
-                        spread = length * (outside + inside)
-                        spread += (
-                            math.pi / 3
-                            * (outside * outside + outside * inside + inside * inside)
-                        )  # fmt: skip
+                        slope = (2 * outside + inside) * (outside - inside)
+                        spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
+                        spread += 0.5 * math.pi * (outside * outside + inside * inside)
                         fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
                         cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
                         row = offsets[slab] + number
@@ -181,54 +183,56 @@ def find_drops(
 
 
 @kernel
-def cover_pixels(drops, alpha, depth, clear):
+def cover_pixels(drops, listed, begins, alpha, depth, clear):
     """clear [H, W]: share of each pixel that none of the drops covers, in their order.
 
-    drops: as found by find_drops. alpha, depth [H, W]: of the surfaces; depth 0 where none is.
+    drops: as found by find_drops. listed: rows of it, those that reach into band b of ROWS image
+    rows from begins[b] to begins[b + 1]. alpha, depth [H, W]: of the surfaces; depth 0 where none
+    is.
     """
     height, width = clear.shape
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    for band in prange((height + ROWS - 1) // ROWS):
+    end = np.float32(width)
+    for band in prange(len(begins) - 1):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
-        for drop in range(len(drops)):
-            u0, v0, u1, v1 = drops[drop, 0], drops[drop, 1], drops[drop, 2], drops[drop, 3]
-            outside = drops[drop, 7]
-            if max(v0, v1) + outside < top or min(v0, v1) - outside > bottom:
-                continue
-            inside, share = drops[drop, 6], drops[drop, 8]
-            near, farther = drops[drop, 4], drops[drop, 5] - drops[drop, 4]
-            du, dv = u1 - u0, v1 - v0
+        for place in range(begins[band], begins[band + 1]):
+            drop = drops[listed[place]]
+            u0, v0, near, outside, share = drop[0], drop[1], drop[4], drop[7], drop[8]
+            du, dv, farther = drop[2] - u0, drop[3] - v0, drop[5] - near
             per_length = one / max(du * du + dv * dv, np.float32(1e-12))
-            ramp = one / (outside - inside)
-            lowest = np.int64(math.floor(min(v0, v1) - outside))
-            highest = np.int64(math.ceil(max(v0, v1) + outside))
-            for i in range(max(top, lowest), min(bottom, highest + 1)):
-                v = np.float32(i) + half
+            beyond = outside * outside
+            ramp = share / (beyond - drop[6] * drop[6])
+            leans = abs(dv) > np.float32(1e-3)
+            per_row = one / dv if leans else zero
+            first = max(top, np.int64(min(v0, drop[3]) - outside + np.float32(ROWS)) - ROWS)
+            last = min(bottom, np.int64(max(max(v0, drop[3]) + outside, zero)) + 1)
+            for row in range(first, last):
+                i = U(row)  # what is not signed needs no check
+                v = np.float32(row) + half - v0
                 # The piece of the streak that is so near to the row.
                 a, b = zero, one
-                if abs(dv) > np.float32(1e-3):
-                    a, b = (v - outside - v0) / dv, (v + outside - v0) / dv
-                    a, b = min(a, b), max(a, b)
-                    a, b = min(max(a, zero), one), min(max(b, zero), one)
+                if leans:
+                    middle, reach = v * per_row, outside * abs(per_row)
+                    a = min(max(middle - reach, zero), one)
+                    b = min(max(middle + reach, zero), one)
                 ua, ub = u0 + a * du, u0 + b * du
-                left = max(np.int64(math.floor(max(min(ua, ub) - outside, zero))), 0)
-                right = np.int64(math.ceil(min(max(ua, ub) + outside, np.float32(width))))
-                for j in range(left, min(right, width)):
-                    x, y = np.float32(j) + half - u0, v - v0
-                    along = min(max((x * du + y * dv) * per_length, zero), one)
+                ax, base = du * per_length, v * dv * per_length
+                left = np.int64(max(min(ua, ub) - outside, zero))
+                right = np.int64(min(max(max(ua, ub) + outside + one, zero), end))
+                for column in range(left, right):
+                    j = U(column)
+                    x, y = np.float32(column) + half - u0, v
+                    along = min(max(x * ax + base, zero), one)
                     x -= along * du
                     y -= along * dv
-                    covered = (outside - math.sqrt(x * x + y * y)) * ramp
-                    if covered <= zero:
-                        continue
-                    covered = min(covered, one) * share
+                    covered = min(max((beyond - (x * x + y * y)) * ramp, zero), share)
+                    # Without a branch, which no processor could foresee; 1 / z of the drop is
+                    # near + along * farther.
                     surface = depth[i, j]
-                    if surface > zero:
-                        z = one / (near + along * farther)
-                        before = (surface - z) * np.float32(1 / SOFT_M) + one
-                        before = min(max(before, zero), one)
-                        covered *= one - alpha[i, j] * (one - before)
+                    behind = (one - surface * (near + along * farther)) * np.float32(1 / SOFT)
+                    hidden = alpha[i, j] * min(max(behind, zero), one)
+                    covered *= one - (hidden if surface > zero else zero)
                     clear[i, j] *= one - covered
 
 
@@ -248,42 +252,57 @@ def _decay(y):
 
 
 @kernel
-def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, far, airlight, glow):
+def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, upwards, airlight, glow):
     """rgb [H, W, 3] behind the veil and the drops, in place.
 
     clear: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb [3]: the world's z along the
-    camera's axes. bands [B, 3]: extinction of a class, depth where it begins, depth from which
-    on it is whole. far [3]: sum of the extinctions, and of them times the depths that they lose;
-    optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the
-    camera's axes, and in the mean. Light is squares of display-encoded colours. All float32.
+    camera's axes. bands [NUM_CLASSES, 5]: extinction of a class, depth where it begins, over which
+    depth it grows, half its inverse, depth from which on it is whole. upwards: optical depth
+    straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the camera's axes,
+    and in the mean. Light is squares of display-encoded colours. All float32.
     """
     height, width = depth.shape
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    last = bands[len(bands) - 1, 2]
     for i in prange(height):
+        # In loops without branches, of few arrays each, so that LLVM writes vectors.
         v = (np.float32(i) + half - rays[3]) * rays[1]
-        for j in range(width):
-            u = (np.float32(j) + half - rays[2]) * rays[0]
-            length = math.sqrt(one + u * u + v * v)
-            z = depth[i, j]
-            tau = far[0] * z - far[1]
-            if z < last:
-                tau = zero
-                for b in range(len(bands)):
-                    begin, whole = bands[b, 1], bands[b, 2]
-                    inside = min(max(z - begin, zero), whole - begin)
-                    ramp = half * inside * inside / max(whole - begin, np.float32(1e-6))
-                    tau += bands[b, 0] * (ramp + max(z - whole, zero))
-            slope = climb[0] * u + climb[1] * v + climb[2]
+        tau, lengths = np.zeros(width, np.float32), np.empty(width, np.float32)
+        for b in range(NUM_CLASSES):
+            extinction, begin, grows = bands[b, 0], bands[b, 1], bands[b, 2]
+            half_inverse, whole = bands[b, 3], bands[b, 4]
+            for j in range(U(width)):
+                z = depth[i, j]
+                inside = min(max(z - begin, zero), grows)
+                tau[j] += extinction * (inside * inside * half_inverse + max(z - whole, zero))
+        across, left = rays[0], half - rays[2]
+        sideways, level = climb[0], climb[1] * v + climb[2]
+        for j in range(U(width)):
+            u = (np.float32(np.int32(j)) + left) * across
+            lengths[j] = math.sqrt(one + u * u + v * v)
+        for j in range(U(width)):
+            u = (np.float32(np.int32(j)) + left) * across
             # Of the sky: straight up over the sine of the elevation.
-            sky = _decay(far[2] * length / max(slope, np.float32(1e-6)))
-            shown = alpha[i, j] if z > zero else zero
-            seen = sky + shown * (_decay(tau * length) - sky)
-            through = clear[i, j]
-            per_length = one / length
-            for c in range(3):
-                light = glow[c, 3]
-                light += (glow[c, 0] * u + glow[c, 1] * v + glow[c, 2]) * per_length
-                own = max(rgb[i, j, c], zero)
-                own = airlight[c] + seen * (own * own - airlight[c])
-                rgb[i, j, c] = math.sqrt(max(light + through * (own - light), zero))
+            slope = max(sideways * u + level, np.float32(1e-6))
+            sky = _decay(upwards * lengths[j] / slope)
+            shown = alpha[i, j] if depth[i, j] > zero else zero
+            tau[j] = sky + shown * (_decay(tau[j] * lengths[j]) - sky)
+            lengths[j] = one / lengths[j]
+        red, green, blue = airlight[0], airlight[1], airlight[2]
+        red_mean, green_mean, blue_mean = glow[0, 3], glow[1, 3], glow[2, 3]
+        red_right, green_right, blue_right = glow[0, 0], glow[1, 0], glow[2, 0]
+        red_ahead = glow[0, 1] * v + glow[0, 2]
+        green_ahead = glow[1, 1] * v + glow[1, 2]
+        blue_ahead = glow[2, 1] * v + glow[2, 2]
+        for j in range(U(width)):
+            u = (np.float32(np.int32(j)) + left) * across
+            seen, through, k = tau[j], clear[i, j], lengths[j]
+            r, g, b = max(rgb[i, j, 0], zero), max(rgb[i, j, 1], zero), max(rgb[i, j, 2], zero)
+            light = red_mean + (red_right * u + red_ahead) * k
+            r = light + through * (red + seen * (r * r - red) - light)
+            light = green_mean + (green_right * u + green_ahead) * k
+            g = light + through * (green + seen * (g * g - green) - light)
+            light = blue_mean + (blue_right * u + blue_ahead) * k
+            b = light + through * (blue + seen * (b * b - blue) - light)
+            rgb[i, j, 0] = math.sqrt(max(r, zero))
+            rgb[i, j, 1] = math.sqrt(max(g, zero))
+            rgb[i, j, 2] = math.sqrt(max(b, zero))

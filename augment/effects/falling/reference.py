@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL, mix
-from augment.effects.falling.kernels import FADE, SOFT_M
+from augment.effects.falling.kernels import FADE, LEAST_RADIUS, SOFT
 
 if TYPE_CHECKING:
     from augment.effects.falling.air import Veil, Walk
@@ -52,12 +52,14 @@ def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
         return ((values >> np.uint64(shift)) & np.uint64(0x1FFFFF)) / 2.0**21
 
     within = np.stack([unit(bits, shift) for shift in (0, 21, 42)], 1)
-    ends = []
-    for end in range(2):
-        at = (cells[cell] + within) * size + walk.moves[number, 2 * end]
-        if walk.sways[0] > 0:
-            at = at + sway(at, walk.times[end], unit(more, 21), float(walk.sways[0]))
-        ends.append(at @ walk.shutter[end, :, :3].T + walk.shutter[end, :, 3])
+    at = (cells[cell] + within) * size + walk.moves[number, 0]
+    if walk.sways[0] > 0:
+        at = at + sway(at, walk.sways[1], unit(more, 21), float(walk.sways[0]))
+    closed = at + (walk.moves[number, 2] - walk.moves[number, 0])
+    ends = [
+        point @ pose[:, :3].T + pose[:, 3]
+        for point, pose in zip((at, closed), walk.shutter, strict=True)
+    ]
     place = unit(more, 0) * (walk.quantiles.shape[1] - 1)
     across = np.interp(place, np.arange(walk.quantiles.shape[1]), walk.quantiles[number])
     return _streaks(ends[0], ends[1], across, farthest, walk.lens)
@@ -67,11 +69,11 @@ def sway(at: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.nda
     """As kernels._sway, [N, 3]."""
     out = np.zeros_like(at)
     for wave in range(3):
-        pace = 0.9 + 0.3 * wave
-        angle = (1.1 + 0.4 * wave) * at[:, wave]
-        size = speed / pace * 0.6
-        out[:, (wave + 1) % 3] += size * np.sin(angle + pace * time)
-        out[:, (wave + 2) % 3] += size * np.cos(1.3 * angle - pace * time)
+        pace = 2.0 + 0.7 * wave
+        angle = (1.1 + 0.4 * wave) * at[:, wave] + pace * time
+        size = 0.6 * speed / pace
+        out[:, (wave + 1) % 3] += size * np.sin(angle)
+        out[:, (wave + 2) % 3] += size * np.cos(angle)
     pace = 4 + 8 * phase
     out[:, 0] += speed / pace * np.sin(pace * time + 50 * phase)
     out[:, 1] += speed / pace * np.cos(pace * time + 50 * phase)
@@ -92,13 +94,15 @@ def _streaks(
     z0, z1 = opened[:, 2], closed[:, 2]
     z, focal = (z0 + z1) / 2, math.sqrt(fx * fy)
     wide, blur = across / z * focal, aperture * np.abs(1 / z - 1 / focus) * focal
-    outside = np.maximum((wide + blur) / 2 + 0.5, 1)
+    outside = np.maximum((wide + blur) / 2 + 0.5, LEAST_RADIUS)
     inside = np.maximum(np.abs(wide - blur) / 2 - 0.5, 0)
     u = np.stack([fx * opened[:, 0] / z0 + cx, fx * closed[:, 0] / z1 + cx])
     v = np.stack([fy * opened[:, 1] / z0 + cy, fy * closed[:, 1] / z1 + cy])
     length = np.hypot(u[1] - u[0], v[1] - v[0])
-    spread = length * (outside + inside)
-    spread += math.pi / 3 * (outside**2 + outside * inside + inside**2)
+    # Of 1 up to `inside`, then falling as a parabola: across a line, and over a disc.
+    slope = (2 * outside + inside) * (outside - inside)
+    spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
+    spread += math.pi / 2 * (outside**2 + inside**2)
     fade = np.clip((farthest - z) / ((1 - FADE) * farthest), 0, 1)
     cover = np.minimum(math.pi / 2 * wide**2 / spread, 1) * fade
     shown = (z < farthest) & (u.max(0) >= -outside) & (v.max(0) >= -outside)
@@ -122,11 +126,11 @@ def cover_by_numpy(
         du, dv = u1 - u0, v1 - v0
         along = ((x - u0) * du + (y - v0) * dv) / max(du * du + dv * dv, 1e-12)
         along = along.clip(0, 1)
-        away = np.hypot(x - u0 - along * du, y - v0 - along * dv)
-        covered = ((outside - away) / (outside - inside)).clip(0, 1) * share
-        z, surface = 1 / (near + along * (far - near)), depth[rows, across]
-        before = ((surface - z) / SOFT_M + 1).clip(0, 1)
-        hidden = np.where(surface > 0, alpha[rows, across] * (1 - before), 0)
+        away = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
+        covered = ((outside**2 - away) / (outside**2 - inside**2)).clip(0, 1) * share
+        per_z, surface = near + along * (far - near), depth[rows, across]
+        behind = ((1 - surface * per_z) / SOFT).clip(0, 1)
+        hidden = np.where(surface > 0, alpha[rows, across] * behind, 0)
         clear[rows, across] *= 1 - covered * (1 - hidden)
     return clear
 
@@ -139,7 +143,7 @@ def blend_by_torch(
     veil: Veil,
 ) -> Float[Tensor, "H W 3"]:
     """As kernels.blend_falling."""
-    rays, climb, bands, far, airlight, glow = (
+    rays, climb, bands, upwards, airlight, glow = (
         torch.from_numpy(numbers).to(rgb.device, rgb.dtype) for numbers in veil
     )
     height, width = depth.shape
@@ -148,12 +152,11 @@ def blend_by_torch(
     v, u = torch.meshgrid(v, u, indexing="ij")
     length = torch.sqrt(1 + u * u + v * v)
     z = depth[..., None]
-    begin, whole = bands[:, 1], bands[:, 2]
-    inside = torch.minimum((z - begin).clamp_min(0), whole - begin)
-    ramp = inside**2 / 2 / (whole - begin).clamp_min(1e-6)
-    tau = (bands[:, 0] * (ramp + (z - whole).clamp_min(0))).sum(-1)
+    extinction, begin, grows, half_inverse, whole = bands.unbind(1)
+    inside = torch.minimum((z - begin).clamp_min(0), grows)
+    tau = (extinction * (inside**2 * half_inverse + (z - whole).clamp_min(0))).sum(-1)
     slope = climb[0] * u + climb[1] * v + climb[2]
-    sky = torch.exp(-(far[2] * length / slope.clamp_min(1e-6)).clamp_max(80))
+    sky = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
     shown = torch.where(depth > 0, alpha, 0)
     seen = sky + shown * (torch.exp(-(tau * length).clamp_max(80)) - sky)
     directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]

@@ -24,6 +24,10 @@ from augment.scene import Scene
 from recipes.lens_drops import LensDrops
 
 LIFE_S = (8.0, 40.0)  # of a drop on glass that nothing wipes
+# Drops above 0.5 mm that come down on a square metre in a second, by the rate in mm/h to the power
+# of 0.53: Marshall and Palmer's sizes at Atlas's speeds within 8 % from 2.5 to 100 mm/h.
+FLUX = 850.0
+MAX_COUNT = 500
 RUNS_FROM_M = 1.2e-3  # radius from which a drop overcomes the glass's hold
 RUN_MPS = 3e-3  # of a drop larger than that by a millimetre
 BALANCE_MPS = 15.0  # speed of the car at which the air stream carries as strongly as gravity
@@ -47,16 +51,26 @@ class Drops(NamedTuple):
 
 @dataclass(frozen=True)
 class PlacedDrops:
-    """drops: of the recipe. count: how many. seed: the recipe's."""
+    """drops: of the recipe. seed: the recipe's. rate_mm_h: of its rain."""
 
     drops: LensDrops
-    count: int
     seed: int
+    rate_mm_h: float = 0.0
+
+    def count_on(self, camera: Camera) -> int:
+        """How many a camera looks through: those that the recipe gives, or as many as its rain
+        brings to a pane across its way in the time that they stay.
+        """
+        if self.drops.count is not None:
+            return self.drops.count
+        area_m2 = self.drops.glass_m**2 * camera.width * camera.height / (camera.fx * camera.fy)
+        stay_s = sum(LIFE_S) / 2 if self.drops.wiper_s is None else self.drops.wiper_s
+        return min(round(FLUX * self.rate_mm_h**0.53 * area_m2 * stay_s), MAX_COUNT)
 
 
 def drops_at(placed: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
     """The drops on the camera's glass at its time."""
-    own, count = placed.drops, placed.count
+    own, count = placed.drops, placed.count_on(camera)
     rng = rng_for(
         seed=placed.seed, scene=scene.name, effect="camera.lens_drops", camera=camera.name
     )

@@ -11,6 +11,7 @@ from augment.effects.lens_drops.drops import PlacedDrops, drops_at
 from augment.effects.lens_drops.optics import blend_drops, draw_drops, map_surroundings
 from augment.scene import Scene
 from augment.timing import timed
+from recipes.fields import found
 from recipes.lens_drops import LensDrops
 from recipes.schema import Recipe
 
@@ -29,18 +30,23 @@ class LensDropsEffect(Effect):
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         drops = self.of(recipe)
+        rate_mm_h = found(recipe, "weather.rain.rate_mm_h") or 0.0
+        why = ""
         if drops is None or not drops.changes:
-            why = "the recipe has no drops on the lens"
-            if drops is not None:
-                why = "camera.lens_drops.count is 0"
+            absent = "the recipe has no drops on the lens"
+            why = absent if drops is None else "camera.lens_drops.count is 0"
+        elif drops.count is None and rate_mm_h == 0:
+            why = "camera.lens_drops.count is null, and there is no rain"
+        if drops is None or why:
             return Placed(None, skipped((ON_GLASS,), why, PICTURE))
         blur_mrad = 2000 * drops.aperture_m / drops.glass_m
+        many = f"{rate_mm_h:g} mm/h of" if drops.count is None else f"{drops.count}"
         why = (
-            f"{drops.count} drops about {drops.radius_mm:g} mm in radius, {drops.glass_m:g} m "
+            f"{many} drops about {drops.radius_mm:g} mm in radius, {drops.glass_m:g} m "
             f"before the lens, blurred over {blur_mrad:.3g} mrad; "
         )
         why += "never wiped" if drops.wiper_s is None else f"wiped every {drops.wiper_s:g} s"
-        data = PlacedDrops(drops, drops.count, recipe.seed)
+        data = PlacedDrops(drops, recipe.seed, rate_mm_h)
         return Placed(data, (Step(ON_GLASS, True, why, PICTURE),))
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:

@@ -435,13 +435,37 @@ def _grain_row(i, rgb, depth, snow, hidden, view, noise):
                 x, y, height = px, py, pz
                 du, dv = c[0] * du + c[1] * dv, c[3] * du + c[4] * dv
                 break
-        pixel_m = far / lens[0] / math.sqrt(max(abs(rz) / length, MIN_FALL))
+        pixel_m = _pixel_on_snow(i, j, depth, (rx, ry, rz), length, lens, pose)
         x, y, height = x + view.shift[0], y + view.shift[1], height + view.shift[2]
         bright = _grain_at(x, y, height, du, dv, pixel_m, view.relief, view.mottle, noise)
         clear = math.exp(-view.extinction * far) if view.extinction > 0.0 else 1.0
         factor = np.float32(1.0 + fade * snow[i, j] * clear * bright)
         for channel in range(3):
             rgb[i, j, channel] *= factor
+
+
+@inner()
+def _larger(a, b):
+    return a if abs(a) > abs(b) else b
+
+
+@inner()
+def _pixel_on_snow(i, j, depth, ray, length, lens, pose):
+    """Size of a pixel on the surface, metres: that of level snow, or more where the depth's change
+    to the neighbours shows that the surface is steeper along the ray, or ends.
+    """
+    z = np.float64(depth[i, j])
+    across = _larger(z - depth[i, max(j - 1, 0)], depth[i, min(j + 1, depth.shape[1] - 1)] - z)
+    down = _larger(z - depth[max(i - 1, 0), j], depth[min(i + 1, depth.shape[0] - 1), j] - z)
+    wide = high = 0.0
+    for c in range(3):
+        step, rise = (
+            across * ray[c] + z / lens[0] * pose[c, 0],
+            down * ray[c] + z / lens[1] * pose[c, 1],
+        )
+        wide, high = wide + step * step, high + rise * rise
+    fall, level = max(abs(ray[2]) / length, MIN_FALL), z * length / lens[0]
+    return max(math.sqrt(max(wide, high * fall * fall)), level) / math.sqrt(fall)
 
 
 @inner()

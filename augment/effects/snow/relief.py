@@ -4,7 +4,8 @@ A splat of snow is centimetres wide, which is dozens of pixels a few metres befo
 Every pixel that shows snow there is made brighter where the surface leans to the sun, and darker
 where it leans away or is dull: by noise that is a function of the place and the seed, so that all
 cameras and frames see one grain. It is the ground's, or a vehicle's, with which it drives on.
-Octaves of the noise that a pixel cannot show are left out (Perlin 1985, "An image synthesizer").
+Octaves of the noise that a pixel cannot show are left out (Perlin 1985, "An image synthesizer"), by
+its size on the surface: at the rounded edge of a roof noise would draw rings.
 """
 
 from __future__ import annotations
@@ -102,7 +103,10 @@ def _add_grain(
     across = (columns + 0.5 - float(lens[2])) / float(lens[0])
     down = (rows + 0.5 - float(lens[3])) / float(lens[1])
     rays = torch.stack([across, down, torch.ones_like(across)], 1).double() @ pose[:, :3].T
-    far = z * rays.norm(dim=1)
+    far, pixel_m = (
+        z * rays.norm(dim=1),
+        _pixels_on_snow(depth_m.double(), rows, columns, rays, view),
+    )
     places = z[:, None] * rays + pose[:, 3]
     steps = torch.from_numpy(view.sun).to(device).expand(len(z), 3)
     unmoved = torch.ones(len(z), dtype=torch.bool, device=device)
@@ -114,7 +118,7 @@ def _add_grain(
         places = torch.where(inside[:, None], local, places)
         steps = torch.where(inside[:, None], (steps @ turn.T), steps)
         unmoved &= ~inside
-    bright = _brightness(places, steps, rays, far, view)
+    bright = _brightness(places, steps, pixel_m, view)
     share = snow[rows, columns].double() * torch.exp(-view.extinction * far)
     share = share * (2 * (1 - far / FARTHEST_M)).clamp(0, 1)
     factor = (1 + share * bright)[:, None]
@@ -123,15 +127,29 @@ def _add_grain(
     return out
 
 
-def _brightness(
-    places: Tensor, steps: Tensor, rays: Tensor, far: Tensor, view: GrainView
+def _pixels_on_snow(
+    depth: Tensor, rows: Tensor, columns: Tensor, rays: Tensor, view: GrainView
 ) -> Tensor:
+    """Sizes of pixels on the surface, metres, as of the kernel's _pixel_on_snow."""
+    z, lens, pose = depth[rows, columns], view.lens, torch.from_numpy(view.pose).to(depth.device)
+    steps = []
+    for axis, own in ((1, columns), (0, rows)):
+        near = [(own + way).clamp(0, depth.shape[axis] - 1) for way in (-1, 1)]
+        a, b = (depth[(rows, n) if axis else (n, columns)] for n in near)
+        change = torch.where((z - a).abs() > (b - z).abs(), z - a, b - z)
+        axis_m = z / float(lens[1 - axis])
+        steps.append((change[:, None] * rays + axis_m[:, None] * pose[:, 1 - axis]).norm(dim=1))
+    lengths = rays.norm(dim=1)
+    fall = (rays[:, 2].abs() / lengths).clamp(min=kernels.MIN_FALL)
+    level = z * lengths / float(lens[0])
+    return torch.stack([steps[0], steps[1] * fall, level]).amax(0) / fall.sqrt()
+
+
+def _brightness(places: Tensor, steps: Tensor, pixel_m: Tensor, view: GrainView) -> Tensor:
     noise, mask = torch.from_numpy(noise_table()).to(places.device).double(), kernels.GRAIN_SIDE - 1
     places = places + torch.from_numpy(view.shift).to(places.device)
     (x, y, z), (dx, dy) = places.unbind(1), steps[:, :2].unbind(1)
-    fall = rays[:, 2].abs() / rays.norm(dim=1)
-    pixel_m = far / float(view.lens[0]) / fall.clamp(min=kernels.MIN_FALL).sqrt()
-    bright, texel = torch.zeros_like(far), kernels.COARSEST_TEXEL_M
+    bright, texel = torch.zeros_like(pixel_m), kernels.COARSEST_TEXEL_M
     cos, sin = kernels.TURN_COS, kernels.TURN_SIN
     for _ in range(kernels.GRAINS):
         shown = (kernels.SHOWN_AT * texel / pixel_m - 1).clamp(0, 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,10 +24,12 @@ from augment.effects.effect import (
     Sight,
     Step,
 )
+from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.light import light_of
 from augment.effects.snow.support import share_support
 from augment.effects.wet.darkening import darkened, wet_ratio, white_level
 from augment.effects.wet.ground import SETTINGS, WetGround, WetSplats, wet_ground, wet_splats
+from augment.effects.wet.lidar import wet_echoes
 from augment.effects.wet.reflection import (
     Film,
     Mirror,
@@ -156,6 +159,9 @@ class WetEffect(Effect):
                 *(rgb, camera, depth, share, own.prepared, film, mirror), backend=own.backend
             )
         return replace(drawn, rgb=rgb)
+
+    def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
+        wet_echoes(echoes, own.prepared, own.data.wetness, own.data.puddles)
 
 
 def _plane(own: Active, camera: Camera) -> Plane | None:

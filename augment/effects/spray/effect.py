@@ -1,0 +1,99 @@
+"""Spray as an effect: behind vehicles in the rain, on the finished picture and along beams."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+
+from augment.cameras import Camera
+from augment.effects.effect import (
+    PICTURE,
+    Active,
+    Drawn,
+    Effect,
+    InView,
+    Placed,
+    Sight,
+    Step,
+    skipped,
+)
+from augment.effects.falling.air import glow_of
+from augment.effects.falling.effect import blows_to
+from augment.effects.lidar.beam import Echoes
+from augment.effects.spray.lidar import spray_echoes
+from augment.effects.spray.picture import blend_puffs, windows_of
+from augment.effects.spray.puffs import FROM_MPS, Puffs, film_depth_m, spray_puffs, spraying_actors
+from augment.render.buffers import ALPHA, MEDIAN_DEPTH
+from augment.rng import rng_for
+from augment.scene import Scene
+from augment.timing import timed
+from recipes.rain import Rain
+from recipes.schema import Recipe
+
+SPRAY = "spray behind vehicles"
+
+
+@dataclass(frozen=True)
+class PlacedSpray:
+    """water_m: on the road. wind_mps: where it blows to. seed: the recipe's."""
+
+    water_m: float
+    wind_mps: tuple[float, float]
+    seed: int
+
+    def puffs(self, scene: Scene, time_ns: int) -> Puffs:
+        return spray_puffs(scene, time_ns, self.water_m, seed=self.seed, wind_mps=self.wind_mps)
+
+
+class SprayEffect(Effect):
+    """What vehicles lift from a wet road."""
+
+    name, section, model = "spray", "weather.rain", Rain
+
+    def kernels(self, section: Rain) -> Hashable:
+        return (section.changes and section.spray) or None
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        rain, why = self.of(recipe), ""
+        if rain is None or not rain.changes:
+            why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
+        elif not rain.spray:
+            why = "weather.rain.spray is false"
+        elif rain.ground_wetness == 0:
+            why = "weather.rain.wetness is 0"
+        elif not spraying_actors(scene):
+            why = f"no actor drives faster than {3.6 * FROM_MPS:.0f} km/h"
+        if rain is None or why:
+            return Placed(None, skipped((SPRAY,), why, PICTURE))
+        wind_mps = blows_to(rain.wind_mps, rain.wind_from_deg)
+        water_m = film_depth_m(rain.rate_mm_h) * rain.ground_wetness
+        placed = PlacedSpray(water_m, wind_mps, recipe.seed)
+        why = (
+            f"{len(spraying_actors(scene))} actors drive faster than {3.6 * FROM_MPS:.0f} km/h on "
+            f"{1000 * placed.water_m:.2g} mm of water"
+        )
+        return Placed(placed, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, MEDIAN_DEPTH}))
+
+    def in_view(self, own: Active, sight: Sight) -> InView:
+        puffs, camera = own.data.puffs(own.scene, sight.camera.timestamp_ns), sight.camera
+        windows = windows_of(puffs, camera)
+        if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
+            return InView(False, {SPRAY: "no spray can be in view"})
+        return InView(seen=puffs)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        raster = drawn.raster
+        assert raster.alpha is not None and raster.median_depth is not None
+        with timed(SPRAY):
+            rgb = blend_puffs(
+                *(drawn.rgb, raster.alpha, raster.median_depth, camera, own.seen),
+                glow_of(own.light).mean,
+                fog=drawn.layers.fog,
+                backend=own.backend,
+            )
+        return replace(drawn, rgb=rgb)
+
+    def meet(self, own: Active, echoes: Echoes, frame_ns: int) -> None:
+        key = f"lidar.spray at {frame_ns} ns"
+        rng = rng_for(seed=own.data.seed, scene=own.scene.name, effect=key)
+        spray_echoes(echoes, own.data.puffs(own.scene, frame_ns), rng)

@@ -1,0 +1,159 @@
+"""Puffs of spray before a picture: their light, and how much of the picture they take.
+
+The optical depth of a Gaussian puff along a ray, from the eye to the surface that the pixel shows,
+is in closed form, so a puff that holds the camera, or a car, is no special case:
+
+    tau = sigma sqrt(2 pi / a) |d| exp(-q / 2) (Phi(sqrt(a) (z - z0)) - Phi(-sqrt(a) z0))
+
+for a ray z d with unit z, a = |w d|^2, z0 where it comes closest to the centre, q the square of its
+distance there in standard deviations. Depths add up over puffs. Droplets scatter what light there
+is around them, alike in all directions: the mean of sky and ground.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.spray import kernels
+from augment.effects.spray.puffs import CUT, Puffs
+from augment.render.buffers import CPU, kernels_for
+from augment.render.composite import ROWS
+from augment.render.fog import Fog, optical_depth_of_arrays
+from augment.render.threads import kernel_threads
+
+_RUN_SD, _MAX_RUN = 12, 8  # runs of pixels: in standard deviations of a puff 1 / 12, and pixels
+
+
+def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
+    """Top, bottom, left, right of the pixels that each puff can show in, and in how long runs of a
+    row it hardly varies, int64 [N, 5].
+    """
+    pose = camera.camera_from_world.numpy()
+    centres = puffs.centres_m @ pose[:3, :3].T + pose[:3, 3]
+    own = puffs.whitenings @ pose[:3, :3].T
+    reach = CUT * np.linalg.inv(np.swapaxes(own, 1, 2) @ own)
+    windows = np.empty((len(centres), 5), np.int64)
+    sides = ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width))
+    for place, (axis, focal, middle, size) in zip((0, 2), sides, strict=True):
+        low, high = _tangents(centres[:, axis], centres[:, 2], reach[:, [axis, 2]][:, :, [axis, 2]])
+        with np.errstate(invalid="ignore"):
+            windows[:, place] = np.clip(np.floor(focal * low + middle), 0, size)
+            windows[:, place + 1] = np.clip(np.ceil(focal * high + middle), 0, size)
+    windows[centres[:, 2] + np.sqrt(reach[:, 2, 2]) <= 0, :4] = 0
+    deviations_px = (windows[:, 3] - windows[:, 2]) / (2 * math.sqrt(CUT))
+    windows[:, 4] = np.clip(deviations_px / _RUN_SD, 1, _MAX_RUN)
+    return windows
+
+
+def _tangents(x: np.ndarray, z: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest slope x / z of an ellipse's part of z > 0, seen from the origin [N]:
+    (x - s z)^2 = (1, -s) reach (1, -s). Infinite where it crosses z = 0.
+    """
+    a = z * z - reach[:, 1, 1]
+    b = x * z - reach[:, 0, 1]
+    c = x * x - reach[:, 0, 0]
+    inside = b * b - a * c
+    root = np.sqrt(np.maximum(inside, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (b - root) / a, (b + root) / a
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    is_right = x - z * reach[:, 0, 1] / reach[:, 1, 1] > 0  # where it crosses z = 0
+    crosses = a <= 0
+    low, high = (
+        np.where(crosses, np.where(is_right, high, -np.inf), low),
+        np.where(crosses, np.where(is_right, np.inf, low), high),
+    )
+    around = (inside <= 0) | ~np.isfinite(first) | ~np.isfinite(second)  # of the origin
+    return np.where(around, -np.inf, low), np.where(around, np.inf, high)
+
+
+def blend_puffs(
+    rgb: Float[Tensor, "H W 3"],
+    alpha: Float[Tensor, "H W"],
+    depth: Float[Tensor, "H W"],
+    camera: Camera,
+    puffs: Puffs,
+    light: np.ndarray,
+    *,
+    fog: Fog | None = None,
+    backend: str = CPU,
+) -> Float[Tensor, "H W 3"]:
+    """The picture behind the puffs. depth: z of surfaces, metres. light [3]: of the puffs, as the
+    square of display-encoded colours. fog: before them. On the CPU by a kernel, equal to this
+    definition within float rounding; `rgb` is overwritten.
+    """
+    windows = windows_of(puffs, camera)
+    seen = (windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])
+    if not seen.any():
+        return rgb
+    puffs, windows = Puffs(*(array[seen] for array in puffs)), windows[seen]
+    numbers, before = _numbers(puffs, camera, fog), np.zeros(3)
+    if fog is not None:
+        before = np.square(np.asarray(fog.rgb, np.float64))
+    surfaces = torch.where((alpha >= 0.5) & (depth > 0), depth, torch.inf).float()
+    if kernels_for(backend, rgb, depth) == CPU and rgb.is_contiguous():
+        rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        with kernel_threads(ROWS):
+            kernels.blend_puffs(
+                rgb.detach().numpy(), surfaces.contiguous().numpy(), rays, numbers, windows,
+                np.asarray(light, np.float64), before,
+            )  # fmt: skip
+        return rgb
+    return _blend_by_torch(rgb, surfaces, camera, numbers, windows, light, before)
+
+
+def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
+    """[N, 15], as of kernels.blend_puffs."""
+    rotation, eye = camera.camera_from_world[:3, :3].numpy(), camera.centre.numpy()
+    own = puffs.whitenings @ rotation.T
+    offsets = puffs.centres_m - eye
+    whitened = (puffs.whitenings @ offsets[:, :, None])[..., 0]
+    clear = np.ones(len(own))
+    if fog is not None:
+        away, heights = np.linalg.norm(offsets, axis=1), puffs.centres_m[:, 2]
+        clear = np.exp(-optical_depth_of_arrays(fog, away, np.full(len(own), eye[2]), heights))
+    strength = math.sqrt(2 * math.pi) * puffs.extinction_per_m
+    numbers = [own.reshape(-1, 9), whitened, strength[:, None], clear[:, None]]
+    return np.concatenate([*numbers, np.full((len(own), 1), CUT)], 1)
+
+
+def _blend_by_torch(
+    rgb: Tensor,
+    surfaces: Tensor,
+    camera: Camera,
+    numbers: np.ndarray,
+    windows: np.ndarray,
+    light: np.ndarray,
+    before: np.ndarray,
+) -> Tensor:
+    tau = torch.zeros(rgb.shape[:2], dtype=torch.float64, device=rgb.device)
+    clear = torch.zeros_like(tau)
+    v = torch.arange(camera.height, dtype=tau.dtype, device=tau.device)
+    v = (v + 0.5 - camera.cy) / camera.fy
+    for puff, (top, bottom, left, right, run) in zip(numbers, windows.tolist(), strict=True):
+        part = slice(top, bottom), slice(left, right)
+        u = torch.arange(right - left, device=tau.device) // run * run + left + run / 2
+        u = (u.to(tau.dtype) - camera.cx) / camera.fx
+        d = torch.stack(torch.broadcast_tensors(u, v[part[0], None], tau.new_ones(1)), -1)
+        own = d @ torch.from_numpy(puff[:9].reshape(3, 3)).to(tau.device).T
+        centre = torch.from_numpy(puff[9:12]).to(tau.device)
+        a = own.square().sum(-1)
+        nearest = (own @ centre) / a
+        off = centre.square().sum() - a * nearest.square()
+        per = (a / 2).sqrt()
+        passed = torch.erf(per * (surfaces[part] - nearest)) + torch.erf(per * nearest)
+        found = puff[12] * d.norm(dim=-1) / a.sqrt() * torch.exp(-off / 2) * passed.clamp_min(0) / 2
+        found = torch.where(off > puff[14], 0.0, found)
+        tau[part] += found
+        clear[part] += found * puff[13]
+    share = (clear / tau.clamp_min(1e-300))[..., None]
+    own = share * torch.from_numpy(light).to(tau) + (1 - share) * torch.from_numpy(before).to(tau)
+    left = torch.exp(-tau)[..., None]
+    blended = (left * rgb.clamp_min(0).square() + (1 - left) * own).sqrt().to(rgb.dtype)
+    return torch.where((tau > 0)[..., None], blended, rgb)

@@ -1,0 +1,52 @@
+"""What a recipe may say of falling snow."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from recipes.effect import Column, EffectModel, Knob
+from recipes.fields import Angle, Colour, Number
+from recipes.rain import MAX_WIND_MPS
+
+MAX_SNOWFALL_MM_H = 50.0  # of water: more than half a metre of snow an hour
+
+
+class Snowfall(EffectModel):
+    """Snow in the air: flakes near the camera, a white veil beyond; what lies is `snow`."""
+
+    meant_by = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
+    knobs = (
+        Knob("min_width_px", (2.0, 1.0, 0.5, 0.35), "flakes drawn one by one; the rest is veil", 8),
+    )
+    columns = (
+        Column(
+            "snowfall_rate_mm_h",
+            lambda it: it.rate_mm_h,
+            "Snowfall",
+            "mm/h",
+            absent=0.0,
+            shows="nonzero",
+            label="snowfall",
+            caption="snowfall {snowfall_rate_mm_h:.3g} mm/h",
+        ),
+    )
+
+    rate_mm_h: Number = Field(ge=0, le=MAX_SNOWFALL_MM_H)
+    """Water that falls as snow, about a tenth of the fresh snow's depth: light below 1, heavy above
+    2.5."""
+    wind_mps: Number = Field(default=0.0, ge=0, le=MAX_WIND_MPS)
+    """Speed of the wind, which the flakes have too."""
+    wind_from_deg: Angle = 0.0
+    """Where the wind comes from: 0 is world +x, 90 is +y."""
+    turbulence_mps: Number = Field(default=0.3, ge=0, le=5)
+    """Speed of eddies that the flakes follow, and of their own flutter."""
+    color: Colour | None = None
+    """Colour of the far veil, display-encoded sRGB; null for the sky's above the horizon."""
+    min_width_px: Number = Field(default=0.5, ge=0.1, le=16)
+    """Flakes are drawn one by one up to where they are this wide, pixels of the rendered picture;
+    farther ones are the veil."""
+
+    @property
+    def changes(self) -> bool:
+        """Snowfall without a rate changes nothing."""
+        return self.rate_mm_h > 0

@@ -1,0 +1,209 @@
+"""An output folder in the browser: its images, found by what they show and by their numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from augment.errors import OutputError
+from augment.jobs.files import decode_image, decode_png, depth_in_metres
+from augment.jobs.layout import mask_names, resolve_inside
+from augment.jobs.manifest import MANIFEST, OK, Row, read_finished, weather_columns
+from augment.jobs.store import open_store
+from recipes.schema import columns_of_effects
+from tools.view.fields import NONE
+from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+STEPS = 200  # of a slider of numbers
+
+
+def is_output(text: str) -> bool:
+    """Whether a command's scene is a folder that `climategs render` or `generate` wrote."""
+    return (Path(text) / MANIFEST).is_file()
+
+
+class OutputViewer:
+    """The finished images of an output folder, for the pages of one server.
+
+    Raises:
+        OutputError: there is no finished image, or the manifest is damaged.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        table = read_finished(open_store(str(out)))
+        self.rows: list[Row] = [row for row in table.to_pylist() if row["status"] == OK]
+        if not self.rows:
+            raise OutputError(f"{out} holds no finished image; run `climategs render` first")
+        self.numbers = [name for name in weather_columns(table) if len(self.values(name)) > 1]
+        self.pages: dict[int, OutputPage] = {}
+
+    def values(self, column: str) -> list[Any]:
+        """Those that a column has, sorted; NaN left out."""
+        found = {row[column] for row in self.rows}
+        return sorted(value for value in found if value is not None and value == value)
+
+    def picture(self, row: Row, shows: str) -> np.ndarray:
+        """uint8 [H, W, 3]: a row's image, or what stands for another file of the row.
+
+        Raises:
+            OutputError: the file is missing or damaged, or the row has none.
+        """
+        relative = row[f"{shows}_path"]
+        if not relative:
+            raise OutputError(f"{row['variant']} has no {shows} images")
+        path = resolve_inside(self.out, relative)
+        try:
+            data = path.read_bytes()
+            if shows == "image":
+                return decode_image(data)
+            if shows == "depth":
+                return color_depth(depth_in_metres(decode_png(data, np.uint16)))
+            if shows == "instance":
+                return color_numbers(decode_png(data, np.uint16))
+            numbers = decode_png(data, np.uint8)
+        except (OSError, ValueError) as error:
+            raise OutputError(f"cannot read {path}: {error}") from error
+        return color_classes(numbers) if shows == "semantic" else np.stack([numbers] * 3, -1)
+
+    def start(self) -> None:
+        """Pages draw for themselves."""
+
+    def stop(self) -> None:
+        """As `start`."""
+
+    def open_page(self, client: ClientHandle) -> None:
+        self.pages[client.client_id] = OutputPage(self, client)
+
+    def close_page(self, client: ClientHandle) -> None:
+        self.pages.pop(client.client_id, None)
+
+
+class OutputPage:
+    """One client's page. All runs on the server's event loop: there is little to do."""
+
+    def __init__(self, viewer: OutputViewer, client: ClientHandle) -> None:
+        self.viewer, self.client = viewer, client
+        rows, gui = viewer.rows, client.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        gui.main_panel.dock_right()
+        gui.set_panel_label(f"ClimateGS: {viewer.out.name}")
+        self._status = gui.add_markdown("")
+        self._scene = self._dropdown("scene", viewer.values("scene"))
+        self._camera = self._dropdown("camera", viewer.values("camera"))
+        frames = viewer.values("frame")
+        self._frame = gui.add_slider("frame", 0, max(len(frames) - 1, 1), 1, 0)
+        self._variant = self._dropdown("variant", viewer.values("variant"))
+        kinds = ("image", "depth", "semantic", "instance", *mask_names())
+        there = [k for k in kinds if any(row.get(f"{k}_path") for row in rows)]
+        self._shows = self._dropdown("shows", there)
+        self._other = self._dropdown("left of the line", [NONE, *viewer.values("variant")])
+        self._line = gui.add_slider("line", 0.0, 1.0, 0.005, 0.5)
+        self._ranges: dict[str, Any] = {}
+        with gui.add_folder("only images with", visible=bool(viewer.numbers)):
+            for name in viewer.numbers:
+                self._ranges[name] = self._range(name)
+        self._facts = gui.add_markdown("")
+        self._frames = frames
+        for part in (self._frame, self._line):
+            self._when(part, self._show)
+        self._show()
+        client.camera.on_update(self._on_camera)
+
+    def _dropdown(self, label: str, options: list[Any]) -> Any:
+        part = self.client.gui.add_dropdown(label, tuple(map(str, options)))
+        self._when(part, self._show)
+        return part
+
+    def _range(self, name: str) -> Any:
+        values = self.viewer.values(name)
+        low, high = float(values[0]), float(values[-1])
+        step = 10.0 ** math.floor(math.log10((high - low) / STEPS))
+        low, high = math.floor(low / step) * step, math.ceil(high / step) * step
+        column = columns_of_effects().get(name)
+        hint = column.title if column is not None else name
+        own = {"step": step, "initial_value": (low, high), "hint": hint}
+        part = self.client.gui.add_multi_slider(name, low, high, **own)
+        self._when(part, self._narrow)
+        return part
+
+    def _when(self, part: Any, act: Callable[[], None]) -> None:
+        @part.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                act()
+
+    async def _on_camera(self, _: Any) -> None:
+        self._show()
+
+    def _matches(self, row: Row) -> bool:
+        """Whether its numbers lie within the page's; of a number that it lacks, the whole range."""
+        for name, part in self._ranges.items():
+            (low, high), value = part.value, row[name]
+            missing = value is None or value != value
+            if missing and (low > part.min or high < part.max):
+                return False
+            if not missing and not low <= value <= high:
+                return False
+        return True
+
+    def _narrow(self) -> None:
+        """Only variants with an image whose numbers lie within the page's."""
+        rows = [row for row in self.viewer.rows if self._matches(row)]
+        variants = sorted({row["variant"] for row in rows})
+        if variants:
+            self._variant.options = tuple(variants)
+        self._show()
+
+    def _show(self) -> None:
+        matching = [row for row in self.viewer.rows if self._matches(row)]
+        frame = self._frames[min(self._frame.value, len(self._frames) - 1)]
+        wanted = {"scene": self._scene.value, "camera": self._camera.value, "frame": frame}
+        own = self._find(matching, wanted | {"variant": self._variant.value})
+        count = f"{len(matching)} of {len(self.viewer.rows)} images"
+        if own is None:
+            self._status.content = f"{count}; none of this scene, camera, frame and variant"
+            return
+        try:
+            picture = self.viewer.picture(own, self._shows.value)
+            before = self._find(self.viewer.rows, wanted | {"variant": self._other.value})
+            if before is not None:
+                left = self.viewer.picture(before, self._shows.value)
+                if left.shape == picture.shape:
+                    picture = split(left, picture, self._line.value)
+        except OutputError as error:
+            self._status.content = f"{count}; {error}"
+            return
+        camera = self.client.camera
+        shape = with_aspect(picture, camera.image_width / max(camera.image_height, 1))
+        self.client.scene.set_background_image(shape, "png")
+        self._status.content = f"**{picture.shape[1]} x {picture.shape[0]}**; {count}"
+        self._facts.content = _facts_of(own)
+
+    def _find(self, rows: list[Row], wanted: Row) -> Row | None:
+        return next((row for row in rows if wanted.items() <= row.items()), None)
+
+
+def with_aspect(picture: np.ndarray, aspect: float) -> np.ndarray:
+    """The picture in the middle of one of another shape, which loses none of its pixels."""
+    height, width = picture.shape[:2]
+    more_x, more_y = max(0, round(height * aspect) - width), max(0, round(width / aspect) - height)
+    left, top = more_x // 2, more_y // 2
+    sides = (top, more_y - top, left, more_x - left)
+    return cv2.copyMakeBorder(picture, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
+
+
+def _facts_of(row: Row) -> str:
+    """A table of all that the manifest says of an image."""
+    there = {n: v for n, v in row.items() if v not in (None, "") and v == v}
+    words = (f"{v:g}" if isinstance(v, float) else str(v) for v in there.values())
+    lines = (f"| {n} | {w.replace('|', ' ')} |" for n, w in zip(there, words, strict=True))
+    return "\n".join(["| column | value |", "|---|---|", *lines])
