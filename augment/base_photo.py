@@ -11,7 +11,10 @@ in the water, what is seen through it and what the screen reflects are the photo
 the photo is not, as the mirrored one, show splats.
 
 T and the sky's share are those of splats, whose edges lie pixels beside the photo's: a guided
-filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there.
+filter (He, Sun and Tang 2013, "Guided Image Filtering") moves them there. Things close to the
+camera lie further off: beside edges that the photo does not show, T is told by what is around, as
+far as the photo shows no edge between (Min et al. 2014, "Fast Global Image Smoothing Based on
+Weighted Least Squares").
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from jaxtyping import Float, Int16, UInt8
 from torch import Tensor
 
 from augment.cameras import Camera, Frame
+from augment.cast_shadows import FadedShadows
 from augment.errors import SceneError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
@@ -60,6 +64,15 @@ CLEAR_ALPHA, OPAQUE_ALPHA = 0.04, 0.96
 # colour that counts as an edge.
 RADIUS, EDGE = 1 / 320, 0.05**2
 WIDER = 4  # times as wide for the sky's share: splats of sky and of pale walls are told apart badly
+# Splats lie OFF_M beside what the photo shows, which is many pixels where that is close: edges of T
+# between surfaces, by at least EDGE_OF_T, that may be off by FEWEST_PX or more, at most a WIDEST of
+# the image's width, in a copy ALIGNED_PX wide. An edge of the photo has a contrast of PLAIN of 255
+# or more; where most of T's edges nearby (a NEARBY of the width) are on such, they are where they
+# belong. The further from the others, the more T counts, and everywhere a little, for what is
+# nothing but edge. REACH, ALIKE: of the smoothing, squared pixels and colours of 255.
+OFF_M, EDGE_OF_T, FEWEST_PX, WIDEST, ALIGNED_PX = 0.12, 0.1, 2, 1 / 30, 480
+PLAIN, NEARBY = 26, 1 / 20
+LITTLE, REACH, ALIKE = 0.02, 1000.0, 5.0
 # Where nothing is rendered, rays that fall by more than this (metres a metre) see the road, no sky.
 LEVEL = 0.02
 MAX_CONDITION = 1e3  # of a colour map that is undone: 8 bits come back exactly
@@ -201,7 +214,7 @@ class Photo:
     """A recorded image. camera: that took it, at its size. pixels: as recorded. backend: that
     draws. undone: the map from recorded colours to the scene's, which the camera's colour map turns
     back in the finished picture; None where these are the same. height_m: of the camera above the
-    road; None where unknown.
+    road; None where unknown. faded: the ground's shadows, in smog.
     """
 
     camera: Camera
@@ -210,6 +223,7 @@ class Photo:
     undone: Float[Tensor, "3 4"] | None = None
     height_m: float | None = None
     style: PhotoStyle | None = None
+    faded: FadedShadows | None = None
 
     def is_seen_by(self, camera: Camera) -> bool:
         """Whether the camera is a window of the photo's."""
@@ -253,6 +267,7 @@ class Photo:
         assert raster.rgb is not None and raster.alpha is not None
         land, sky, level = self.colors(raster, parts, camera)
         surface = land if level is None else mix(land, sky, level)
+        surface = self._without_sun(surface, raster, camera)
         if shown is not None:
             weight = shown if camera is self.camera else shown * self._inside(camera)
             own = (1 - weight)[..., None] * raster.rgb
@@ -270,6 +285,7 @@ class Photo:
         `prepare` gives.
         """
         rgb = self._land if self.style is None else self._styled(self.style, raster, parts)
+        rgb = self._without_sun(rgb, raster, self.camera)
         if raster.overlay is None:
             return rgb
         assert raster.rgb is not None
@@ -335,7 +351,7 @@ class Photo:
         """
         land, style, level = self._cut(self._land, camera), self.style, None
         if style is None:
-            return land, land, None
+            return land, self.sky_colors(camera), None
         if len(style.splats) > 1:
             assert raster.splat_ids is not None
             there = raster.splat_ids >= 0
@@ -350,6 +366,31 @@ class Photo:
             levels = style.levels.to(land.device)
             level = levels[(raster.splat_ids + 1).clamp_max(len(levels) - 1)]
         return land, self.sky_colors(camera), level
+
+    def _without_sun(
+        self, rgb: Float[Tensor, "H W 3"], raster: RenderOutput, camera: Camera
+    ) -> Float[Tensor, "H W 3"]:
+        """What surfaces show, with the shadows on the ground faded."""
+        depth, alpha = raster.expected_depth, raster.alpha
+        if self.faded is None or depth is None or alpha is None:
+            return rgb
+        small = camera.resized(*_at_most(camera, ALIGNED_PX))
+        z, shown = (
+            cv2.resize(
+                v.detach().cpu().float().contiguous().numpy(),
+                (small.width, small.height),
+                interpolation=cv2.INTER_NEAREST,
+            )
+            for v in (depth, alpha)
+        )
+        points = z[..., None] * small.ray_directions().numpy() + camera.centre.numpy()
+        points[shown < 0.5] = math.inf
+        lit, factors = self.faded.gains(points.astype(np.float32))
+        lit = cv2.resize(lit, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        if camera is self.camera:
+            lit = self.sharpen(torch.from_numpy(lit), WIDER).numpy()
+        steps = cv2.merge([np.rint(lit * 255).astype(np.uint8)] * 3)
+        return rgb * torch.from_numpy(cv2.LUT(steps, factors[None])).to(rgb.device)
 
     def sky_colors(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """What the sky shows at the pixels of a window."""
@@ -404,7 +445,8 @@ class Photo:
         assert raster.alpha is not None and raster.expected_depth is not None
         alpha, depth = opaque_alpha(raster.alpha), raster.expected_depth
         if kernels_for(self.backend, alpha, depth) == CPU:
-            return self.sharpen(self._transmittance_on_cpu(alpha, depth, fog))
+            found = self._transmittance_on_cpu(alpha, depth, fog)
+            return self.sharpen(self.aligned(found, alpha, depth))
         camera, device, fall = self.camera, alpha.device, self.fall
         lengths, eye_z_m = camera.ray_lengths(device=device), float(camera.centre[2])
         seen = torch.exp(-optical_depth(fog, depth * lengths, eye_z_m, eye_z_m - depth * fall))
@@ -414,7 +456,46 @@ class Photo:
             road_z_m = torch.full_like(fall, eye_z_m - self.height_m)
             to_road = optical_depth(fog, distance, eye_z_m, road_z_m)
             tau = torch.where(fall > LEVEL, to_road, tau)
-        return self.sharpen(alpha * seen + (1 - alpha) * torch.exp(-tau))
+        found = alpha * seen + (1 - alpha) * torch.exp(-tau)
+        return self.sharpen(self.aligned(found, alpha, depth))
+
+    def aligned(
+        self, values: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], depth: Float[Tensor, "H W"]
+    ) -> Float[Tensor, "H W"]:
+        """Values of about 0 to 1, beside edges of close things those of what is around there."""
+        size = _at_most(self.camera, ALIGNED_PX)
+        factor = self.camera.width / size[0]
+        full, shown, z = (v.detach().cpu().float().numpy() for v in (values, alpha, depth))
+        own = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+        shown, z = (cv2.resize(v, size, interpolation=cv2.INTER_NEAREST) for v in (shown, z))
+        z = np.where(shown > 0.5, z, np.float32(math.inf))
+        around = np.ones((5, 5), np.uint8)
+        whole = cv2.medianBlur(own, 5)  # without what a reconstruction has of dots
+        edges = (_contrast(whole) > EDGE_OF_T) & np.isfinite(cv2.dilate(z, around))
+        nearest_m = np.maximum(cv2.erode(z, around), 1e-3)
+        off_px = np.where(edges, self.camera.fx / factor * OFF_M / nearest_m, 0)
+        if off_px.max() < FEWEST_PX:
+            return values
+        guide = cv2.resize(self.pixels, size, interpolation=cv2.INTER_AREA)
+        nearby = (max(3, round(NEARBY * size[0])),) * 2
+        asked = (off_px >= FEWEST_PX).astype(np.float32)
+        unseen = asked * (_contrast(guide).max(-1) < PLAIN)
+        off_px[cv2.blur(unseen, nearby) < 0.5 * cv2.blur(asked, nearby)] = 0
+        trust, radius = np.ones(own.shape, np.float32), FEWEST_PX
+        while radius <= WIDEST * size[0]:
+            beside = off_px >= radius
+            if beside.any():
+                away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 3)
+                np.minimum(trust, (2 * away / radius - 1).clip(0, 1), out=trust)
+            radius *= 2
+        if trust.min() == 1:
+            return values
+        smooth = cv2.ximgproc.createFastGlobalSmootherFilter(guide, REACH, ALIKE)
+        weight = np.maximum(trust, np.float32(LITTLE))
+        told = smooth.filter(weight * own) / np.maximum(smooth.filter(weight), 1e-6)
+        shape = (self.camera.width, self.camera.height)
+        change = cv2.resize((1 - trust) * (told - own), shape, interpolation=cv2.INTER_LINEAR)
+        return torch.from_numpy(cv2.add(full, change)).to(values)
 
     def airlight(self, fog: Fog) -> Float[Tensor, "#H #W 3"]:
         """The fog's colour at each pixel; of one pixel where it is one."""
@@ -508,6 +589,18 @@ def open_photo(
         above = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(above, HIGHEST_M) if above > 0 else None
     return Photo(camera, pixels, backend, undone, height_m)
+
+
+def _at_most(camera: Camera, width_px: int) -> tuple[int, int]:
+    """Width and height of a copy of the camera's image."""
+    factor = max(1.0, camera.width / width_px)
+    return max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
+
+
+def _contrast(image: np.ndarray) -> np.ndarray:
+    """Between the highest and the lowest of each pixel and its neighbours."""
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(image, around) - cv2.erode(image, around)
 
 
 def blackened(parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:

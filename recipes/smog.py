@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import ConfigDict, Field, model_validator
 
 from recipes.effect import Column, EffectModel, Knob
-from recipes.fields import Colour, Number, one_of
+from recipes.fields import Colour, Number, Unit, one_of
 
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
@@ -18,7 +18,7 @@ class Smog(EffectModel):
 
     model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
     in_first_release = True
-    later_fields = ("overcast", "scatter")
+    later_fields = ("overcast", "scatter", "shadow_fade")
     meant_by = (
         ("smog", "fog haze mist"),
         ("extinction_per_m", "beta density sigma"),
@@ -62,6 +62,9 @@ class Smog(EffectModel):
     scatter: Number = Field(default=0.0, ge=0, le=4)
     """Forward scatter, which blurs what stands deep in fog: 1 for all that droplets of 20 um
     diffract, 0 for none, as of the finer particles of smog and haze."""
+    shadow_fade: Unit = 0.0
+    """How much of the ground's cast shadows goes with the sun's light that smog keeps from it: 1
+    all that its optical depth towards the sun says, 0 none."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:

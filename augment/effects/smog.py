@@ -20,8 +20,26 @@ from torch import Tensor
 from augment.base_photo import RECORDED
 from augment.boxes import NOT_COUNTED, PlacedBoxes, shown_pixels
 from augment.cameras import Camera
+from augment.cast_shadows import (
+    FadedShadows,
+    faded_shadows,
+    shadows_of,
+    share_shadows,
+    sun_transmittance,
+)
 from augment.drawing import LayerRenderer
-from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
+from augment.effects.effect import (
+    PICTURE,
+    SCENE,
+    Active,
+    Drawn,
+    Effect,
+    EffectView,
+    Placed,
+    Sharing,
+    Step,
+    skipped,
+)
 from augment.effects.lidar.beam import Echoes, LidarModel, signal
 from augment.effects.lidar.codes import LOST, SCATTERED
 from augment.errors import SceneError
@@ -38,6 +56,7 @@ from recipes.smog import KOSCHMIEDER
 
 PER_GAUSSIAN, ON_BUFFERS = "smog per Gaussian", "smog on buffers"
 ELEVATION, SKY, SCATTER = "airlight by elevation", "sky", "forward scatter"
+SHADOWS = "shadows in smog"
 DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is inverted
 
 
@@ -45,13 +64,15 @@ DAMPING = 1e-4  # of the squared gains of a camera's colour map, where that is i
 class PlacedSmog:
     """fog: in the scene's heights. on_buffers: applied to finished layers, not to every splat.
     is_common: whether the mean of the cameras' exposures gives its colour in all of them.
-    scatter: strength of the forward scatter.
+    scatter: strength of the forward scatter. sun: of its light, what arrives at the ground; 1 where
+    shadows stay as they are.
     """
 
     fog: Fog
     on_buffers: bool
     is_common: bool = False
     scatter: float = 0.0
+    sun: float = 1.0
 
 
 class SmogEffect(Effect):
@@ -75,7 +96,8 @@ class SmogEffect(Effect):
         fog, reason = _in_heights(smog, scene)
         if fog is None:
             nothing = skipped((PER_GAUSSIAN, ON_BUFFERS, ELEVATION), reason)
-            return Placed(None, (*nothing, *skipped((SCATTER,), reason, PICTURE)))
+            unchanged = skipped((SHADOWS,), reason, SCENE)
+            return Placed(None, (*unchanged, *nothing, *skipped((SCATTER,), reason, PICTURE)))
         is_common = recipe.render.exposure == "common" and scene.common_color_map is not None
         if is_common:
             reason += "; one airlight for all cameras, by the mean of their exposures"
@@ -87,7 +109,9 @@ class SmogEffect(Effect):
         sky = Step(SKY, True, "sampled, then faded through the smog up to infinity")
         if fog.scale_height_m is None:
             sky = Step(SKY, False, "uniform smog hides it: the airlight colour stands for it")
+        sun, fading = _sun_in(fog, smog, scene)
         steps = (
+            Step(SHADOWS, sun < 1, fading, SCENE),
             Step(PER_GAUSSIAN, not on_buffers, other if on_buffers else reason),
             Step(ON_BUFFERS, on_buffers, reason if on_buffers else other),
             Step(ELEVATION, fog.overcast > 0, f"weather.smog.overcast is {fog.overcast:g}"),
@@ -97,10 +121,23 @@ class SmogEffect(Effect):
         buffers = {EXPECTED_DEPTH} if on_buffers or fog.overcast > 0 else set[str]()
         if smog.scatter > 0:
             buffers.add(MEDIAN_DEPTH)  # which costs nothing where depth images are written
-        data = PlacedSmog(fog, on_buffers, is_common, smog.scatter)
+        data = PlacedSmog(fog, on_buffers, is_common, smog.scatter, sun)
         return Placed(data, steps, frozenset(buffers))
 
+    def prepare(self, own: Active) -> FadedShadows | None:
+        return faded_shadows(own.scene, own.data.sun)
+
+    def share(self, job: Sharing) -> None:
+        if any(smog and smog.shadow_fade > 0 for smog in map(self.of, job.recipes)):
+            share_shadows(job.scene)
+
     def edit_scene(self, own: Active, layers: LayerRenderer, camera: Camera) -> LayerRenderer:
+        faded = own.prepared if own.data.sun < 1 else None
+        if faded is not None:
+            with timed(SHADOWS):
+                parts = [p if p.instance_id or p.is_overlay else faded.on(p) for p in layers.parts]
+                photo = layers.photo and replace(layers.photo, faded=faded)
+                layers = replace(layers, parts=tuple(parts), photo=photo)
         fog, common = own.data.fog, own.scene.common_color_map
         if own.data.is_common and common is not None:
             fog = before_map(fog, own.scene.color_map(camera), common)
@@ -128,6 +165,21 @@ class SmogEffect(Effect):
 
     def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
         fog_echoes(echoes, own.data.fog, rng)
+
+
+def _sun_in(fog: Fog, smog: Smog, scene: Scene) -> tuple[float, str]:
+    """What of the sun's light counts as arriving at the ground, and why."""
+    if smog.shadow_fade == 0:
+        return 1.0, "weather.smog.shadow_fade is 0"
+    shadows = shadows_of(scene)
+    if shadows is None or shadows.certainty == 0:
+        return 1.0, "the ground shows no shadows of a sun"
+    ground_z_m = float(np.median(shadows.height_m[shadows.known > 0]))
+    sun = 1 - smog.shadow_fade * (1 - sun_transmittance(fog, shadows, ground_z_m))
+    return sun, (
+        f"shadows have {shadows.luminance_ratio:.2f} of the light beside them; {100 * sun:.0f} % "
+        f"of the sun's light comes through"
+    )
 
 
 def _in_heights(smog: Smog | None, scene: Scene) -> tuple[Fog | None, str]:

@@ -175,6 +175,28 @@ def test_the_kernels_are_their_definitions(scale_height_m, height_m):
         torch.testing.assert_close(fast, slow.float(), rtol=0, atol=2e-5)
 
 
+def test_a_close_thing_ends_where_the_photo_shows_its_end():
+    """Its splats reach 8 pixels further; where the photo shows their end no bit changes."""
+    camera = ahead(drive(sheet((0, 1), (0, 1)))).resized(320, 180)
+    fog = Fog(0.05, AIRLIGHT, None, 0.0)
+    columns = np.arange(320)
+    for end, moved in ((166, True), (174, False)):
+        gray = np.where(columns < end, 30, 120) + np.random.default_rng(0).integers(0, 6, (180, 1))
+        pixels = np.repeat(gray[..., None], 3, 2).astype(np.uint8)
+        photo = Photo(camera, pixels, "cpu")
+        depth = torch.from_numpy(np.where(columns < 174, 2.0, 40.0)).float().repeat(180, 1)
+        raster = RenderOutput(alpha=torch.ones(180, 320), expected_depth=depth)
+        found = photo.transmittance(raster, fog)[90]
+        near, far = float(found[120]), float(found[250])
+        assert near > 0.85 and far < 0.15
+        assert bool((found[:162] > 0.8).all()) and bool((found[182:] < 0.2).all())
+        if moved:
+            assert bool((found[170:] < 0.3).all())
+        else:
+            values = torch.where(depth < 10, 0.9, 0.1)
+            assert torch.equal(photo.aligned(values, torch.ones(180, 320), depth), values)
+
+
 STREET = "procedural:street?seed=3&frames=1"
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
+from augment.cast_shadows import linear_from_display
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.kernels import BARE_M, FARTHEST_M, FOLIAGE_MOST_M
 from augment.effects.snow.layer import (
@@ -24,13 +25,7 @@ from augment.effects.snow.layer import (
     profile_of,
     share_covered,
 )
-from augment.effects.snow.light import (
-    Illumination,
-    display_from_linear,
-    illumination_of,
-    light_of,
-    linear_from_display,
-)
+from augment.effects.snow.light import Illumination, display_from_linear, illumination_of, light_of
 from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
 from augment.effects.snow.relief import Carrier, Grain, add_grain
 from augment.geometry import rigid

@@ -409,9 +409,9 @@ def test_a_preset_comes_before_a_file_of_its_name(
 
 def test_the_presets_are_there() -> None:
     assert preset_names() == (
-        *("brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "dusting", "evening"),
-        *("fresh-snow", "light-haze", "overcast", "puddled", "rainy-day", "street-flood"),
-        *("winter-day", "winter-fog"),
+        *("blizzard", "brown-smog", "clear", "deep-flood", "deep-snow", "dense-fog", "downpour"),
+        *("drizzle", "dusting", "evening", "flurries", "fresh-snow", "light-haze", "overcast"),
+        *("puddled", "rain", "snowfall", "storm", "street-flood", "winter-day", "winter-fog"),
     )
     for name in preset_names():
         template = load_recipe(name)

@@ -156,7 +156,13 @@ def test_fog_over_snow() -> None:
 STYLES = {
     "overcast": {"overcast"},
     "evening": {"golden-hour", "dusk", "blue-hour"},
-    "rainy-day": {"rain"},
+    "drizzle": {"overcast"},
+    "rain": {"overcast"},
+    "downpour": {"rain"},
+    "storm": {"rain"},
+    "flurries": {"overcast"},
+    "snowfall": {"snow-light"},
+    "blizzard": {"snow-light"},
     "winter-day": {"snow-light"},
 }
 
@@ -171,15 +177,34 @@ def test_styled_presets_are_of_the_styles_documented(name: str) -> None:
     recipes = [template.resolve(i) for i in range(20)]
     drawn = [recipe.style for recipe in recipes if recipe.style is not None]
     assert len(drawn) == 20 and {style.preset for style in drawn} == STYLES[name]
-    has_weather = {"rainy-day", "winter-day"}
-    assert all((recipe.weather != Weather()) == (name in has_weather) for recipe in recipes)
+    is_clear = name in {"overcast", "evening"}
+    assert all((recipe.weather == Weather()) == is_clear for recipe in recipes)
 
 
 def test_weather_of_styled_days() -> None:
     assert load_recipe("winter-day").values["weather.snow.depth_m"] == Uniform(0.05, 0.15)
-    low, high = load_recipe("rainy-day").values["weather.smog.visibility_m"].probes()
-    assert (low, high) == (600, 1500)
-    levels = load_recipe("rainy-day").values["weather.flood.level_m"]
-    assert levels == Uniform(-0.02, 0.02)
-    flood = load_recipe("rainy-day").resolve(0).weather.flood
-    assert flood is not None and flood.reference == "median"
+
+
+# Least and greatest rate, mm/h, and wind, m/s, as documented.
+FALLING = {
+    "drizzle": (0.3, 1, 0, 3),
+    "rain": (5, 15, 1, 6),
+    "downpour": (35, 70, 1, 8),
+    "storm": (80, 150, 14, 24),
+    "flurries": (0.15, 0.4, 0, 4),
+    "snowfall": (0.8, 2.5, 0, 5),
+    "blizzard": (6, 15, 14, 22),
+}
+
+
+@pytest.mark.parametrize("name", FALLING)
+def test_what_falls_at_which_rate(name: str) -> None:
+    values = load_recipe(name).values
+    section = "snowfall" if "weather.snowfall.rate_mm_h" in values else "rain"
+    fields = (f"weather.{section}.{field}" for field in ("rate_mm_h", "wind_mps"))
+    found = [as_number(end) for field in fields for end in values[field].probes()]
+    assert tuple(found) == FALLING[name]
+    low, high, calm, windy = FALLING[name]
+    rows = [line for line in PAGE.splitlines() if line.startswith(f"| `{name}` |")]
+    (row,) = [line for line in rows if " mm/h" in line]
+    assert f"{low:g} to {high:g} mm/h" in row and f"{calm:g} to {windy:g} m/s" in row

@@ -286,8 +286,8 @@ def test_what_counts_as_without_weather() -> None:
         ({"flood_level_m": 0.0}, False),
         ({"smog_extinction_per_m": 1e-4}, False),
         ({"style": "dusk", "style_strength": 0.0}, True),
-        ({"rain_mm_per_h": 0.0}, True),
-        ({"rain_mm_per_h": 2.0}, False),
+        ({"hail_mm_per_h": 0.0}, True),
+        ({"hail_mm_per_h": 2.0}, False),
     ):
         assert find_draws(as_table([make_row(**changes)]))["is_clear"].to_pylist() == [clear], (
             changes

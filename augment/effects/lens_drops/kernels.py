@@ -23,19 +23,20 @@ def blend_drops(rgb, layer, step, margin, least, shown, mask):
         y = (np.float32(i) + half) / step + np.float32(margin) - half
         top = int(y)
         down = y - np.float32(top)
+        cells = np.empty((layer.shape[1], 4), np.float32)
+        for left in range(layer.shape[1]):
+            for k in range(4):
+                above = layer[top, left, k]
+                cells[left, k] = above + down * (layer[top + 1, left, k] - above)
         for j in range(rgb.shape[1]):
             x = (np.float32(j) + half) / step + np.float32(margin) - half
             left = int(x)
             right = x - np.float32(left)
-            a, b = (one - down) * (one - right), (one - down) * right
-            c, d = down * (one - right), down * right
-            cover = a * layer[top, left, 3] + b * layer[top, left + 1, 3]
-            cover += c * layer[top + 1, left, 3] + d * layer[top + 1, left + 1, 3]
+            cover = cells[left, 3] + right * (cells[left + 1, 3] - cells[left, 3])
             mask[i, j] = cover >= shown
             if cover >= least:
                 clear = max(one - cover, zero)
                 for k in range(3):
-                    light = a * layer[top, left, k] + b * layer[top, left + 1, k]
-                    light += c * layer[top + 1, left, k] + d * layer[top + 1, left + 1, k]
+                    light = cells[left, k] + right * (cells[left + 1, k] - cells[left, k])
                     behind = max(rgb[i, j, k], zero)
                     rgb[i, j, k] = math.sqrt(clear * behind * behind + max(light, zero))

@@ -14,6 +14,7 @@ from torch import Tensor
 from augment.bounds import Bounds, bound_chunks, bound_points, owners_seen
 from augment.boxes import NOT_COUNTED, PlacedBoxes
 from augment.cameras import Camera
+from augment.cast_shadows import share_shadows
 from augment.drawing import LayerRenderer
 from augment.effects.effect import (
     PICTURE,
@@ -33,7 +34,7 @@ from augment.effects.lidar.beam import Echoes
 from augment.effects.snow.kernels import FARTHEST_M
 from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.lidar import meet_snow
-from augment.effects.snow.light import illumination_of
+from augment.effects.snow.light import illumination_of, told_light
 from augment.effects.snow.near_camera import SIZE_M, Layer, SnowLayers
 from augment.effects.snow.relief import Carrier, add_grain
 from augment.effects.snow.snow import PlacedSnow, placed_in_snow, placement_settings, snow_pixels
@@ -92,7 +93,7 @@ class SnowEffect(Effect):
         reason = (
             f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, "
             f"no steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
-            f"{100 * snow.cell_m:g} cm near the path"
+            f"{100 * snow.cell_m:g} cm near the path; {told_light(scene, snow)}"
         )
         levels = (other.water_level_z_m for other in later.values())
         level_z_m = next((level for level in levels if level is not None), None)
@@ -115,6 +116,7 @@ class SnowEffect(Effect):
         """Where snow can lie."""
         found = (self.of(recipe) for recipe in job.recipes)
         for settings in dict.fromkeys(placement_settings(s) for s in found if s and s.changes):
+            share_shadows(job.scene)
             share_support(job, settings)
 
     def in_view(self, own: Active, sight: Sight) -> InView:

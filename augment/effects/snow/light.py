@@ -1,8 +1,9 @@
 """The light that snow in a scene would stand in: where the sun is, how bright it is, what colour.
 
-A recording rarely shows its sun, and its pictures hold no physical unit. The sky tells the
-direction and how much of the light is the sun's, and the road, whose albedo is roughly known, what
-a surface of a given albedo looks like at this exposure.
+A recording rarely shows its sun, and its pictures hold no physical unit. Shadows on the ground
+tell how much of the light is the sun's, and the sky where they do not; the sky tells the direction,
+unless shadows contradict it; and the road, whose albedo is roughly known, what a surface of a given
+albedo looks like at this exposure.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from augment.geometry import rotmat_from_quat
+from augment.cast_shadows import SOLID_OPACITY, is_low_and_level, linear_from_display, shadows_of
 from augment.memo import memo_of
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, Scene
+from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.sky import Sky
 from recipes.snow import Snow
@@ -35,8 +36,6 @@ _GROUND_ALBEDOS: tuple[tuple[SemanticClass | None, float, bool], ...] = (
     (None, 0.12, False),
 )
 _MIN_SPLATS = 20
-_SOLID_OPACITY = 0.5
-_LEVEL_COSINE = 0.9  # of a splat that may be ground where no class says so
 
 _SKY_SAMPLES = 16_384  # over the upper half, one in 1.1 degrees
 _SMOOTH_OVER = 40  # of them: a disc 8 degrees wide, so that no single texel wins
@@ -57,7 +56,11 @@ _UNKNOWN_SUN_DEG = (135.0, 45.0)  # azimuth, elevation, where the sky shows none
 
 # Light on snow in shadow over light on snow that faces the sun, at no sun and at nothing but sun.
 _SHADE_OVERCAST, _SHADE_CLEAR = 0.95, 0.50
+_DARKEST_SHADE = 0.35  # as the ground's shadows tell it: snow around lights shadows on snow
 _WRAP_OVERCAST, _WRAP_CLEAR = 0.9, 0.5
+# Shadows that explain at least so much of the ground's brightness move the sun, if one where the
+# sky has it explains less than that share of it.
+_TELLING, _AGREEING = 0.15, 0.75
 _SUN_TINT = (1.02, 1.0, 0.96)
 _TINT_RANGE = (0.8, 1.25)
 _KNEE, _CEILING = 0.45, 0.86  # linear; the ceiling is 0.93 display-encoded
@@ -82,15 +85,17 @@ class SceneLight:
     """What a scene shows of its light.
 
     azimuth_deg, elevation_deg: of the sun, 0 degrees azimuth is world +x. sun_share: 0 to 1, of the
-    light. contrast: of the sky's brightest region over its mean. sky_rgb_linear: mean of the upper
-    half by solid angle. ground_albedo: as assumed, None where no ground was found.
-    ground_rgb_linear: its median; the sky's mean without ground. ground_is_grey: its tint is the
-    light's.
+    light. shadow_ratio: luminance of shaded over lit ground, 1 where nothing casts a shadow; None
+    where the ground does not tell. contrast: of the sky's brightest region over its mean.
+    sky_rgb_linear: mean of the upper half by solid angle. ground_albedo: as assumed, None where no
+    ground was found. ground_rgb_linear: of what the sun lights, its median where there are no
+    shadows; the sky's mean without ground. ground_is_grey: its tint is the light's.
     """
 
     azimuth_deg: float
     elevation_deg: float
     sun_share: float
+    shadow_ratio: float | None
     contrast: float
     sky_rgb_linear: tuple[float, float, float]
     ground_albedo: float | None
@@ -120,9 +125,14 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     flat = math.cos(elevation)
     sun = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
     wrap = _mix(_WRAP_OVERCAST, _WRAP_CLEAR, share)
+    facing_level = max(0.0, sun[2] + wrap) / (1 + wrap)
     shade = _mix(_SHADE_OVERCAST, _SHADE_CLEAR, share)
+    if light.sun is None and found.shadow_ratio is not None:
+        # Level snow has the ratio of the level road: s = q (s + (1 - s) facing_level).
+        level = found.shadow_ratio * facing_level
+        shade = level / max(1 - found.shadow_ratio + level, 1e-6)
+        shade = min(max(shade, _DARKEST_SHADE), _SHADE_OVERCAST)
     if light.brightness is None:
-        facing_level = max(0.0, sun[2] + wrap) / (1 + wrap)
         lit = _shoulder(snow.albedo * _facing_light(found, shade, facing_level))
     else:
         given = float(linear_from_display(np.array(light.brightness)))
@@ -136,11 +146,6 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
         for linear in (lit_linear, _shadow(lit_linear, sky_linear, shade))
     )
     return Illumination(sun, lit_rgb, shadow_rgb, wrap)
-
-
-def linear_from_display(rgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def display_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -181,17 +186,40 @@ def _find_light(scene: Scene) -> SceneLight:
     )
     clear = _ramp(contrast, overcast_at, clear_at)
     clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
+    share, ratio = _mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear), None
     rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
+    shadows = shadows_of(scene)
+    if shadows is not None and albedo is not None:
+        ratio = shadows.luminance_ratio
+        share = min(max(1 - ratio, _OVERCAST_SHARE), _CLEAR_SHARE)
+        if shadows.certainty > 0:
+            rgb = rgb ** (1 - shadows.certainty) * np.array(shadows.lit_rgb) ** shadows.certainty
+        explains = shadows.certainty * float(shadows.explained.max())
+        if explains >= _TELLING and shadows.explained_by(azimuth_deg, elevation_deg) < _AGREEING:
+            azimuth_deg, elevation_deg = shadows.azimuth_deg, shadows.elevation_deg
     return SceneLight(
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
-        sun_share=_mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear),
+        sun_share=share,
+        shadow_ratio=ratio,
         contrast=contrast,
         sky_rgb_linear=_triple(sky_rgb),
         ground_albedo=albedo,
         ground_rgb_linear=_triple(rgb),
         ground_is_grey=is_grey,
     )
+
+
+def told_light(scene: Scene, snow: Snow) -> str:
+    """Where the light on a recipe's snow comes from, in a few words."""
+    if snow.light.sun is not None:
+        return f"light: weather.snow.light.sun is {snow.light.sun:g}"
+    found = light_of(scene)
+    if found.shadow_ratio is None:
+        return f"light: {100 * found.sun_share:.0f} % of it the sun's, by the contrast of the sky"
+    if found.shadow_ratio == 1:
+        return "light: flat, nothing casts a shadow on the ground"
+    return f"light: shadows on the ground have {found.shadow_ratio:.2f} of the light beside them"
 
 
 def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
@@ -234,10 +262,10 @@ def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
     By area: layers beneath a surface, which nothing sees, are of fewer and smaller splats.
     """
     g = scene.background
-    solid = (g.opacities > _SOLID_OPACITY).numpy()
+    solid = (g.opacities > SOLID_OPACITY).numpy()
     for semantic, albedo, is_grey in _GROUND_ALBEDOS:
         if semantic is None:
-            chosen = solid & _is_low_and_level(g, scene)
+            chosen = solid & is_low_and_level(g, scene)
         elif g.semantic is None:
             continue
         else:
@@ -250,22 +278,6 @@ def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
         linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
         return _median(linear, areas), albedo, is_grey
     return None
-
-
-def _is_low_and_level(g: Gaussians, scene: Scene) -> np.ndarray:
-    """Splats that may be ground: flat, and below the cameras, or in the scene's lower half."""
-    if len(g) == 0:
-        return np.zeros(0, bool)
-    up = rotmat_from_quat(g.quats)[:, 2].double().numpy()  # the world's z along each splat's axes
-    thinnest = g.scales.argmin(1).numpy()
-    is_level = np.abs(up[np.arange(len(g)), thinnest]) > _LEVEL_COSINE
-    z = g.means[:, 2].double().numpy()
-    eyes = [
-        float(-(pose[:3, :3].T @ pose[:3, 3])[2])
-        for frame in scene.frames
-        for pose in (camera.camera_from_world for camera in frame.cameras.values())
-    ]
-    return is_level & (z < (min(eyes) if eyes else float(np.median(z))))
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ import torch
 from tqdm import tqdm
 
 from augment.cameras import Camera
+from augment.cast_shadows import CastShadows, shadows_of
 from augment.effects.snow import surface_kernels
 from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells, SnowSupport
 from augment.effects.snow.height_map import (
@@ -338,6 +339,7 @@ _PAINT_M = 0.1  # so far beyond its own splats a marking may show
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # linear sRGB
 _SHARP_CELLS = 0.3  # a narrower blur leaves cells as they are
 _MIN_WEIGHT = 0.02
+_LIT = 0.8  # share of the light that is left where the sun shines
 _MIN_CLASS_CELLS = 50  # cells of a class, for its median to mean anything
 # What differs in colour as much as in light: their brightness says half as much.
 _MOTLEY = (SemanticClass.UNKNOWN, SemanticClass.VEGETATION, SemanticClass.OTHER)
@@ -377,21 +379,29 @@ def ground_luminance(
     return out
 
 
-def relative_light(luminance: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def relative_light(
+    luminance: np.ndarray, classes: np.ndarray, in_light: np.ndarray | None = None
+) -> np.ndarray:
     """float32 [C]: luminance [C] over the median of its class, see SnowCells.light; 1 where it is
-    NaN.
+    NaN. in_light: [C], what share of the light cast shadows leave, NaN where unknown; then medians
+    are of cells in the sun, and motley classes take it.
     """
     out = np.ones(len(luminance), np.float32)
     surfaces = np.where(classes == _MARKING, np.int16(_ROAD), classes)
     known = np.isfinite(luminance)
+    if in_light is None:
+        in_light = np.full(len(luminance), np.nan)
     for surface in np.unique(surfaces):
         here = known & (surfaces == surface)
-        usual = float(np.median(luminance[here])) if here.sum() >= _MIN_CLASS_CELLS else 0.0
+        told = here & (in_light > _LIT)
+        told = told if told.sum() >= _MIN_CLASS_CELLS else here
+        usual = float(np.median(luminance[told])) if told.sum() >= _MIN_CLASS_CELLS else 0.0
         if usual <= 1e-4:
             continue
         ratio = luminance[here] / np.float32(usual)
         if surface in _MOTLEY:
-            ratio = np.sqrt(np.maximum(ratio, 0))
+            by_shadows = in_light[here]
+            ratio = np.where(np.isfinite(by_shadows), by_shadows, np.sqrt(np.maximum(ratio, 0)))
         out[here] = ratio
     return np.clip(out, DARKEST, BRIGHTEST)
 
@@ -787,7 +797,10 @@ def place_snow_support(
         parts = [PosedGaussians(background), *parked]
         seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
         paths = wheel_paths(scene)
-        work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
+        work = _Ground(
+            *(background, parked, plan, views, seen_from, paths, settings),
+            *(shadows_of(scene), backend),
+        )
         in_turn = functools.partial(in_order, after_each=bar.update, backend=backend)
         found = in_turn(work.find, squares)
         find = functools.partial(find_actor_cells, **vars(settings), backend=backend)
@@ -832,9 +845,11 @@ class _Ground:
         views: Views,
         paths: tuple[WheelPath, ...],
         settings: PlacementSettings,
+        shadows: CastShadows | None,
         backend: str,
     ) -> None:
         self._background, self._parked, self._plan = background, parked, plan
+        self._shadows = shadows
         self._views, self._paths, self._settings = views, paths, settings
         self._backend = backend
         self._classes = classes_of(background)
@@ -880,7 +895,10 @@ class _Ground:
             numbers.put(square.level, square.columns, square.rows, to)
             count += len(square.rows)
         cells = CellList.joined([square.cells for square in squares])
-        light = relative_light(cells.luminance, cells.semantic)
+        in_light = None
+        if self._shadows is not None and self._shadows.certainty > 0:
+            in_light = self._shadows.light_at(cells.centers_m.astype(np.float64))
+        light = relative_light(cells.luminance, cells.semantic, in_light)
         return make_cells(cells, light, numbers.at, self._background)
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:

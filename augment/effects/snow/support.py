@@ -29,7 +29,7 @@ from augment.scene import Gaussians, Scene
 logger = logging.getLogger(__name__)
 
 # Raised whenever the same scene would give another support, or a file hold it otherwise.
-FORMAT = "climategs-snow-bed-6"
+FORMAT = "climategs-snow-bed-7"
 _ABOUT = "snow_bed"
 _DTYPES = {
     "neighbours": torch.int32,

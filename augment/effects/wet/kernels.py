@@ -19,6 +19,7 @@ HEIGHT, OPEN, RISE_X, RISE_Y, HOLLOW, TRACK, CHANNELS = range(7)
 
 SQUARE_M = 0.12  # a ring ends before it is as wide
 MAX_DROPS = 2  # in a square at a time
+AT = 9 * MAX_DROPS  # rows of drops that may reach a square; one more names it
 LIFE_NS = 400_000_000
 SPEED_MPS = 0.23  # least of capillary-gravity waves on water, whose length is 1.7 cm
 WAVE_M, WIDTH_M, SLOPE = 0.022, 0.016, 0.1
@@ -41,17 +42,10 @@ def _mix(bits):
 
 
 @inner()
-def rings_at(x, y, footprint, rings, seed, timestamp_ns):
-    """(slope x, slope y, variance of the rest). rings: share, variance, unseen."""
-    shown = (WAVE_M / max(footprint, 1e-9) - FADED_PX) / (FULL_PX - FADED_PX)
-    shown = min(max(shown, 0.0), 1.0)
-    shown = shown * shown * (3.0 - 2.0 * shown)
-    variance = rings[1] + (rings[2] - rings[1]) * shown * shown
-    sx = sy = 0.0
-    if shown <= 0.0 or rings[0] <= 0.0:
-        return sx, sy, variance
-    column, row = math.floor(x / SQUARE_M), math.floor(y / SQUARE_M)
+def _find_drops(column, row, rings, seed, timestamp_ns, drops):
+    """Enter the rings that may reach a square: how many, and x, y, radius and slope of each."""
     reach = SPEED_MPS * LIFE_NS * 1e-9
+    found = 0
     for di in range(-1, 2):
         for dj in range(-1, 2):
             i, j = column + di, row + dj
@@ -61,19 +55,41 @@ def rings_at(x, y, footprint, rings, seed, timestamp_ns):
                 passed = timestamp_ns + np.int64((first >> _S24) % _LIFE)
                 again, age = passed // LIFE_NS, (passed % LIFE_NS) / LIFE_NS
                 bits = _mix(first ^ (np.uint64(again) * _X))
-                if not np.float64(np.int64(bits & _LOW20)) * _UNIT < rings[0]:
-                    continue
-                u = np.float64(np.int64(bits >> _S44)) * _UNIT
-                v = np.float64(np.int64((bits >> _S24) & _LOW20)) * _UNIT
-                dx, dy = x - (i + u) * SQUARE_M, y - (j + v) * SQUARE_M
-                d = max(math.sqrt(dx * dx + dy * dy), 1e-4)
-                off = d - reach * age
-                if abs(off) > ENDS * WIDTH_M:
-                    continue
-                s = SLOPE * (1.0 - age) * (1.0 - age) * math.exp(-(off / WIDTH_M) * (off / WIDTH_M))
-                s *= math.sin(2.0 * math.pi * off / WAVE_M) / d
-                sx += s * dx
-                sy += s * dy
+                if np.float64(np.int64(bits & _LOW20)) * _UNIT < rings[0]:
+                    u = np.float64(np.int64(bits >> _S44)) * _UNIT
+                    v = np.float64(np.int64((bits >> _S24) & _LOW20)) * _UNIT
+                    drops[found, 0], drops[found, 1] = (i + u) * SQUARE_M, (j + v) * SQUARE_M
+                    drops[found, 2] = reach * age
+                    drops[found, 3] = SLOPE * (1.0 - age) * (1.0 - age)
+                    found += 1
+    drops[AT, 0], drops[AT, 1], drops[AT, 2] = column, row, found
+
+
+@inner()
+def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
+    """(slope x, slope y, variance of the rest). rings: share, variance, unseen. drops [AT + 1, 4]:
+    those about the square of the last point, which its last row names.
+    """
+    shown = (WAVE_M / max(footprint, 1e-9) - FADED_PX) / (FULL_PX - FADED_PX)
+    shown = min(max(shown, 0.0), 1.0)
+    shown = shown * shown * (3.0 - 2.0 * shown)
+    variance = rings[1] + (rings[2] - rings[1]) * shown * shown
+    sx = sy = 0.0
+    if shown <= 0.0 or rings[0] <= 0.0:
+        return sx, sy, variance
+    column, row = math.floor(x / SQUARE_M), math.floor(y / SQUARE_M)
+    if not (drops[AT, 0] == column and drops[AT, 1] == row):
+        _find_drops(column, row, rings, seed, timestamp_ns, drops)
+    for k in range(np.int64(drops[AT, 2])):
+        dx, dy = x - drops[k, 0], y - drops[k, 1]
+        d = max(math.sqrt(dx * dx + dy * dy), 1e-4)
+        off = (d - drops[k, 2]) / WIDTH_M
+        if abs(off) > ENDS:
+            continue
+        s = drops[k, 3] * math.exp(-off * off)
+        s *= math.sin((2.0 * math.pi * WIDTH_M / WAVE_M) * off) / d
+        sx += s * dx
+        sy += s * dy
     return sx * shown, sy * shown, variance
 
 
@@ -167,11 +183,13 @@ ASPHALT, PUDDLE = 0.085, 0.008  # standard deviations of slopes: alpha / sqrt 2 
 TRACK_SMOOTHS = 0.35  # share of the roughness that wheels have polished away
 FILM = 0.75  # of wet asphalt that shows water: stones stand out of it
 RIM = 0.12  # of a puddle, in HOLLOW
-MOTTLE_SIDE = 256  # texels of the noise that makes film and roughness uneven
+MOTTLE_SIDE = 256  # a power of 2: texels of the noise that makes film and roughness uneven
 FINE_M, COARSE_M = 0.012, 0.2  # its texels
 FINE, COARSE = 0.07, 0.05  # by how much of the film
 LEVELS = 9  # of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels
 FARTHEST_M = 1e5  # stands for the sky
+# Steps of the table of reflectance, and the largest deviation of slopes in it.
+COSINES, ROUGHNESSES, ROUGHEST = 512, 64, 0.4
 TABLE = 1024  # steps of the tables of the display's encoding
 
 
@@ -191,7 +209,8 @@ class Mirrored(NamedTuple):
 
 class Water(NamedTuple):
     """wetness, level: see reflection.Film. rings: share, variance, unseen. noise: MOTTLE_SIDE
-    squared. decoded: linear light of i / TABLE. encoded: display values of (i / TABLE)^2.
+    squared. reflectance [ROUGHNESSES + 1, COSINES + 1]. decoded: linear light of i / TABLE.
+    encoded: display values of (i / TABLE)^2.
     """
 
     wetness: float
@@ -200,6 +219,7 @@ class Water(NamedTuple):
     seed: np.uint64
     timestamp_ns: np.int64
     noise: np.ndarray
+    reflectance: np.ndarray
     decoded: np.ndarray
     encoded: np.ndarray
 
@@ -210,10 +230,20 @@ def _mottle(noise, x, y, texel):
     i, j = math.floor(u), math.floor(v)
     u, v = u - i, v - j
     side = MOTTLE_SIDE
-    i0, j0 = np.int64(i) % side, np.int64(j) % side
-    i1, j1 = (i0 + 1) % side, (j0 + 1) % side
+    i0, j0 = np.int64(i) & (side - 1), np.int64(j) & (side - 1)
+    i1, j1 = (i0 + 1) & (side - 1), (j0 + 1) & (side - 1)
     a = noise[j0, i0] + (noise[j0, i1] - noise[j0, i0]) * u
     b = noise[j1, i0] + (noise[j1, i1] - noise[j1, i0]) * u
+    return a + (b - a) * v
+
+
+@inner()
+def _look_up(table, cosine, rough):
+    u, v = cosine * COSINES, min(rough / ROUGHEST, 1.0) * ROUGHNESSES
+    i, j = min(np.int64(u), COSINES - 1), min(np.int64(v), ROUGHNESSES - 1)
+    u, v = u - i, v - j
+    a = table[j, i] + (table[j, i + 1] - table[j, i]) * u
+    b = table[j + 1, i] + (table[j + 1, i + 1] - table[j + 1, i]) * u
     return a + (b - a) * v
 
 
@@ -298,6 +328,8 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
     wetness, level, rings, noise = water.wetness, water.level, water.rings, water.noise
     seed, timestamp_ns = water.seed, water.timestamp_ns
     decoded, encoded = water.decoded, water.encoded
+    reflectance = water.reflectance
+    drops = np.full((AT + 1, 4), np.nan)
     b = (line + 0.5 - lens[3]) / lens[1]
     for x in range(depth.shape[1]):
         own = np.float64(share[line, x])
@@ -328,7 +360,7 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
         rough = ASPHALT * (1.0 - TRACK_SMOOTHS * track) * (1.0 - uneven)
         still = PUDDLE
         if puddle > 0.0:
-            sx, sy, variance = rings_at(wx, wy, footprint, rings, seed, timestamp_ns)
+            sx, sy, variance = rings_at(wx, wy, footprint, rings, seed, timestamp_ns, drops)
             nx -= sx * puddle
             ny -= sy * puddle
             still = math.sqrt(PUDDLE * PUDDLE + 0.5 * variance)
@@ -338,23 +370,22 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
         cosine = min(max(nx * ex + ny * ey + nz * ez, 0.005), 1.0)
         film = min(max(FILM + uneven + 0.1 * track, 0.0), 1.0)
         cover = wetness * (film + (1.0 - film) * puddle)
-        power = 5.0 * math.exp(-2.69 * rough)
-        fresnel = (1.0 - cosine) ** power / (1.0 + 22.7 * rough * math.sqrt(rough))
-        strength = own * cover * (R0 + (1.0 - R0) * fresnel)
+        strength = own * cover * _look_up(reflectance, cosine, rough)
         rx, ry, rz = 2.0 * cosine * nx - ex, 2.0 * cosine * ny - ey, 2.0 * cosine * nz - ez
         mx, my, mz = px - offset[0], py - offset[1], pz - offset[2]
-        way, column, row = 0.0, 0.0, 0.0
-        for _ in range(2):
-            tx, ty, tz = mx + way * rx, my + way * ry, mz + way * rz
-            column, row = _project(rotation, m_lens, tx, ty, tz)
-            way = _way_at(m_depth, rotation, m_lens, offset, column, row, px, py, pz)
+        column, row = _project(rotation, m_lens, mx, my, mz)
+        way = _way_at(m_depth, rotation, m_lens, offset, column, row, px, py, pz)
+        tx, ty, tz = mx + way * rx, my + way * ry, mz + way * rz
+        column, row = _project(rotation, m_lens, tx, ty, tz)
         sigma = m_lens[1] * 2.0 * rough * way / (way + distance)
-        sigma = sigma * sigma / (sigma + 1.0)
-        number = min(max(math.log2(max(sigma, 1.0)), 0.0), LEVELS - 1.0)
-        low = min(np.int64(number), LEVELS - 2)
+        sigma = max(sigma * sigma / (sigma + 1.0), 1.0)
+        low, width = np.int64(0), 1.0
+        while low < LEVELS - 2 and sigma >= 2.0 * width:
+            low, width = low + 1, 2.0 * width
+        upper = min(sigma / width - 1.0, 1.0)
         red = green = blue = 0.0
         for k in range(2):
-            weight = number - low if k else 1.0 - (number - low)
+            weight = upper if k else 1.0 - upper
             if weight > 0.0:
                 r, g, b_ = _texel(colors, table, low + k, column, row)
                 red, green, blue = red + weight * r, green + weight * g, blue + weight * b_
@@ -371,28 +402,36 @@ def shade_wet(view, depth, share, flat, rows, columns, mirror, water, rgb):
         _shade_row(np.int64(y), view, depth, share, flat, rows, columns, mirror, water, rgb)
 
 
+@inner()
+def _add_in_row(line, axes, centre, height, lens, rings, seed, timestamp_ns, nxs, nys, variance):
+    drops = np.full((AT + 1, 4), np.nan)
+    b = (line + 0.5 - lens[3]) / lens[1]
+    for x in range(nxs.shape[1]):
+        a = (x + 0.5 - lens[2]) / lens[0]
+        fall = -(axes[2, 0] * a + axes[2, 1] * b + axes[2, 2])
+        if not fall > LEAST_FALL:
+            continue
+        z = height / fall
+        px = centre[0] + z * (axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
+        py = centre[1] + z * (axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
+        length = math.sqrt(1.0 + a * a + b * b)
+        footprint = z * length / lens[1] / max(fall / length, LEAST_SINE)
+        sx, sy, rest = rings_at(px, py, footprint, rings, seed, timestamp_ns, drops)
+        nx, ny = np.float64(nxs[line, x]), np.float64(nys[line, x])
+        nz = math.sqrt(max(1.0 - nx * nx - ny * ny, 1e-6))
+        gx, gy = nx / nz - sx, ny / nz - sy
+        scale = 1.0 / math.sqrt(gx * gx + gy * gy + 1.0)
+        nxs[line, x], nys[line, x] = np.float32(gx * scale), np.float32(gy * scale)
+        variance[line, x] += np.float32(0.5 * rest)
+
+
 @kernel
 def add_rings(axes, centre, height, lens, rings, seed, timestamp_ns, normal_x, normal_y, variance):
     """Rings on the waves of a level plane, `height` below the eye, in place: normals' x and y, and
     the variance of slope, [H, W]. axes: world_from_camera [3, 3]. centre: world x and y.
     """
     for y in prange(normal_x.shape[0]):
-        line = np.int64(y)
-        b = (line + 0.5 - lens[3]) / lens[1]
-        for x in range(normal_x.shape[1]):
-            a = (x + 0.5 - lens[2]) / lens[0]
-            fall = -(axes[2, 0] * a + axes[2, 1] * b + axes[2, 2])
-            if not fall > LEAST_FALL:
-                continue
-            z = height / fall
-            px = centre[0] + z * (axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
-            py = centre[1] + z * (axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
-            length = math.sqrt(1.0 + a * a + b * b)
-            footprint = z * length / lens[1] / max(fall / length, LEAST_SINE)
-            sx, sy, rest = rings_at(px, py, footprint, rings, seed, timestamp_ns)
-            nx, ny = np.float64(normal_x[line, x]), np.float64(normal_y[line, x])
-            nz = math.sqrt(max(1.0 - nx * nx - ny * ny, 1e-6))
-            gx, gy = nx / nz - sx, ny / nz - sy
-            scale = 1.0 / math.sqrt(gx * gx + gy * gy + 1.0)
-            normal_x[line, x], normal_y[line, x] = np.float32(gx * scale), np.float32(gy * scale)
-            variance[line, x] += np.float32(0.5 * rest)
+        _add_in_row(
+            np.int64(y), axes, centre, height, lens, rings, seed, timestamp_ns,
+            normal_x, normal_y, variance,
+        )  # fmt: skip

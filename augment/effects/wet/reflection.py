@@ -36,6 +36,7 @@ from augment.effects.wet.kernels import (
     ASPHALT,
     COARSE,
     COARSE_M,
+    COSINES,
     FAINT,
     FAR_OFF,
     FAR_PER_M,
@@ -56,6 +57,8 @@ from augment.effects.wet.kernels import (
     RIM,
     RISE_X,
     RISE_Y,
+    ROUGHEST,
+    ROUGHNESSES,
     TABLE,
     TRACK,
     TRACK_SMOOTHS,
@@ -223,7 +226,9 @@ def _halved(image: Tensor) -> Tensor:
 
 def _look_up(levels: list[Tensor], column: Tensor, row: Tensor, sigma: Tensor) -> Tensor:
     """Colours [P, 3] between the two levels about a blur of sigma pixels."""
-    number = torch.log2(sigma.clamp_min(1.0)).clamp(0, LEVELS - 1)
+    sigma = sigma.clamp_min(1.0)
+    low = torch.log2(sigma).floor().clamp(0, LEVELS - 2)
+    number = low + (sigma / torch.exp2(low) - 1).clamp_max(1.0)
     out = torch.zeros(len(column), 3, dtype=column.dtype, device=column.device)
     for k, image in enumerate(levels):
         weight = (1 - (number - k).abs()).clamp_min(0)
@@ -358,8 +363,7 @@ def _seen_in_mirror(
 ) -> Tensor:
     """Linear light [H, W, 3] that the mirrored picture shows in rays from the ground.
 
-    A ray's length is first that of the flat mirror's, then what is shown where a ray of that length
-    ends.
+    A ray is as long as the flat mirror's.
     """
     view = mirror.camera
     axes = view.camera_from_world[:3, :3].to(ray)
@@ -380,7 +384,6 @@ def _seen_in_mirror(
 
     way = way_at(*project(points - to_mirror))
     column, row = project(points + way[..., None] * ray - to_mirror)
-    way = way_at(column, row)
     sigma = view.fy * 2 * rough * way / (way + distance)
     sigma = sigma * sigma / (sigma + 1)  # less than a pixel is none
     found = _look_up(mirror.levels, column.reshape(-1), row.reshape(-1), sigma.reshape(-1))
@@ -459,9 +462,18 @@ def _mirrored(mirror: Mirror, camera: Camera) -> kernels.Mirrored:
 
 
 def _water(film: Film) -> kernels.Water:
-    return kernels.Water(
-        film.wetness, film.level, *numbers_of(film.rings), mottle_table(), *_tables()
-    )
+    noise, tables = mottle_table(), _tables()
+    rings = numbers_of(film.rings)
+    return kernels.Water(film.wetness, film.level, *rings, noise, _reflectances(), *tables)
+
+
+@functools.cache
+def _reflectances() -> np.ndarray:
+    """`mean_reflectance` by slopes and cosine."""
+    cosines = torch.arange(COSINES + 1, dtype=torch.float64) / COSINES
+    slopes = ROUGHEST * torch.arange(ROUGHNESSES + 1, dtype=torch.float64) / ROUGHNESSES
+    slopes, cosines = torch.meshgrid(slopes, cosines, indexing="ij")
+    return mean_reflectance(cosines, slopes).numpy()
 
 
 @functools.cache
