@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
-import math
 import re
 import time
 from collections import deque
@@ -43,6 +43,7 @@ REST_S = 0.15  # without a change, after which the whole picture is drawn
 PLAY_S = 0.1  # from frame to frame
 POSE_M, POSE_RAD = 0.01, 0.002  # a camera that is nearer to where it was put has not been moved
 ECHO_S = 30.0  # that a window gets at most to say that it is where it was put
+SETTLE_S = 1.0  # after which it is there
 LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera around
 FRAME_S = 0.09  # what a picture may take while something moves
 FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
@@ -113,8 +114,8 @@ class Page:
         self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
         self._poses: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=30)
         self._window = (0, 0)
-        self._reported: tuple[np.ndarray, np.ndarray] | None = None  # where the window says it is
-        self._put_at = -math.inf  # when it was put elsewhere and has not said yet that it is there
+        self._reported: FreePose | None = None  # where the window says it is
+        self._quiet_until = 0.0  # the window is on its way to where it was put
         self.overlaid: Any = None  # what is drawn over the picture
         self._overlays: dict[str, Any] = {}
         self._good: Recipe | None = None
@@ -237,8 +238,8 @@ class Page:
         own, position = self.client.camera, pose[:3, 3]
         target = (position, pose[:3, :3])
         self._poses.append(target)
-        if self._reported is None or not _is_near(*self._reported, *target):  # else it stays silent
-            self._put_at = time.monotonic()
+        pause_s = SETTLE_S if self._is_at(target) else ECHO_S
+        self._quiet_until = time.monotonic() + pause_s
         with self.client.atomic():
             own.position = position
             own.look_at = position + LOOK_M * pose[:3, 2]
@@ -252,19 +253,32 @@ class Page:
 
     async def _on_camera(self, camera: Any) -> None:
         is_resized = self._resize(camera.image_width, camera.image_height)
-        wxyz = np.asarray(camera.wxyz, float)
-        self._reported = (wxyz, np.asarray(camera.position, float))
-        is_put = any(_is_near(*self._reported, *pose) for pose in self._poses)
-        if self.wish.pose is None and is_put:
-            self._put_at = -math.inf
+        position, wxyz = (tuple(map(float, each)) for each in (camera.position, camera.wxyz))
+        self._reported = FreePose(wxyz, position, float(camera.fov))
+        now = time.monotonic()
+        if self.wish.pose is None and self._is_put:
+            self._quiet_until = min(self._quiet_until, now + SETTLE_S)
             if is_resized:
                 self._to_camera()
                 self.ask()
-        elif time.monotonic() - self._put_at > ECHO_S:  # until then it may be from before
-            self._poses.clear()
-            pose = FreePose(tuple(wxyz), tuple(map(float, camera.position)), float(camera.fov))
-            if pose != self.wish.pose or is_resized:
-                self.ask(pose=pose)
+        elif now < self._quiet_until:  # it may be from before, or half way
+            pause_s = self._quiet_until - now
+            asyncio.get_running_loop().call_later(pause_s, self._fly_where_the_window_is)
+        elif self._reported != self.wish.pose or is_resized:
+            self._fly_where_the_window_is()
+
+    def _fly_where_the_window_is(self) -> None:
+        if time.monotonic() >= self._quiet_until and not self.is_closed and not self._is_put:
+            self.ask(pose=self._reported)
+
+    @property
+    def _is_put(self) -> bool:
+        """Whether the window shows a recorded camera's view that it was lately put at."""
+        return self.wish.pose is None and any(map(self._is_at, self._poses))
+
+    def _is_at(self, target: tuple[np.ndarray, np.ndarray]) -> bool:
+        own = self._reported
+        return own is not None and _is_near(np.array(own.wxyz), np.array(own.position), *target)
 
     def _resize(self, width: int, height: int) -> bool:
         """Whether the window has another shape, or more pixels than ever in this shape: a browser
