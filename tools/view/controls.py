@@ -20,6 +20,7 @@ from recipes.schema import SECTIONS
 STEPS = 400  # of a slider
 MAX_LINEAR = 10.0  # from it on a slider of numbers that are not negative is logarithmic
 DECADES = 6  # that a slider spans at most
+SEEN = 0.7  # the way along a logarithmic slider at which an effect is likely to be seen
 LEAST = 1e-3  # of a logarithmic slider; 0 lies at its left end, where it is allowed
 MAX_WORDS_WHOLE = 1000  # whole numbers in a wider range have no slider
 
@@ -223,16 +224,20 @@ def _numeric(leaf: Leaf, own: dict[str, Any]) -> Control:
 
 
 def start_of_model(section: str) -> dict[str, Any]:
-    """Values that make a valid section: nothing, or the middle of what must be given, or of one
-    field more, where the section's rules want one.
+    """Values that make a valid section which changes something: the middle of what must be given,
+    and of one field more where the section's rules want one, or where it is 0.
     """
     model, controls = SECTIONS[section], group_of(section).controls
-    needed = {c.label: c.start for c in controls if model.model_fields[c.label].is_required()}
+    required = [c for c in controls if model.model_fields[c.label].is_required()]
+    needed = {c.label: c.value_at(SEEN) if c.way == "log" else c.start for c in required}
     optional = [{c.label: c.start} for c in controls if c.nullable and is_number(c.start)]
-    for more in ({}, *optional):
+    zero = [c for c in controls if c.kind == "slider" and c.default == 0 and not c.nullable]
+    some = [{c.label: (int if c.whole else float)(c.value_at(0.2))} for c in zero]
+    for more in ({}, *optional, *some):
         try:
-            model.model_validate(needed | more)
+            made = model.model_validate(needed | more)
         except ValidationError:
             continue
-        return needed | more
+        if made.changes:
+            return needed | more
     return needed

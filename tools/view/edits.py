@@ -109,7 +109,7 @@ def start_of_section(section: str) -> dict[str, Any]:
     for name in preset_names():
         recipe = load_recipe(name).resolve(0)
         own = found(recipe, section)
-        if own is not None:
+        if own is not None and own.changes:
             start = own.model_dump(mode="json", exclude_defaults=True)
             found_in.append((len(recipe.sections()), len(start), name, start))
     if found_in:

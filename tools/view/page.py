@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import re
 import time
 from collections import deque
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 REST_S = 0.15  # without a change, after which the whole picture is drawn
 PLAY_S = 0.1  # from frame to frame
 POSE_M, POSE_RAD = 0.01, 0.002  # a camera that is nearer to where it was put has not been moved
-ECHO_S = 3.0  # that a window gets to say that it is where it was put
+ECHO_S = 30.0  # that a window gets at most to say that it is where it was put
 LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera around
 FRAME_S = 0.09  # what a picture may take while something moves
 FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
@@ -112,7 +113,8 @@ class Page:
         self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
         self._poses: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=30)
         self._window = (0, 0)
-        self._put_at = 0.0  # when; 0 once the window has said that it is there
+        self._reported: tuple[np.ndarray, np.ndarray] | None = None  # where the window says it is
+        self._put_at = -math.inf  # when it was put elsewhere and has not said yet that it is there
         self.overlaid: Any = None  # what is drawn over the picture
         self._overlays: dict[str, Any] = {}
         self._good: Recipe | None = None
@@ -233,8 +235,10 @@ class Page:
         camera = self.recorded_camera(self.wish)
         pose = camera.world_from_camera.numpy()
         own, position = self.client.camera, pose[:3, 3]
-        self._poses.append((position, pose[:3, :3]))
-        self._put_at = time.monotonic()
+        target = (position, pose[:3, :3])
+        self._poses.append(target)
+        if self._reported is None or not _is_near(*self._reported, *target):  # else it stays silent
+            self._put_at = time.monotonic()
         with self.client.atomic():
             own.position = position
             own.look_at = position + LOOK_M * pose[:3, 2]
@@ -249,9 +253,10 @@ class Page:
     async def _on_camera(self, camera: Any) -> None:
         is_resized = self._resize(camera.image_width, camera.image_height)
         wxyz = np.asarray(camera.wxyz, float)
-        is_put = any(_is_near(wxyz, camera.position, *pose) for pose in self._poses)
+        self._reported = (wxyz, np.asarray(camera.position, float))
+        is_put = any(_is_near(*self._reported, *pose) for pose in self._poses)
         if self.wish.pose is None and is_put:
-            self._put_at = 0.0
+            self._put_at = -math.inf
             if is_resized:
                 self._to_camera()
                 self.ask()
