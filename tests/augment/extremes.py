@@ -17,6 +17,7 @@ from hypothesis import assume
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from augment import effects
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import support_of
@@ -349,7 +350,7 @@ _TAMED: dict[str, st.SearchStrategy[Any]] = {
     "style.preset": st.sampled_from(("dusk", "night")),
     **dict.fromkeys(("style.image", "style.mask", "style.checkpoint", "style.digest"), st.none()),
 }
-EFFECTS = ("smog", "flood", "snow", "style")
+EFFECTS = ("smog", "flood", "snow", "style", "rain", "snowfall", "lens_drops")
 _NOT_OF_FRAMES = ("quality", "output")  # chooses settings; drawn after the weather
 
 
@@ -493,8 +494,8 @@ def check_view(view: WeatheredView, scene: Scene, recipe: Recipe) -> None:
     if view.depth_m is not None:
         assert view.depth_m.dtype == np.float32 and view.depth_m.shape == size
         assert np.isfinite(view.depth_m).all() and (view.depth_m >= 0).all()
-    weather = {"water": recipe.weather.flood, "snow": recipe.weather.snow}
-    assert view.masks.keys() == {name for name, section in weather.items() if section is not None}
+    masks = {e.mask for e in effects.EFFECTS if e.mask and e.of(recipe) is not None}
+    assert view.masks.keys() == masks
     for mask in view.masks.values():
         assert mask.dtype == np.uint8 and mask.shape == size
         assert np.isin(mask, (0, 255)).all()

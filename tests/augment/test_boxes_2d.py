@@ -15,7 +15,7 @@ from snow_scenes import box_car, drive, stack_all
 from augment.boxes import MAX_INSTANCE, Instances, instances_of
 from augment.cameras import Camera
 from augment.dataset import SceneDataset, WeatherDataset, box_masks, boxes_2d, torchvision_sample
-from augment.dataset.samples import box_tensors
+from augment.dataset.samples import box_tensors, buffers
 from augment.errors import AdapterError
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
 from augment.jobs.box_tables import BoxNumbers, BoxWeather
@@ -399,7 +399,7 @@ def a_sample(boxes: Boxes, frame: str = "world", weather: BoxWeather | None = No
     origins = {"ego": world_from_ego, "camera": world_from_camera, "world": torch.eye(4)}
     camera = {"name": "front", "width": WIDTH, "height": HEIGHT, "timestamp_ns": 0, "K": K}
     camera |= {"world_from_camera": world_from_camera, "world_from_ego": world_from_ego}
-    images = dict.fromkeys(("depth", "semantic", "instance", "water", "snow", "trust"))
+    images = dict.fromkeys(buffers())
     return {
         "boxes": box_tensors(there, weather or {}, frame, origins[frame].numpy()),
         "camera": camera,

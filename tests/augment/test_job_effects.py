@@ -315,14 +315,18 @@ def test_visibility_is_what_all_effects_leave(whole: Path) -> None:
     smog = box_tables()["box_smog"].from_json([names, [0.5, 0.25, 1.0, np.nan], [9, 0, 9, -1]])
     water = box_tables()["box_water"].from_json([names, [0.0] * 4, [10, 0, 4, 0], [5, 0, 4, 0]])
     snow = box_tables()["box_snow"].from_json([names, [-1, -1, 8, -1], [0, 0, 2, 0]])
-    everything = {"box_smog": smog, "box_water": water, "box_snow": snow}
+    rain = box_tables()["box_rain"].from_json([names, [0.5] * 4, [9] * 4, [0] * 4])
+    snowfall = box_tables()["box_snowfall"].from_json([names, [1.0] * 4, [9] * 4, [0] * 4])
+    everything = {"box_smog": smog, "box_water": water, "box_snow": snow, "box_rain": rain,
+                  "box_snowfall": snowfall}  # fmt: skip
     assert everything.keys() == box_tables().keys() - {"box_2d"}  # which is not of the weather
     for effects, expected in (
         ({}, [1, 1, 1, 1]),
         ({"box_smog": smog}, [0.5, 0.25, 1, 1]),
         ({"box_water": water}, [0.5, 1, 0, 1]),
         ({"box_snow": snow}, [1, 1, 0.75, 1]),
-        (everything, [0.25, 0.25, 0, 1]),
+        ({"box_rain": rain}, [0.5] * 4),
+        (everything, [0.125, 0.125, 0, 0.5]),
     ):
         np.testing.assert_array_equal(visibility(effects, 4), expected)
     assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64

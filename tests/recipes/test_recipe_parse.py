@@ -385,7 +385,7 @@ def test_paths_that_are_no_files(tmp_path: Path) -> None:
         load_recipe(tmp_path)
     with pytest.raises(RecipeError, match=r"missing.yaml: no such file, and no such preset; pres"):
         load_recipe(tmp_path / "missing.yaml")
-    with pytest.raises(RecipeError, match=r"did you mean light-haze\? presets are brown-smog, c"):
+    with pytest.raises(RecipeError, match=r"did you mean light-haze\? presets are blizzard, brown"):
         load_recipe("lite-haze")
     with pytest.raises(RecipeError, match="cannot be read: embedded null byte"):
         load_recipe("a\0b")

@@ -14,8 +14,8 @@ from tyro.conf import UseAppendAction
 from tools.output import JsonFile, write_json
 
 Device = Literal["cpu", "cuda"]
-Effect = Literal["smog", "flood", "snow", "style"]
-EFFECTS: tuple[Effect, ...] = ("smog", "flood", "snow", "style")
+Effect = Literal["smog", "flood", "snow", "rain", "style"]
+EFFECTS: tuple[Effect, ...] = ("smog", "flood", "snow", "rain", "style")
 
 
 def bench_raster(
@@ -42,7 +42,7 @@ def bench_effects(
     photos: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
-    """What smog, flood, snow and styles cost a frame, and how far they are from what is known.
+    """What each effect costs a frame, and how far its pictures are from what is known.
 
     Args:
         only: Some of the effects.

@@ -167,6 +167,7 @@ def _drop_light(
     # bends: a, 2 t0, b, 3 t1.
     t, (a, t0, b, t1) = np.arctan2(down, right), of_cells(drops.bends).T
     rims_m = radii_m * (1 + a * np.cos(2 * t - t0) + b * np.cos(3 * t - t1))
+    rims_m = np.maximum(rims_m, np.float32(1e-12))  # radii may be below float32's least
     # A drop smaller than a cell covers its share of it.
     cover = np.clip((rims_m - np.hypot(right, down)) * (fx / glass_m) + 0.5, 0, 1)
     cover *= np.minimum(1, np.pi * (radii_m * (fx / glass_m)) ** 2)
