@@ -223,14 +223,17 @@ def _columns_of(
 
 def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
     """The drops before a camera as kernels.find_drops describes them, in the order of the cells."""
-    counts = np.zeros(len(walk.slabs), np.int64)
-    found = np.empty((0, kernels.NUM_NUMBERS), np.float32)
+    held = np.zeros(len(walk.slabs), np.int64)
+    empty = np.empty((0, kernels.NUM_NUMBERS), np.float32)
     with kernel_threads(1):
-        kernels.find_drops(*walk, np.zeros_like(counts), counts, found)
-        if counts.sum():
-            found = np.empty((int(counts.sum()), kernels.NUM_NUMBERS), np.float32)
-            kernels.find_drops(*walk, np.cumsum(counts) - counts, counts, found)
-    return found
+        kernels.find_drops(*walk, np.zeros_like(held), held, empty)
+        if not held.any():
+            return empty
+        found = np.empty((int(held.sum()), kernels.NUM_NUMBERS), np.float32)
+        offsets, counts = np.cumsum(held) - held, np.empty_like(held)
+        kernels.find_drops(*walk, offsets, counts, found)
+    within = np.arange(len(found)) - np.repeat(offsets, held)
+    return found[within < np.repeat(counts, held)]
 
 
 def left_clear(

@@ -18,7 +18,7 @@ from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
 from augment.effects.falling.shutter import frame_interval_s, motion_of
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
-from augment.render.buffers import ALPHA, MEDIAN_DEPTH
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH
 from augment.scene import Scene
 from augment.timing import timed
 from recipes.rain import Rain
@@ -132,11 +132,11 @@ def _placed(falling: Falling, step: str, scene: Scene) -> Placed:
         why += "; the scene's unit is not known to be a metre, so sizes are in scene units"
     if not scene.has_known_gravity:
         why += "; it falls along -z, which is not known to point down"
-    return Placed(falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, MEDIAN_DEPTH}))
+    return Placed(falling, (Step(step, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH}))
 
 
 def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> Drawn:
-    alpha, depth = drawn.raster.alpha, drawn.raster.median_depth
+    alpha, depth = drawn.raster.alpha, drawn.raster.expected_depth
     assert alpha is not None and depth is not None
     with timed(step):
         rgb, clear = draw_falling(

@@ -60,10 +60,10 @@ def find_drops(
     slabs, columns, cells, keys, moves, sways, quantiles, shares, planes, shutter, lens,
     offsets, counts, found,
 ):  # fmt: skip
-    """counts [S]: drops of each slab of cells that may be seen. found [N, NUM_NUMBERS]: theirs from
+    """counts [S]: drops of each slab of cells that are seen. found [N, NUM_NUMBERS]: theirs from
     offsets [S] on: column and row at both ends of a streak, 1 / z there, radius up to which it
-    covers as much as in its middle, radius beyond which nothing, covered share. Empty: they are
-    counted only.
+    covers as much as in its middle, radius beyond which nothing, covered share. Empty: counts are
+    of all drops in the cells, which takes next to no time.
 
     slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 3]: size, how far a
     drop can be from its cell's middle, depth to which the class is drawn. keys [B]: of the hashes.
@@ -109,9 +109,11 @@ def find_drops(
                 for drop in range(MAX_IN_CELL):
                     if share < shares[drop]:
                         break
+                    if is_counting:
+                        number += 1
+                        continue
                     bits = _mix(cell + np.uint64(drop + 1) * _GOLDEN)
                     more = _mix(bits ^ _GOLDEN)
-                    ok = True
                     at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 0, 0]
                     at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 0, 1]
                     at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 0, 2]
@@ -162,22 +164,19 @@ def find_drops(
                         or min(u0, u1) > lens[4] + outside
                         or min(v0, v1) > lens[5] + outside
                     ):
-                        ok = False
-                    if not ok:
                         continue
-                    if not is_counting:
-                        length = math.sqrt((u1 - u0) ** 2 + (v1 - v0) ** 2)
-                        slope = (2 * outside + inside) * (outside - inside)
-                        spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
-                        spread += 0.5 * math.pi * (outside * outside + inside * inside)
-                        fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
-                        cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
-                        row = offsets[slab] + number
-                        found[row, 0], found[row, 1] = u0, v0
-                        found[row, 2], found[row, 3] = u1, v1
-                        found[row, 4], found[row, 5] = 1 / z0, 1 / z1
-                        found[row, 6], found[row, 7] = inside, outside
-                        found[row, 8] = cover * fade
+                    length = math.sqrt((u1 - u0) ** 2 + (v1 - v0) ** 2)
+                    slope = (2 * outside + inside) * (outside - inside)
+                    spread = length * (2 * inside + slope / (1.5 * (outside + inside)))
+                    spread += 0.5 * math.pi * (outside * outside + inside * inside)
+                    fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
+                    cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
+                    row = offsets[slab] + number
+                    found[row, 0], found[row, 1] = u0, v0
+                    found[row, 2], found[row, 3] = u1, v1
+                    found[row, 4], found[row, 5] = 1 / z0, 1 / z1
+                    found[row, 6], found[row, 7] = inside, outside
+                    found[row, 8] = cover * fade
                     number += 1
         counts[slab] = number
 

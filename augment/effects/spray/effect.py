@@ -23,7 +23,7 @@ from augment.effects.lidar.beam import Echoes
 from augment.effects.spray.lidar import spray_echoes
 from augment.effects.spray.picture import blend_puffs, windows_of
 from augment.effects.spray.puffs import FROM_MPS, Puffs, film_depth_m, spray_puffs, spraying_actors
-from augment.render.buffers import ALPHA, MEDIAN_DEPTH
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH
 from augment.rng import rng_for
 from augment.scene import Scene
 from augment.timing import timed
@@ -72,7 +72,9 @@ class SprayEffect(Effect):
             f"{len(spraying_actors(scene))} actors drive faster than {3.6 * FROM_MPS:.0f} km/h on "
             f"{1000 * placed.water_m:.2g} mm of water"
         )
-        return Placed(placed, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, MEDIAN_DEPTH}))
+        return Placed(
+            placed, (Step(SPRAY, True, why, PICTURE),), frozenset({ALPHA, EXPECTED_DEPTH})
+        )
 
     def in_view(self, own: Active, sight: Sight) -> InView:
         puffs, camera = own.data.puffs(own.scene, sight.camera.timestamp_ns), sight.camera
@@ -83,10 +85,10 @@ class SprayEffect(Effect):
 
     def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
         raster = drawn.raster
-        assert raster.alpha is not None and raster.median_depth is not None
+        assert raster.alpha is not None and raster.expected_depth is not None
         with timed(SPRAY):
             rgb = blend_puffs(
-                *(drawn.rgb, raster.alpha, raster.median_depth, camera, own.seen),
+                *(drawn.rgb, raster.alpha, raster.expected_depth, camera, own.seen),
                 glow_of(own.light).mean,
                 fog=drawn.layers.fog,
                 backend=own.backend,
