@@ -1,4 +1,4 @@
-"""Kernels of the records themselves: boxes against depth images, and colours over time."""
+"""Kernels of the records themselves: boxes against depth images, colours over time, hashes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,19 @@ import numpy as np
 from numba import prange
 
 from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.rng import MIX_A, MIX_B
 
 BLOCK = 2048  # splats a thread takes at a time
+_A, _B = np.uint64(MIX_A), np.uint64(MIX_B)
+_S27, _S30, _S31 = (np.uint64(s) for s in (27, 30, 31))
+
+
+@inner()
+def mix(bits):
+    """As augment.rng.mix."""
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    return bits ^ (bits >> _S31)
 
 
 @kernel

@@ -13,6 +13,10 @@ from typing import SupportsIndex
 
 import numpy as np
 
+# SplitMix64 (Steele, Lea and Flood 2014, "Fast Splittable Pseudorandom Number Generators"), and odd
+# factors, far apart in all their bits, for the numbers that are mixed.
+MIX_A, MIX_B = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+STEP_X, STEP_Y = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F
 _DOMAIN = "climategs effect 1"  # a change of the scheme changes this, never silently a number
 
 
@@ -44,3 +48,10 @@ def rng_for(
     digest = hashlib.sha256(key.encode()).digest()
     entropy = np.random.SeedSequence(int.from_bytes(digest, "big"))
     return np.random.Generator(np.random.PCG64(entropy))
+
+
+def mix(bits: np.ndarray) -> np.ndarray:
+    """uint64 of which every bit hangs on every bit given; `augment.kernels.mix` in kernels."""
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(MIX_A)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(MIX_B)
+    return bits ^ (bits >> np.uint64(31))

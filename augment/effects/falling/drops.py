@@ -112,7 +112,6 @@ def sizes_of(kind: Kind, rate_mm_h: float) -> Sizes:
 
 # ---- Where each drop is --------------------------------------------------------------------------
 
-GOLDEN = 0x9E3779B97F4A7C15
 CELL_FACTORS = (0x8CB92BA72F3D8DD7, 0xD1B54A32D192ED03, 0xABC98388FB8FAC03)
 
 
@@ -121,10 +120,3 @@ def cell_counts() -> Float64[np.ndarray, "6"]:
     """Below which share of the hashes a cell has no more than 0, 1, ... drops, and their mean."""
     below = poisson.cdf(np.arange(MAX_IN_CELL), 1.0)
     return np.append(below, float((1 - below).sum()))
-
-
-def mix(value: np.ndarray) -> np.ndarray:
-    """SplitMix64's last step (Steele, Lea and Flood 2014), on uint64."""
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))

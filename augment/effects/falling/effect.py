@@ -13,6 +13,7 @@ from augment.boxes import PlacedBoxes
 from augment.cameras import Camera
 from augment.effects.effect import PICTURE, Active, Drawn, Effect, EffectView, Placed, Step, skipped
 from augment.effects.falling.air import Falling, draw_falling
+from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
 from augment.effects.falling.shutter import frame_interval_s, motion_of
@@ -30,9 +31,37 @@ MASK_SHARE = 0.05  # of a pixel, covered by near drops: from here on it is the m
 
 
 class FallingEffect(Effect):
-    """What falls through the air, on labels and LiDAR sweeps. Its placed data are a Falling."""
+    """What falls through the air. step: its pass. kind: as of Falling. Its placed data are one."""
 
     is_see_through: ClassVar[bool] = True
+    step: ClassVar[str]
+    kind: ClassVar[Kind]
+
+    def kernels(self, section: Rain | Snowfall) -> Any:
+        return section.changes or None
+
+    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
+        section: Rain | Snowfall | None = self.of(recipe)
+        if section is None or not section.changes:
+            why = f"the recipe has no {self.name}"
+            if section is not None:
+                why = f"{self.section}.rate_mm_h is 0"
+            return Placed(None, skipped((self.step,), why, PICTURE))
+        falling = Falling(
+            self.kind,
+            section.rate_mm_h,
+            blows_to(section.wind_mps, section.wind_from_deg),
+            section.turbulence_mps if isinstance(section, Snowfall) else 0.0,
+            recipe.seed,
+            recipe.camera.exposure_ms / 1000,
+            section.min_width_px,
+            section.color,
+        )
+        return _placed(falling, self.step, scene)
+
+    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
+        assert self.mask is not None
+        return _fallen(own, drawn, camera, self.step, self.mask)
 
     def measure(
         self, placed: PlacedBoxes, camera: Camera, view: EffectView
@@ -49,62 +78,16 @@ class RainEffect(FallingEffect):
     """Rain in the air."""
 
     name, section, model, mask = "rain", "weather.rain", Rain, "rain"
+    step, kind = STREAKS, "rain"
     table = falling_table("rain", "streak")
-
-    def kernels(self, section: Rain) -> Any:
-        return section.changes or None
-
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
-        rain = self.of(recipe)
-        if rain is None or not rain.changes:
-            why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
-            return Placed(None, skipped((STREAKS,), why, PICTURE))
-        falling = Falling(
-            "rain",
-            rain.rate_mm_h,
-            blows_to(rain.wind_mps, rain.wind_from_deg),
-            0.0,
-            recipe.seed,
-            recipe.camera.exposure_ms / 1000,
-            rain.min_width_px,
-            rain.color,
-        )
-        return _placed(falling, STREAKS, scene)
-
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
-        return _fallen(own, drawn, camera, STREAKS, "rain")
 
 
 class SnowfallEffect(FallingEffect):
     """Snow in the air."""
 
     name, section, model, mask = "snowfall", "weather.snowfall", Snowfall, "snowfall"
+    step, kind = FLAKES, "snow"
     table = falling_table("snowfall", "flake")
-
-    def kernels(self, section: Snowfall) -> Any:
-        return section.changes or None
-
-    def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
-        snowfall = self.of(recipe)
-        if snowfall is None or not snowfall.changes:
-            why = "the recipe has no snowfall"
-            if snowfall is not None:
-                why = "weather.snowfall.rate_mm_h is 0"
-            return Placed(None, skipped((FLAKES,), why, PICTURE))
-        falling = Falling(
-            "snow",
-            snowfall.rate_mm_h,
-            blows_to(snowfall.wind_mps, snowfall.wind_from_deg),
-            snowfall.turbulence_mps,
-            recipe.seed,
-            recipe.camera.exposure_ms / 1000,
-            snowfall.min_width_px,
-            snowfall.color,
-        )
-        return _placed(falling, FLAKES, scene)
-
-    def edit_image(self, own: Active, drawn: Drawn, camera: Camera) -> Drawn:
-        return _fallen(own, drawn, camera, FLAKES, "snowfall")
 
 
 def blows_to(speed_mps: float, from_deg: float) -> tuple[float, float]:

@@ -7,9 +7,13 @@ import math
 import numpy as np
 from numba import prange
 
-from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL, NUM_CLASSES
+from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL, NUM_CLASSES
+from augment.kernels import mix
 from augment.render.cpu.jit import inner, kernel
+from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import U
+from augment.render.picture_kernels import decay
+from augment.rng import STEP_X
 
 ROWS = 16  # image rows of a band, which a thread draws at a time
 FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
@@ -18,15 +22,7 @@ LEAST_RADIUS = 1.25  # pixels; a smaller one would show where pixels lie
 NUM_NUMBERS = 9  # of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
-_GOLDEN = np.uint64(GOLDEN)
-
-
-@inner()
-def _mix(value):
-    """As drops.mix."""
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))
+_STEP = np.uint64(STEP_X)
 
 
 @inner()
@@ -104,7 +100,7 @@ def find_drops(
             for k in range(first, last + 1):
                 cell = keys[b] + np.uint64(i) * _CELL_X
                 cell = cell + np.uint64(j) * _CELL_Y + np.uint64(k) * _CELL_Z
-                cell = _mix(cell)
+                cell = mix(cell)
                 share = np.float64(cell >> np.uint64(11)) * (1.0 / 9007199254740992.0)
                 for drop in range(MAX_IN_CELL):
                     if share < shares[drop]:
@@ -112,8 +108,8 @@ def find_drops(
                     if is_counting:
                         number += 1
                         continue
-                    bits = _mix(cell + np.uint64(drop + 1) * _GOLDEN)
-                    more = _mix(bits ^ _GOLDEN)
+                    bits = mix(cell + np.uint64(drop + 1) * _STEP)
+                    more = mix(bits ^ _STEP)
                     at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 0, 0]
                     at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 0, 1]
                     at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 0, 2]
@@ -235,21 +231,6 @@ def cover_pixels(drops, listed, begins, alpha, depth, clear):
                     clear[i, j] *= one - covered
 
 
-@inner()
-def _decay(y):
-    """exp(-y) for y >= 0, within 5e-6 of 1: of plain sums, which LLVM writes as vectors."""
-    one = np.float32(1)
-    z = min(y, np.float32(80)) * np.float32(-1 / 64)
-    p = one + z * np.float32(1 / 4) * (one + z * np.float32(1 / 5))
-    p = one + z * (one + z * np.float32(1 / 2) * (one + z * np.float32(1 / 3) * p))
-    p *= p
-    p *= p
-    p *= p
-    p *= p
-    p *= p
-    return p * p
-
-
 @kernel
 def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, upwards, airlight, glow):
     """rgb [H, W, 3] behind the veil and the drops, in place.
@@ -262,6 +243,7 @@ def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, upwards, airligh
     """
     height, width = depth.shape
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    most = np.float32(MAX_EXPONENT)
     for i in prange(height):
         # In loops without branches, of few arrays each, so that LLVM writes vectors.
         v = (np.float32(i) + half - rays[3]) * rays[1]
@@ -282,9 +264,9 @@ def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, upwards, airligh
             u = (np.float32(np.int32(j)) + left) * across
             # Of the sky: straight up over the sine of the elevation.
             slope = max(sideways * u + level, np.float32(1e-6))
-            sky = _decay(upwards * lengths[j] / slope)
+            sky = decay(min(upwards * lengths[j] / slope, most))
             shown = alpha[i, j] if depth[i, j] > zero else zero
-            tau[j] = sky + shown * (_decay(tau[j] * lengths[j]) - sky)
+            tau[j] = sky + shown * (decay(min(tau[j] * lengths[j], most)) - sky)
             lengths[j] = one / lengths[j]
         red, green, blue = airlight[0], airlight[1], airlight[2]
         red_mean, green_mean, blue_mean = glow[0, 3], glow[1, 3], glow[2, 3]

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from augment.effects.falling.drops import CELL_FACTORS, GOLDEN, MAX_IN_CELL, mix
+from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
 from augment.effects.falling.kernels import FADE, LEAST_RADIUS, SOFT
+from augment.rng import STEP_X, mix
 
 if TYPE_CHECKING:
     from augment.effects.falling.air import Veil, Walk
@@ -45,8 +46,8 @@ def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
         key = mix(walk.keys[number] + (cells.astype(np.uint64) * factors).sum(1, dtype=np.uint64))
         counts = (key >> np.uint64(11)) / 2.0**53 >= walk.shares[:MAX_IN_CELL, None]
         drop, cell = np.nonzero(counts)
-        bits = mix(key[cell] + (drop + 1).astype(np.uint64) * np.uint64(GOLDEN))
-        more = mix(bits ^ np.uint64(GOLDEN))
+        bits = mix(key[cell] + (drop + 1).astype(np.uint64) * np.uint64(STEP_X))
+        more = mix(bits ^ np.uint64(STEP_X))
 
     def unit(values: np.ndarray, shift: int) -> np.ndarray:
         return ((values >> np.uint64(shift)) & np.uint64(0x1FFFFF)) / 2.0**21

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 
 from augment.cameras import Camera
 from augment.memo import memo_of
-from augment.rng import rng_for
+from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Scene
 from recipes.lens_drops import LensDrops
 
@@ -172,12 +172,6 @@ def _units(key: np.uint64, slots: np.ndarray, lives: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1) of every drop's life [N, _DRAWS], by rounds of SplitMix64 (Steele, Lea and
     Flood 2014).
     """
-    state = _mix(_mix(key + slots) + lives.astype(np.uint64))
-    columns = np.arange(1, _DRAWS + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    return (_mix(state[:, None] + columns) >> np.uint64(11)) * 2.0**-53
-
-
-def _mix(z: np.ndarray) -> np.ndarray:
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return z ^ (z >> np.uint64(31))
+    state = mix(mix(key + slots) + lives.astype(np.uint64))
+    columns = np.arange(1, _DRAWS + 1, dtype=np.uint64) * np.uint64(STEP_X)
+    return (mix(state[:, None] + columns) >> np.uint64(11)) * 2.0**-53

@@ -14,8 +14,10 @@ import numpy as np
 from numba import prange
 
 from augment.effects.snow.cells import OPEN_EDGE
+from augment.kernels import mix
 from augment.render.cpu.jit import inner, kernel, serial_kernel
 from augment.render.sh import SH_C0
+from augment.rng import STEP_X, STEP_Y
 from augment.semantics import SemanticClass
 
 # ---- Noise ---------------------------------------------------------------------------------------
@@ -23,24 +25,15 @@ from augment.semantics import SemanticClass
 # Standard deviation of the noise over the plane where the gradients' components are uniform in
 # [-1, 1]: the mean over a square of 4 w^2 (x^2 + y^2) / 3, w the blend of a corner at (0, 0).
 DEVIATION = 0.17612713
-MIX_A, MIX_B = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # splitmix64 (Steele et al. 2014)
-STEP_X, STEP_Y = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F  # odd, far apart in all their bits
-_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
+_X, _Y = np.uint64(STEP_X), np.uint64(STEP_Y)
 _LOW, _UNIT = np.uint64(0xFFFFFFFF), 2.0**-53
-_S11, _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (11, 27, 30, 31, 32))
-
-
-@inner()
-def _mix(bits):
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    return bits ^ (bits >> _S31)
+_S11, _S32 = np.uint64(11), np.uint64(32)
 
 
 @inner()
 def _uniform(bits, number):
     """The number-th random number of these bits, in [-1, 1)."""
-    bits = _mix(bits + np.uint64(number + 1) * _X)
+    bits = mix(bits + np.uint64(number + 1) * _X)
     return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
 
 
@@ -522,7 +515,7 @@ STEEPEST = 1.4  # of the logarithm of the drift: within four times the depth, or
 
 @inner()
 def _corner(across, down, seed, x, y):
-    bits = _mix((across + down) ^ seed)
+    bits = mix((across + down) ^ seed)
     gx = np.float64(np.int64(bits >> _S32)) * 2.0**-31 - 1.0
     gy = np.float64(np.int64(bits & _LOW)) * 2.0**-31 - 1.0
     return gx * x + gy * y
@@ -588,7 +581,7 @@ def lay(cells, numbers, drifts, patches, mottling, seed, depths):
         size = np.float64(sizes[i])
         column = np.uint64(np.int64(math.floor(x / size))) * _X
         row = np.uint64(np.int64(math.floor(y / size))) * _Y
-        draws[i] = _mix((column + row) ^ seed)
+        draws[i] = mix((column + row) ^ seed)
         heights[i] = mottle[i] = np.float32(0)
         room = np.float64(centers[i, 2]) - numbers.floor_z_m
         above = 1e9

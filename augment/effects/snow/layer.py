@@ -31,7 +31,7 @@ from augment.effects.snow.light import Illumination
 from augment.effects.snow.near_camera import Layer, SnowLayers, crystals_of
 from augment.effects.snow.relief import Grain
 from augment.render.threads import kernel_threads
-from augment.rng import rng_for
+from augment.rng import STEP_X, STEP_Y, mix, rng_for
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.snow import Snow
@@ -87,13 +87,6 @@ def octaves_of(
     return Octaves(np.ascontiguousarray(turns), pairs[:, 1].copy(), pairs[:, 0].copy(), seeds)
 
 
-def mix(bits: np.ndarray) -> np.ndarray:
-    """uint64 with every bit of the result hanging on every bit of the input (splitmix64)."""
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(kernels.MIX_A)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(kernels.MIX_B)
-    return bits ^ (bits >> np.uint64(31))
-
-
 def gradient_noise(u: np.ndarray, v: np.ndarray, seed: np.uint64) -> np.ndarray:
     """Noise of unit standard deviation at lattice coordinates u, v [N], float64."""
     column, row = np.floor(u), np.floor(v)
@@ -102,8 +95,8 @@ def gradient_noise(u: np.ndarray, v: np.ndarray, seed: np.uint64) -> np.ndarray:
     corners = []
     for j in (0, 1):
         for i in (0, 1):
-            across = (column.astype(np.int64) + i).astype(np.uint64) * np.uint64(kernels.STEP_X)
-            down = (row.astype(np.int64) + j).astype(np.uint64) * np.uint64(kernels.STEP_Y)
+            across = (column.astype(np.int64) + i).astype(np.uint64) * np.uint64(STEP_X)
+            down = (row.astype(np.int64) + j).astype(np.uint64) * np.uint64(STEP_Y)
             bits = mix((across + down) ^ seed)
             gx = (bits >> np.uint64(32)).astype(np.float64) * 2.0**-31 - 1
             gy = (bits & np.uint64(0xFFFFFFFF)).astype(np.float64) * 2.0**-31 - 1

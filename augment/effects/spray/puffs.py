@@ -21,9 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from augment.effects.falling.drops import GOLDEN, mix
 from augment.memo import memo_of
-from augment.rng import rng_for
+from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Actor, Scene
 
 FROM_MPS = 40 / 3.6
@@ -140,7 +139,7 @@ def _draws(seed: int, scene: str, track_id: str, births: np.ndarray) -> np.ndarr
     """Numbers in [0, 1) of every puff, [N, 3]."""
     rng = rng_for(seed=seed, scene=scene, effect=f"spray of {track_id}")
     key = rng.integers(0, 2**64, dtype=np.uint64)
-    columns = np.arange(1, 4, dtype=np.uint64) * np.uint64(GOLDEN)
+    columns = np.arange(1, 4, dtype=np.uint64) * np.uint64(STEP_X)
     return (mix(mix(key + births.astype(np.uint64))[:, None] + columns) >> np.uint64(11)) * 2.0**-53
 
 

@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from augment.kernels import mix
 from augment.render.cpu.jit import inner, kernel
+from augment.rng import STEP_X, STEP_Y
 
 # Channels of the ground's map.
 HEIGHT, OPEN, RISE_X, RISE_Y, HOLLOW, TRACK, CHANNELS = range(7)
@@ -27,18 +29,9 @@ ENDS = 3.0  # widths beyond which a ring is none
 LEAST_FALL = 1e-7  # of a ray that meets a plane, at unit depth
 LEAST_SINE = 0.02  # of the angle at which a pixel's footprint is judged
 FADED_PX, FULL_PX = 2.0, 4.0  # waves of so many pixels are gone, and full
-MIX_A, MIX_B = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # splitmix64 (Steele et al. 2014)
-STEP_X, STEP_Y = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F
-_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
-_S24, _S27, _S30, _S31, _S44 = (np.uint64(s) for s in (24, 27, 30, 31, 44))
+_X, _Y = np.uint64(STEP_X), np.uint64(STEP_Y)
+_S24, _S44 = np.uint64(24), np.uint64(44)
 _LOW20, _LIFE, _UNIT = np.uint64(0xFFFFF), np.uint64(LIFE_NS), 2.0**-20
-
-
-@inner()
-def _mix(bits):
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    return bits ^ (bits >> _S31)
 
 
 @inner()
@@ -51,10 +44,10 @@ def _find_drops(column, row, rings, seed, timestamp_ns, drops):
             i, j = column + di, row + dj
             place = np.uint64(np.int64(i)) * _X + np.uint64(np.int64(j)) * _Y
             for drop in range(MAX_DROPS):
-                first = _mix(place + seed + np.uint64(drop))
+                first = mix(place + seed + np.uint64(drop))
                 passed = timestamp_ns + np.int64((first >> _S24) % _LIFE)
                 again, age = passed // LIFE_NS, (passed % LIFE_NS) / LIFE_NS
-                bits = _mix(first ^ (np.uint64(again) * _X))
+                bits = mix(first ^ (np.uint64(again) * _X))
                 if np.float64(np.int64(bits & _LOW20)) * _UNIT < rings[0]:
                     u = np.float64(np.int64(bits >> _S44)) * _UNIT
                     v = np.float64(np.int64((bits >> _S24) & _LOW20)) * _UNIT

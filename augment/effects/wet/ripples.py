@@ -32,18 +32,15 @@ from augment.effects.wet.kernels import (
     LEAST_SINE,
     LIFE_NS,
     MAX_DROPS,
-    MIX_A,
-    MIX_B,
     SLOPE,
     SPEED_MPS,
     SQUARE_M,
-    STEP_X,
-    STEP_Y,
     WAVE_M,
     WIDTH_M,
 )
 from augment.render.buffers import AUTO, CPU, kernels_for
 from augment.render.threads import kernel_threads
+from augment.rng import MIX_A, MIX_B, STEP_X, STEP_Y
 
 _LIFE_S = LIFE_NS * 1e-9
 # Mean square of the slopes of one ring, over its life, times its area: m2.
