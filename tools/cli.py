@@ -183,6 +183,58 @@ class InspectOptions(SceneCommand):
         return 0
 
 
+class RecordOptions(Command):
+    """Make a recording of a COLMAP reconstruction: of a phone's video, say (docs/own-data.md).
+
+    Args:
+        model: The folder of the COLMAP model, or of the project that holds sparse/0.
+        images: The folder of the images that COLMAP was run on, named by their frame's number;
+            those of several cameras in a folder each.
+        out: The recording's folder, new.
+        fps: Images a second.
+        camera_height: Height of the camera above the road in metres. Without it and positions the
+            recording has no metres.
+        positions: A CSV table with the columns image, lat, lon, or image, x, y in metres: where
+            images were taken. It also turns the recording's x to the east.
+    """
+
+    model: Positional[Path]
+    images: Path
+    out: Path
+    fps: Annotated[float, Field(gt=0, le=1000)]
+    camera_height: Annotated[float, Field(gt=0.05, le=20)] | None = None
+    positions: Path | None = None
+
+    def run(self) -> int:
+        from adapters.recording.from_colmap import record_colmap
+
+        made = record_colmap(
+            self.model,
+            self.images,
+            self.out,
+            fps=self.fps,
+            camera_height_m=self.camera_height,
+            positions=self.positions,
+        )
+        road = made.road
+        print(f"{made.frames} frames, {made.images} images; {made.left_out} have no pose, left out")
+        print(
+            f"road: {road.points} points, half of them within {100 * road.residual:.1f} % of the "
+            f"cameras' height of one plane, which is taken for level"
+        )
+        if made.metres is None:
+            print("metres are not known: give --camera-height or --positions")
+        else:
+            print(
+                f"scale: {made.metres:.4g} m a unit of COLMAP's; the cameras are "
+                f"{made.metres * road.height:.2f} m above the road"
+            )
+        if made.residual_m is not None:
+            print(f"positions: half of them within {made.residual_m:.2f} m")
+        print(f"recording: {self.out}")
+        return 0
+
+
 class ExplainOptions(RecipeCommand):
     """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
@@ -521,6 +573,7 @@ COMMANDS = {
     "render": RenderOptions,
     "generate": GenerateOptions,
     "fit": FitOptions,
+    "record": RecordOptions,
     "inspect": InspectOptions,
     "explain": ExplainOptions,
     "view": ViewOptions,
