@@ -97,6 +97,7 @@ _TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
         r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
     ),
     "kitti": _kitti,
+    "av2": _fixed(r"sensors/cameras/[^/]+/\d+\.jpg", r"sensors/lidar/\d+\.feather"),
     "street_gaussians": _fixed(r"images/[^/]+\.(png|jpg)"),
     "drivestudio": _drivestudio,
     "recording": _fixed(r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet"),
@@ -239,6 +240,11 @@ FOLDERS = (
         _is_kitti,
         "a KITTI drive (velodyne_points/, calib_cam_to_cam.txt in it or above) or object folder "
         "(calib/ and image_2/)",
+    ),
+    Signature(
+        "av2",
+        lambda folder: (folder / "city_SE3_egovehicle.feather").is_file(),
+        "a log of Argoverse 2 (city_SE3_egovehicle.feather)",
     ),
     Signature("recording", _is_recording, "a recording (calibration.json and images/)"),
     Signature(

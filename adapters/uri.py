@@ -88,6 +88,12 @@ SCHEMES = {
         labels="adapters.waymo.adapter:waymo_labels",
         is_raw=True,
     ),
+    "av2": Scheme(
+        "adapters.av2.adapter:open_av2",
+        "av2:data/av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede",
+        labels="adapters.av2.adapter:av2_labels",
+        is_raw=True,
+    ),
     "street_gaussians": Scheme(
         "adapters.street_gaussians.adapter:open_street_gaussians",
         "street_gaussians:output/waymo/002?data=data/waymo/002",

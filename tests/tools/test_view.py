@@ -35,7 +35,7 @@ from tests.augment.dust import DustEffect
 from tools.cli import main
 from tools.view.controls import effect_groups, group_of
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
-from tools.view.outputs import OutputViewer
+from tools.view.outputs import OutputViewer, find_output
 from tools.view.pictures import free_camera, place_in_window
 from tools.view.server import Viewer, import_viser, serve
 
@@ -357,7 +357,9 @@ def test_an_output_is_looked_through_by_its_numbers(tmp_path):
     sets = ["--set", "weather.smog.visibility_m={uniform: [20, 80]}", "--variants", "2"]
     assert main(["render", "dense-fog", *where, *sets, "--out", str(out), "--no-sheet"]) == 0
     assert main(["render", "clear", *where, "--out", str(out), "--no-sheet"]) == 0
-    viewer = OutputViewer(out)
+    output = find_output(str(out))
+    assert output is not None and find_output(str(tmp_path)) is None
+    viewer = OutputViewer(output)
     images = {(row["variant"], row["frame"]): viewer.picture(row, "image") for row in viewer.rows}
     assert len(images) == 6
     own = (192, 108)

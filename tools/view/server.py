@@ -42,7 +42,7 @@ from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.edits import Edits, free_path, save_recipe, without_weather
-from tools.view.outputs import OutputViewer, is_output
+from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
@@ -68,8 +68,8 @@ JOIN_S = 10.0  # that the picture being drawn gets when the server ends
 def view_scene(options: ViewOptions) -> int:
     """Serves pages until it is interrupted. Returns the exit code."""
     viser = import_viser()
-    if is_output(options.scene):
-        return _serve_until_interrupted(viser, OutputViewer(Path(options.scene)), options)
+    if (output := find_output(options.scene)) is not None:
+        return _serve_until_interrupted(viser, OutputViewer(output), options)
     scene = open_scene(options.scene)
     check_frames(scene)
     given = (text.partition("=") for text in options.overrides)
