@@ -56,6 +56,26 @@ def colors_at(sh, coefficients, weights, turn, out):
                 first = after
 
 
+@kernel
+def covered_plane(starts, opacities, places, covariances, out):
+    """out [G]: the integral of 1 - prod_i (1 - alpha_i) over a plane, of the splats in rows
+    starts[g] to starts[g + 1]: places [N, 2] and covariances [N, 2, 2] in units in which the group
+    has a standard deviation of 1. By 49 places within 3.15 deviations. All float64.
+    """
+    for g in prange(len(out)):
+        total = 0.0
+        for column in range(7):
+            for row in range(7):
+                x, y, passed = 0.9 * (column - 3), 0.9 * (row - 3), 1.0
+                for i in range(starts[g], starts[g + 1]):
+                    a, b, c = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
+                    dx, dy = x - places[i, 0], y - places[i, 1]
+                    sigma = 0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b)
+                    passed *= 1 - min(opacities[i] * np.exp(-sigma), 0.999)
+                total += 1 - passed
+        out[g] = 0.81 * total
+
+
 # Of one thread: it runs beside the renderer, on those that write files.
 @serial_kernel
 def count_occlusion(

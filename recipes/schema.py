@@ -169,7 +169,7 @@ class Weather(Closed):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px")
+    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px", "lod_px")
     knobs = (
         Knob(
             "scale",
@@ -179,6 +179,7 @@ class Render(Section):
             tiers={"draft": 0.75},
         ),
         Knob("radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out", 4),
+        Knob("lod_px", (2.0, 1.0, 0.5, 0.0), "far splats are merged in cells as large", 13),
         Knob(
             "transmittance_stop",
             (0.05, 0.01, 1e-3, 1e-4),
@@ -213,6 +214,9 @@ class Render(Section):
     radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
     """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
     picture, are left out; 0 leaves out none."""
+    lod_px: Number = Field(default=0.0, ge=0, le=64)
+    """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
+    this in the picture, pixels; 0 draws all as they are. For scenes of many millions."""
 
 
 class Sensor(Section):
