@@ -646,14 +646,17 @@ def _write_pixels(state, left, top, size, images, wanted):
             opacity = one - v8.absolute(v8.load_row(columns, state, at))
             _write(images.alpha, pixel, opacity, count)
             if wanted is None or wanted & RGB:
-                parts = v8.triples(
-                    v8.load_row(columns, state, at + P_RED),
-                    v8.load_row(columns, state, at + P_GREEN),
-                    v8.load_row(columns, state, at + P_BLUE),
-                )
-                _write(images.rgb, U(3) * pixel, parts[0], 3 * count)
-                _write(images.rgb, U(3) * pixel + U(LANES), parts[1], 3 * count - LANES)
-                _write(images.rgb, U(3) * pixel + U(2 * LANES), parts[2], 3 * count - 2 * LANES)
+                red = v8.load_row(columns, state, at + P_RED)
+                green = v8.load_row(columns, state, at + P_GREEN)
+                blue = v8.load_row(columns, state, at + P_BLUE)
+                if count >= LANES:
+                    v8.store_colours(images.rgb, U(3) * pixel, red, green, blue)
+                else:
+                    for k in range(U(count)):
+                        first = U(3) * (pixel + k)
+                        images.rgb[first] = v8.lane(red, k)
+                        images.rgb[first + U(1)] = v8.lane(green, k)
+                        images.rgb[first + U(2)] = v8.lane(blue, k)
             if wanted is not None:
                 if wanted & EXPECTED:
                     weighted = v8.load_row(columns, state, at + P_DEPTH)

@@ -20,7 +20,7 @@ import operator
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, codegen, config, types
+from numba.core import codegen, config, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -416,25 +416,70 @@ def totals(builder, *rows):
     return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
 
 
-@_operation(types.UniTuple(float8, 3), float8, float8, float8)
-def triples(builder, *planes):
-    """The 24 numbers a0 b0 c0 a1 b1 c1 ..."""
-    pairs = builder.shuffle_vector(*planes[:2], ir.Constant(ir.VectorType(_INT, 16), [*range(16)]))
-    third = builder.shuffle_vector(
-        planes[2], planes[2], ir.Constant(ir.VectorType(_INT, 16), [*range(8)] * 2)
-    )
-    found = []
-    for first in range(0, 24, LANES):
-        places = [divmod(number, 3) for number in range(first, first + LANES)]
-        mask = [(k + 8 * plane) if plane < 2 else 16 + k for k, plane in places]
-        mask = ir.Constant(ir.VectorType(_INT, LANES), mask)
-        found.append(builder.shuffle_vector(pairs, third, mask))
-    return cgutils.pack_array(builder, found)
-
-
 @_operation(types.float32, float8, types.uint64)
 def lane(builder, value, number):
     return builder.extract_element(value, number)
+
+
+# ---- Pixels of three colours, which lie one after the other --------------------------------------
+# Of 24 such numbers each register has a colour's in lanes that the other two have not: lane
+# (colour + 3 pixel) % 8. So two blends and a permutation sort them, and the same way back.
+
+_MIXED = [[(colour + 3 * pixel) % LANES for pixel in range(LANES)] for colour in range(3)]
+
+
+def _owner(colour: int, lane: int) -> int:
+    """Which of three registers has a colour's number in a lane."""
+    return (colour + 3 * _MIXED[colour].index(lane)) // LANES
+
+
+def _blend(builder, values, choose):
+    """Lane by lane the value that `choose` names."""
+    pairs = [choose(lane) for lane in range(LANES)]
+    two = [lane + LANES * (pick == 1) for lane, pick in enumerate(pairs)]
+    mixed = builder.shuffle_vector(*values[:2], _like(values[0], two))
+    three = [lane + LANES * (pick == 2) for lane, pick in enumerate(pairs)]
+    return builder.shuffle_vector(mixed, values[2], _like(mixed, three))
+
+
+@intrinsic
+def load_colours(typingctx, array, index):
+    """Red, green and blue of the eight pixels from array[index] on."""
+    kind = types.UniTuple(float8, 3)
+
+    def codegen(context, builder, sig, args):
+        at = builder.bitcast(
+            _pointer(context, builder, sig.args[0], *args), _floats(LANES).as_pointer()
+        )
+        rows = [builder.load(builder.gep(at, [_INT(k)]), align=4) for k in range(3)]
+        sorted_rows = []
+        for colour in range(3):
+            mixed = _blend(builder, rows, lambda lane, c=colour: _owner(c, lane))
+            lanes = _like(mixed, _MIXED[colour])
+            sorted_rows.append(builder.shuffle_vector(mixed, mixed, lanes))
+        return context.make_tuple(builder, kind, sorted_rows)
+
+    return kind(array, types.uint64), codegen
+
+
+@intrinsic
+def store_colours(typingctx, array, index, red, green, blue):
+    """What `load_colours` loads."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args[:2])
+        at = builder.bitcast(at, _floats(LANES).as_pointer())
+        mixed = []
+        for colour, value in enumerate(args[2:]):
+            lanes = [_MIXED[colour].index(lane) for lane in range(LANES)]
+            mixed.append(builder.shuffle_vector(value, value, _like(value, lanes)))
+        for k in range(3):
+            own = [next(c for c in range(3) if _owner(c, lane) == k) for lane in range(LANES)]
+            row = _blend(builder, mixed, lambda lane, own=own: own[lane])
+            builder.store(row, builder.gep(at, [_INT(k)]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, float8, float8, float8), codegen
 
 
 @_operation(types.boolean, _Floats)
