@@ -60,6 +60,18 @@ def layered_way(distance, eye, up):
 
 
 @kernel
+def composite_constant(rgb, alpha, color, out):
+    """out = rgb + (1 - alpha) color [3]."""
+    red, green, blue = color[0], color[1], color[2]
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            share = np.float32(1) - alpha[i, j]
+            out[i, j, 0] = rgb[i, j, 0] + share * red
+            out[i, j, 1] = rgb[i, j, 1] + share * green
+            out[i, j, 2] = rgb[i, j, 2] + share * blue
+
+
+@kernel
 def composite_cubemap(
     rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, gains, airlight, varying, out
 ):
