@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, parse_uri
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_SPLITS, parse_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.jobs.mirror import SourceTree
@@ -97,6 +97,7 @@ _TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
         r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
     ),
     "kitti": _kitti,
+    "av2": _fixed(r"sensors/cameras/[^/]+/\d+\.jpg", r"sensors/lidar/\d+\.feather"),
     "street_gaussians": _fixed(r"images/[^/]+\.(png|jpg)"),
     "drivestudio": _drivestudio,
     "recording": _fixed(r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet"),
@@ -162,6 +163,14 @@ def _is_kitti(folder: Path) -> bool:
     )
 
 
+def _is_waymo(folder: Path) -> bool:
+    tables = ("vehicle_pose", "lidar_calibration")
+    splits = (folder, *(folder / name for name in WAYMO_SPLITS))
+    return any(all((split / name).is_dir() for name in tables) for split in splits) or all(
+        (folder / f"{name}.parquet").is_file() for name in tables
+    )
+
+
 def _is_street_gaussians(folder: Path) -> bool:
     is_data = all((folder / name).is_dir() for name in ("ego_pose", "extrinsics", "track"))
     if is_data or any(folder.glob("trained_model/iteration_*.pth")):
@@ -211,6 +220,11 @@ FOLDERS = (
     ),
     Signature("nuscenes", _is_nuscenes, "a nuScenes dataset (v1.0-*/scene.json)"),
     Signature(
+        "waymo",
+        _is_waymo,
+        "Waymo Open Dataset v2 tables (vehicle_pose/ and lidar_calibration/, of Parquet files)",
+    ),
+    Signature(
         "street_gaussians",
         _is_street_gaussians,
         "a Street Gaussians model (trained_model/iteration_N.pth) or its dataset (ego_pose/, "
@@ -226,6 +240,11 @@ FOLDERS = (
         _is_kitti,
         "a KITTI drive (velodyne_points/, calib_cam_to_cam.txt in it or above) or object folder "
         "(calib/ and image_2/)",
+    ),
+    Signature(
+        "av2",
+        lambda folder: (folder / "city_SE3_egovehicle.feather").is_file(),
+        "a log of Argoverse 2 (city_SE3_egovehicle.feather)",
     ),
     Signature("recording", _is_recording, "a recording (calibration.json and images/)"),
     Signature(

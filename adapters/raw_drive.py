@@ -442,7 +442,8 @@ class RawDrive:
     frame that is used and has any. boxes: of the objects that move, in order of frames. labels: of
     all frames, in the dataset's world, with the meaning of the sweeps' classes. lidar_top_deg: the
     highest elevation that the LiDAR looks at. problems: what is missing or damaged, a sentence
-    each. used_rows: by camera, the part of the rows from the top that does not show the car."""
+    each. used_rows: by camera, the part of the rows from the top that does not show the car.
+    grey_cameras: those whose images say nothing of colour."""
 
     name: str
     source: str
@@ -455,6 +456,7 @@ class RawDrive:
     lidar_top_deg: float
     problems: tuple[str, ...]
     used_rows: Mapping[str, float] = field(default_factory=dict)
+    grey_cameras: frozenset[str] = frozenset()
     has_metric_scale: bool = True
 
     @property

@@ -11,7 +11,9 @@ of the same size and time goes unnoticed; to read all bytes of a drive would tak
 are no part of an entry: they are read from the recording, as ever.
 
 CLIMATEGS_SCENE_CACHE_GB says how large the folder may grow (10 by default), what was not used for
-longest goes first; with 0 the cache is neither read nor written.
+longest goes first; with 0 the cache is neither read nor written. Beside it, in images/NAME-KEY/,
+lie images that a dataset has in no files of their own; they may take as much, or all that was used
+within a day, which a running job may need.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ import logging
 import math
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import distributions
@@ -46,6 +50,8 @@ logger = logging.getLogger(__name__)
 LIMIT_KEY = "CLIMATEGS_SCENE_CACHE_GB"
 DEFAULT_LIMIT_GB = 10.0  # some 150 scenes
 _MAX_FILES = 1_000_000  # of a dataset's folder: some seconds to look at; or links lead in circles
+_IMAGES = "images"
+_IN_USE_S = 86_400.0
 _CODE = ("adapters", "augment", "recipes")
 _LIBRARIES = (
     "climategs", "numpy", "scipy", "numba", "torch", "opencv-contrib-python-headless",
@@ -64,10 +70,10 @@ def cached_scene(
     if key is None or folder is None:
         return build()
     found = _read(folder, key)
-    if found is None:
+    if found is None or not _has_images(found, folder):
         with _alone(folder, key) as can_write:
             found = _read(folder, key) if can_write else None  # by another process meanwhile
-            if found is None:
+            if found is None or not _has_images(found, folder):
                 scene = build()
                 if can_write:
                     _store(scene, folder, key, limit_bytes)
@@ -79,6 +85,40 @@ def cached_scene(
         labels=open_labels(),
         recorded_source=None,
     )
+
+
+def image_folder(name: str, sources: Sequence[Path]) -> Path:
+    """The folder for images that are made of these files, named by the files' paths, sizes and
+    times. Others make room that were not used for longest, and not within a day."""
+    scenes = _cache_folder()
+    if scenes is None:
+        raise AdapterError(
+            "images without lens distortion need a folder, and this user has no home: set "
+            "XDG_CACHE_HOME"
+        )
+    facts = json.dumps(list(_facts_of(sources))).encode()
+    own = scenes.with_name(_IMAGES) / f"{name}-{hashlib.sha256(facts).hexdigest()[:16]}"
+    with contextlib.suppress(OSError):  # what cannot be written, the writer says
+        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.utime(own)
+        _make_room_for_images(own.parent, _limit_bytes())
+    return own
+
+
+def _make_room_for_images(folder: Path, limit_bytes: float) -> None:
+    used = sorted(((path.stat().st_mtime, path) for path in folder.iterdir()), reverse=True)
+    total = 0
+    for used_s, path in used:
+        total += sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        if total > limit_bytes and time.time() - used_s > _IN_USE_S:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _has_images(scene: Scene, folder: Path) -> bool:
+    """Whether those of the scene's images are there that lie beside the cache's folder."""
+    own = str(folder.with_name(_IMAGES)) + os.sep
+    paths = (path for frame in scene.frames for path in frame.image_paths.values())
+    return all(os.path.exists(path) for path in paths if path.startswith(own))
 
 
 def leave_out_cache() -> None:
@@ -142,6 +182,11 @@ def _files_of(
         for frame in labels.frames:
             yield from (root / f.filename for f in (frame.sweep, *frame.images.values()))
         yield from (root / name for name in tables.semantic_files.values())
+        return
+    if scheme == "waymo":  # so is a split
+        from adapters.waymo.adapter import waymo_files
+
+        yield from waymo_files(path, query)
         return
     yield root
     if scheme == "kitti":

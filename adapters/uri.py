@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # torch would be loaded with them
 
 CAMERA_PATH_KEY = "camera_path"
 GROUND_KEY = "ground_z"
+WAYMO_SPLITS = ("training", "validation", "testing")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 
@@ -79,6 +80,18 @@ SCHEMES = {
         "adapters.kitti.adapter:open_kitti",
         "kitti:data/kitti/2011_09_26/2011_09_26_drive_0001_sync",
         labels="adapters.kitti.adapter:kitti_labels",
+        is_raw=True,
+    ),
+    "waymo": Scheme(
+        "adapters.waymo.adapter:open_waymo",
+        "waymo:data/waymo/training?segment=10023947602400723454_1120_000_1140_000",
+        labels="adapters.waymo.adapter:waymo_labels",
+        is_raw=True,
+    ),
+    "av2": Scheme(
+        "adapters.av2.adapter:open_av2",
+        "av2:data/av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede",
+        labels="adapters.av2.adapter:av2_labels",
         is_raw=True,
     ),
     "street_gaussians": Scheme(

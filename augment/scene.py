@@ -375,7 +375,7 @@ class PosedGaussians:
         return self.gaussians.semantic if self.color_rows is None else self.color_rows
 
 
-GroundSource = Literal["lidar labels", "road splats", "ransac", "ego path", "stated"]
+GroundSource = Literal["map", "lidar labels", "road splats", "ransac", "ego path", "stated"]
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,10 @@ class SemanticClass(IntEnum):
 
 
 _WORDS: dict[SemanticClass, frozenset[str]] = {
+    SemanticClass.SIGN: frozenset({"sign"}),  # of a pedestrian crossing too
     SemanticClass.TWO_WHEELER: frozenset(
-        {"bicycle", "bike", "cyclist", "motorbike", "motorcycle", "moped", "rider", "scooter"}
+        {"bicycle", "bicyclist", "bike", "cyclist", "motorbike", "motorcycle", "motorcyclist"}
+        | {"moped", "rider", "scooter"}
     ),
     SemanticClass.PEDESTRIAN: frozenset({"human", "pedestrian", "person"}),
     SemanticClass.VEHICLE: frozenset(

@@ -20,7 +20,7 @@ from adapters.base import open_scene
 from adapters.training_views.checks import check_views, with_camera_times
 from adapters.training_views.starting_scene import starting_scene
 from adapters.training_views.views import RecordedViews, holdout_step
-from adapters.uri import format_uri
+from adapters.uri import SCHEMES, format_uri
 from augment.errors import AdapterError, ClimateGSError
 from augment.files.scene_file import is_scene_folder, save_scene
 from augment.reconstruct.trainer import StepRecord, Trainer
@@ -50,7 +50,6 @@ ROW_STEPS = 50  # steps averaged into one row of the history
 HELD_OUT_KEY = "held_out"
 MIN_OFFSET_S = 0.005  # of clocks: less moves a camera by centimetres at most, if it is real
 SCORES = ("psnr", "ssim", "depth_median_m")  # of a row of the history
-_HELD_OUT_SCHEMES = ("pandaset", "recording", "nuscenes", "kitti")
 _AVERAGED = ("loss", "l1", "ssim", "depth", "sky")
 
 # Of timing a run's first steps, whose number is chosen by the time that there is.
@@ -374,7 +373,7 @@ def _can_hold_out(scheme: str, path: str) -> bool:
         from adapters.street_gaussians.model import is_dataset
 
         return is_dataset(Path(path))
-    return scheme in _HELD_OUT_SCHEMES
+    return scheme in SCHEMES and SCHEMES[scheme].is_raw
 
 
 def _check_recorded(scene: Scene) -> None:

@@ -133,7 +133,7 @@ def read_table(
     """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
     where: the file, for errors. columns: only those of these that it has. without: none of these.
     """
-    with _opened(source, where) as file:
+    with opened_parquet(source, where) as file:
         there = Counter(file.schema_arrow.names)
         if repeated := [name for name, count in there.items() if count > 1]:
             raise OutputError(f"{where} has several columns {repeated[0]!r}; leave one")
@@ -152,14 +152,14 @@ def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
 
 def read_note(path: Path) -> dict[str, Any]:
     """The metadata alone, without reading a column."""
-    with _opened(path, str(path)) as file:
+    with opened_parquet(path, str(path)) as file:
         schema = file.schema_arrow
     return _note(schema, path)
 
 
 def is_ours(path: Path) -> bool:
     """Whether a Parquet file has metadata as `parquet_bytes` writes it."""
-    with _opened(path, str(path)) as file:
+    with opened_parquet(path, str(path)) as file:
         return METADATA_KEY in (file.schema_arrow.metadata or {})
 
 
@@ -188,7 +188,7 @@ def as_described(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _opened(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
+def opened_parquet(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
     """The file, for as long as it is read; what Arrow then raises becomes an OutputError."""
     try:
         with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:

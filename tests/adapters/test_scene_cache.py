@@ -14,6 +14,7 @@ from pathlib import Path
 import kitti_files
 import nuscenes_files
 import pytest
+import waymo_files
 from fitted_scenes import assert_same, fitted_scene
 from pandaset_folder import write_sequence
 from recording_folder import write_recording
@@ -36,6 +37,7 @@ RAW: dict[str, Callable[[Path], str]] = {
     "recording": lambda root: f"recording:{write_recording(root)}?",
     "kitti": lambda root: f"kitti:{kitti_files.write_raw(root)}?",
     "nuscenes": _nuscenes,
+    "waymo": lambda root: f"waymo:{waymo_files.write_segment(root, frames=2)}?",
 }
 
 

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import av2_files
 import cv2
 import drivestudio_files
 import kitti_files
@@ -118,6 +119,17 @@ def test_a_recording(tmp_path):
     assert changed_files(root, copy / "drive") == relative_images(scene, root)
     again = open_scene(format_uri("recording", copy / "drive", SMALL))
     assert_same_but_colours(scene, again, root, copy / "drive")
+
+
+def test_an_argoverse_log(tmp_path):
+    root = av2_files.write_log(tmp_path / av2_files.NAME)
+    scene = open_scene(format_uri("av2", root, SMALL))
+    copy, said = weather(scene, tmp_path / "out")
+    assert changed_files(root, copy / root.name) == relative_images(scene, root)
+    again = open_scene(format_uri("av2", copy / root.name, SMALL))
+    assert_same_but_colours(scene, again, root, copy / root.name)
+    # Images come twice as often as sweeps.
+    assert "  12 of 27 camera images are weathered; 15 stay clear, as recorded" in said
 
 
 def test_a_nuscenes_dataset(tmp_path):

@@ -25,6 +25,7 @@ from types import SimpleNamespace
 from typing import Any, Literal
 from unittest import mock
 
+import numpy as np
 import pytest
 from generate_jobs import image_name, make_job, make_recipes, outputs
 
@@ -34,6 +35,7 @@ from augment.jobs.blocks import read_status
 from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
 from augment.jobs.generate import run_generate
 from augment.jobs.store import LocalStore, Patience, RemoteStore, StoredFileMissing, open_store
+from tools.view.outputs import OutputViewer, find_output
 
 # ---- An S3 server in this process, and failures to order ----------------------------------------
 
@@ -529,6 +531,11 @@ def test_a_remote_output_has_the_files_of_a_local_one(server, tmp_path, monkeypa
     assert not any((tmp_path / "scratch" / "blocks").iterdir())
     (status,) = read_status(store)
     assert (status.total.published, status.claims) == (6, 0)
+    shown, local = (find_output(str(at)) for at in (uri, tmp_path / "local"))
+    assert shown is not None and local is not None and find_output(server.uri("other")) is None
+    viewers = OutputViewer(shown), OutputViewer(local)
+    remote_image, image = (viewer.picture(viewer.rows[0], "image") for viewer in viewers)
+    assert np.array_equal(remote_image, image)
 
 
 # ---- Claims: one holder at a time, whoever contends, however the last one ended -----------------

@@ -9,6 +9,7 @@ import math
 import shlex
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,7 +36,7 @@ from tests.augment.dust import DustEffect
 from tools.cli import main
 from tools.view.controls import effect_groups, group_of
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
-from tools.view.outputs import OutputViewer
+from tools.view.outputs import OutputViewer, find_output
 from tools.view.pictures import free_camera, place_in_window
 from tools.view.server import Viewer, import_viser, serve
 
@@ -265,6 +266,40 @@ def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten
         assert not np.array_equal(one.rest(after=count), clear)
 
 
+class SlowDust(DustEffect):
+    """Dust of which a picture of the whole size waits until it may go on."""
+
+    def __init__(self, height: int) -> None:
+        self.height, self.begun, self.may_end = height, threading.Event(), threading.Event()
+
+    def edit_image(self, own, drawn, camera):
+        if camera.height == self.height:
+            self.begun.set()
+            assert self.may_end.wait(60)
+        return super().edit_image(own, drawn, camera)
+
+
+@pytest.mark.long
+def test_a_picture_at_rest_is_given_up_once_something_else_is_asked_for(tmp_path):
+    edits = Edits("clear", SCALE, folder=tmp_path)
+    with served(edits) as (viewer, url), PageClient(url, (320, 180)) as page:
+        count = len(page.rest(after=0)) and len(page.pictures)
+        slow = SlowDust(round(SCALE * viewer.scene.frames[0].cameras["front"].height))
+        effects.add_effect(slow)
+        try:
+            (open_page,) = viewer.pages
+            open_page.edit(edits.with_section("weather.dust"))
+            assert slow.begun.wait(60)
+            open_page.edit(edits)  # without dust
+            slow.may_end.set()
+            page.rest(after=count)
+        finally:
+            slow.may_end.set()
+            effects.remove_effect("dust")
+    kinds = [message["format"] for _, message in page.pictures[count:]]
+    assert kinds.count("png") == 1 and kinds[-1] == "png"  # the dusty one is not among them
+
+
 @pytest.mark.long
 def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
     edits = Edits("fresh-snow", folder=tmp_path)
@@ -357,7 +392,9 @@ def test_an_output_is_looked_through_by_its_numbers(tmp_path):
     sets = ["--set", "weather.smog.visibility_m={uniform: [20, 80]}", "--variants", "2"]
     assert main(["render", "dense-fog", *where, *sets, "--out", str(out), "--no-sheet"]) == 0
     assert main(["render", "clear", *where, "--out", str(out), "--no-sheet"]) == 0
-    viewer = OutputViewer(out)
+    output = find_output(str(out))
+    assert output is not None and find_output(str(tmp_path)) is None
+    viewer = OutputViewer(output)
     images = {(row["variant"], row["frame"]): viewer.picture(row, "image") for row in viewer.rows}
     assert len(images) == 6
     own = (192, 108)

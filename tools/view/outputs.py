@@ -14,7 +14,7 @@ from augment.errors import OutputError
 from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.jobs.layout import mask_names, resolve_inside
 from augment.jobs.manifest import MANIFEST, OK, Row, read_finished, weather_columns
-from augment.jobs.store import open_store
+from augment.jobs.store import Store, open_store
 from recipes.schema import columns_of_effects
 from tools.view.fields import NONE
 from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
@@ -25,24 +25,32 @@ if TYPE_CHECKING:
 STEPS = 200  # of a slider of numbers
 
 
-def is_output(text: str) -> bool:
-    """Whether a command's scene is a folder that `climategs render` or `generate` wrote."""
-    return (Path(text) / MANIFEST).is_file()
+def find_output(text: str) -> Store | None:
+    """What `climategs render` or `generate` wrote at a command's scene, if it is a folder or a
+    bucket with a manifest.
+
+    Raises:
+        OutputError: a bucket that cannot be read.
+    """
+    if "://" not in text:
+        return open_store(text) if (Path(text) / MANIFEST).is_file() else None
+    store = open_store(text)
+    return store if store.exists(MANIFEST) else None
 
 
 class OutputViewer:
-    """The finished images of an output folder, for the pages of one server.
+    """The finished images of an output folder or bucket, for the pages of one server.
 
     Raises:
         OutputError: there is no finished image, or the manifest is damaged.
     """
 
-    def __init__(self, out: Path) -> None:
-        self.out = out
-        table = read_finished(open_store(str(out)))
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        table = read_finished(store)
         self.rows: list[Row] = [row for row in table.to_pylist() if row["status"] == OK]
         if not self.rows:
-            raise OutputError(f"{out} holds no finished image; run `climategs render` first")
+            raise OutputError(f"{store.uri} holds no finished image; run `climategs render` first")
         self.numbers = [name for name in weather_columns(table) if len(self.values(name)) > 1]
         self.pages: dict[int, OutputPage] = {}
 
@@ -60,9 +68,11 @@ class OutputViewer:
         relative = row[f"{shows}_path"]
         if not relative:
             raise OutputError(f"{row['variant']} has no {shows} images")
-        path = resolve_inside(self.out, relative)
+        here = self.store.local_dir
         try:
-            data = path.read_bytes()
+            data = (
+                resolve_inside(here, relative).read_bytes() if here else self.store.read(relative)
+            )
             if shows == "image":
                 return decode_image(data)
             if shows == "depth":
@@ -71,7 +81,7 @@ class OutputViewer:
                 return color_numbers(decode_png(data, np.uint16))
             numbers = decode_png(data, np.uint8)
         except (OSError, ValueError) as error:
-            raise OutputError(f"cannot read {path}: {error}") from error
+            raise OutputError(f"cannot read {self.store.uri}/{relative}: {error}") from error
         return color_classes(numbers) if shows == "semantic" else np.stack([numbers] * 3, -1)
 
     def start(self) -> None:
@@ -95,7 +105,7 @@ class OutputPage:
         rows, gui = viewer.rows, client.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"ClimateGS: {viewer.out.name}")
+        gui.set_panel_label(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}")
         self._status = gui.add_markdown("")
         self._scene = self._dropdown("scene", viewer.values("scene"))
         self._camera = self._dropdown("camera", viewer.values("camera"))

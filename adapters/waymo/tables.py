@@ -1,0 +1,679 @@
+"""A segment of the Waymo Open Dataset v2 (perception): its Parquet tables, calibration and images.
+
+    <split>/<component>/<segment>.parquet     or, of one segment alone, <folder>/<component>.parquet
+
+A component is a flat table with columns `key.<name>` and `[<Class>].<field>`. Releases differ in
+types: cameras and lasers are numbers or words, transforms float64 or float32; both are read. Rows
+have no order, so they are joined by keys. Camera axes are turned to OpenCV's (x right, y down, z
+forward); pixel centres are at +0.5 already. Errors are AdapterErrors that name file and column.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from adapters.plain_files import LARGEST, ImageFault, checked_pose, is_whole_jpeg
+from adapters.raw_drive import some
+from adapters.scene_cache import image_folder
+from adapters.uri import WAYMO_SPLITS
+from augment.errors import AdapterError, OutputError
+from augment.files.image_size import image_header
+from augment.jobs.atomic import temporary_beside
+from augment.jobs.manifest import MAX_SIDE_PX
+from augment.jobs.tables import opened_parquet, read_table
+
+COMPONENTS = {
+    "vehicle_pose": "VehiclePoseComponent",
+    "camera_calibration": "CameraCalibrationComponent",
+    "camera_image": "CameraImageComponent",
+    "lidar_calibration": "LiDARCalibrationComponent",
+    "lidar": "LiDARComponent",
+    "lidar_pose": "LiDARPoseComponent",
+    "lidar_box": "LiDARBoxComponent",
+    "lidar_segmentation": "LiDARSegmentationLabelComponent",
+}
+_REQUIRED = tuple(COMPONENTS)[:6]
+CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # numbered from 1
+LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")  # numbered from 1
+TOP = 1
+SEGMENT, STAMP = "key.segment_context_name", "key.frame_timestamp_micros"
+MAX_SIDE = 10_000  # of a range image; published ones have 2650 columns
+# Axes of the dataset's cameras (x out of the lens, y left, z up) from OpenCV's.
+_CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_LATEST_S = 9e9  # nanoseconds in int64 reach 9.2e18
+_NEAR_S = 0.25  # an image is taken this close to its frame's time
+_SPIN_NS = 100_000_000  # one turn of the TOP laser, from the frame's time on
+_DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError)
+_ADVICE = "copy it again from the dataset"
+
+
+# ---- Which files ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SegmentFiles:
+    """The tables of one segment. is_alone: its folder holds the files themselves."""
+
+    name: str
+    root: Path
+    is_alone: bool = False
+
+    def path(self, component: str) -> Path:
+        if self.is_alone:
+            return self.root / f"{component}.parquet"
+        return self.root / component / f"{self.name}.parquet"
+
+    def has(self, component: str) -> bool:
+        return self.path(component).is_file()
+
+
+def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
+    """The segment at a path: the only one, or the one of that name or first part of a name."""
+    alone = SegmentFiles("", path, is_alone=True)
+    if alone.has(_REQUIRED[0]):
+        file = alone.path(_REQUIRED[0])
+        with reading(file):
+            names = set(read_table(file, str(file), [SEGMENT]).column(SEGMENT).to_pylist())
+        found = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
+    else:
+        found = {
+            file.stem: SegmentFiles(file.stem, folder)
+            for folder in (path, *(path / split for split in WAYMO_SPLITS))
+            for file in sorted((folder / _REQUIRED[0]).glob("*.parquet"))
+        }
+    if not found:
+        raise AdapterError(
+            f"{path} holds no segment of the Waymo Open Dataset v2; expected "
+            f"{_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
+        )
+    names = sorted(found)
+    if wanted is not None:
+        wanted = wanted.removeprefix("segment-").removesuffix("_with_camera_labels")
+        names = [n for n in names if n == wanted] or [
+            n for n in names if n.startswith(f"{wanted}_")
+        ]
+    if len(names) == 1:
+        return found[names[0]]
+    first = ", ".join(names[:3] or sorted(found)[:3])
+    if not names:
+        raise AdapterError(
+            f"{path} has no segment {wanted!r}; it has {len(found)}, such as {first}"
+        )
+    raise AdapterError(
+        f"{path} has {len(names)} segments; a scene is one of them, give ?segment={names[0]} "
+        f"(there are {first})"
+    )
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Errors of Arrow and the system become AdapterErrors that name the file."""
+    try:
+        yield
+    except _DAMAGED as error:
+        raise AdapterError(f"{path} cannot be read as Parquet ({error}); {_ADVICE}") from error
+
+
+# ---- Columns -------------------------------------------------------------------------------------
+
+
+class Rows:
+    """The rows of a segment in one component; columns go by their fields' names, keys by theirs."""
+
+    def __init__(self, files: SegmentFiles, component: str, fields: Sequence[str]) -> None:
+        self.path = files.path(component)
+        self._class = COMPONENTS[component]
+        wanted = [field if field == STAMP else self.name(field) for field in fields]
+        with reading(self.path):
+            table = read_table(self.path, str(self.path), [SEGMENT, *wanted])
+            there = set(table.column_names)
+            if SEGMENT not in there:
+                raise self.fault(SEGMENT, "is missing")
+            same = pc.equal(table[SEGMENT], files.name)
+            self._table = table.append_column("row", pa.array(np.arange(len(table)))).filter(same)
+        if not len(self._table):
+            held = ", ".join(map(repr, table[SEGMENT].unique().to_pylist()[:3])) or "none"
+            raise self.fault(SEGMENT, f"must be {files.name!r} in some rows; got {held}")
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The rows' numbers in the file."""
+        return self._table["row"].to_numpy()
+
+    def name(self, field: str) -> str:
+        return field if field.startswith("key.") else f"[{self._class}].{field}"
+
+    def has(self, field: str) -> bool:
+        return self.name(field) in self._table.column_names
+
+    def fault(self, field: str, what: str) -> AdapterError:
+        return AdapterError(f"{self.path}: column {self.name(field)} {what}; {_ADVICE}")
+
+    def column(self, field: str) -> pa.Array:
+        if not self.has(field):
+            raise self.fault(field, "is missing")
+        return self._table[self.name(field)].combine_chunks()
+
+    def values(self, field: str, *, or_else: float | None = None) -> np.ndarray:
+        """A number for each row, as the file has it. or_else: for nulls, which are refused without,
+        and for all rows where there is no such column."""
+        if or_else is not None and not self.has(field):
+            return np.full(len(self), or_else)
+        column = self.column(field)
+        kind = column.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+            raise self.fault(field, f"must hold numbers; it holds {kind}")
+        if column.null_count and or_else is None:
+            raise self.fault(
+                field, f"must have a value in every row; {column.null_count} have none"
+            )
+        if column.null_count:
+            column = pc.cast(column, pa.float64()).fill_null(or_else)
+        return column.to_numpy(zero_copy_only=False)
+
+    def finite(self, field: str, largest: float = LARGEST) -> np.ndarray:
+        """As `values` in float64, all finite and none beyond the largest in size."""
+        values = self.values(field).astype(np.float64)
+        if not (np.abs(values) <= largest).all():
+            bad = values[~(np.abs(values) <= largest)][0]
+            raise self.fault(field, f"must hold finite numbers up to {largest:g}; got {bad}")
+        return values
+
+    def xyz(self, field: str) -> np.ndarray:
+        return np.stack([self.finite(f"{field}.{axis}") for axis in "xyz"], axis=1)
+
+    def stamps(self) -> np.ndarray:
+        values = self.values(STAMP)
+        if values.dtype.kind not in "iu":
+            raise self.fault(STAMP, f"must hold whole microseconds; it holds {values.dtype}")
+        return values.astype(np.int64)
+
+    def texts(self, field: str) -> list[str]:
+        values = self.column(field).to_pylist()
+        if not all(isinstance(value, str) for value in values):
+            raise self.fault(field, "must hold a text in every row")
+        return values
+
+    def enum(self, field: str, words: Sequence[str]) -> np.ndarray:
+        """Numbers from 1 of the words, which the file may have in their place, int64."""
+        of = {word: number for number, word in enumerate(words, start=1)}
+        of |= {number: number for number in of.values()}
+        values = self.column(field).to_pylist()
+        if strange := [value for value in values if value not in of]:
+            expected = f"numbers from 1 to {len(words)} or {', '.join(words)}"
+            raise self.fault(field, f"must hold {expected}; got {strange[0]!r}")
+        return np.array([of[value] for value in values], np.int64)
+
+    def box_types(self, field: str, words: Sequence[str]) -> list[str]:
+        """The words that the rows' numbers from 1, or the dataset's names such as TYPE_VEHICLE,
+        stand for; else Unknown."""
+        of = {number: word for number, word in enumerate(words, start=1)}
+        of |= {f"TYPE_{word.upper()}": word for word in words}
+        return [of.get(value, "Unknown") for value in self.column(field).to_pylist()]
+
+    def poses(self, field: str) -> np.ndarray:
+        """Rigid transforms, float64 [N, 4, 4]."""
+        flat = self.lists(field)
+        if any(values is None or values.shape != (16,) for values in flat):
+            raise self.fault(field, "must hold 16 numbers in every row")
+        where = f"{self.path}: column {self.name(field)}, row"
+        return np.stack(
+            [
+                checked_pose(values.reshape(4, 4), f"{where} {row}")
+                for row, values in zip(self.numbers, flat, strict=True)
+            ]
+        )
+
+    def lists(self, field: str) -> list[np.ndarray | None]:
+        """Float64 numbers of each row's list, None for null."""
+        column = self.column(field)
+        if not _is_list(column.type) or not _is_number(column.type.value_type):
+            raise self.fault(field, f"must hold lists of numbers; it holds {column.type}")
+        found = [None if cell.values is None else _flat(cell) for cell in column]
+        if any(values is not None and not np.isfinite(values).all() for values in found):
+            raise self.fault(field, "holds numbers that are not finite")
+        return found
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return (
+        pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+    )
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
+
+
+def _flat(cell: Any) -> np.ndarray:
+    return cell.values.to_numpy(zero_copy_only=False).astype(np.float64)
+
+
+class RowReader:
+    """Rows of a large file by number. Cheapest in ascending order: a row group is decoded from its
+    start on, in pieces, and goes on from where it was left. Thread-safe."""
+
+    def __init__(self, path: Path, columns: Sequence[str], rows_at_once: int) -> None:
+        self._path, self._columns, self._rows_at_once = path, list(columns), rows_at_once
+        self._stack, self._lock = ExitStack(), threading.Lock()
+        with reading(path):
+            self._file = self._stack.enter_context(opened_parquet(path, str(path)))
+            metadata = self._file.metadata
+            sizes = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
+        missing = [name for name in columns if name not in self._file.schema_arrow.names]
+        if missing:
+            raise AdapterError(f"{path}: column {missing[0]} is missing; {_ADVICE}")
+        self._starts = np.cumsum([0, *sizes])
+        self._batches: Iterator[pa.RecordBatch] = iter(())
+        self._batch: pa.RecordBatch | None = None
+        self._first = self._group = -1
+
+    def __del__(self) -> None:
+        self._stack.close()
+
+    def read(self, rows: Sequence[int]) -> dict[int, dict[str, Any]]:
+        """By row number, its cells by column, Arrow's scalars."""
+        found = {}
+        with self._lock, reading(self._path):
+            for row in sorted(map(int, rows)):
+                batch = self._batch_of(row)
+                at = row - self._first
+                found[row] = {name: batch[name][at] for name in self._columns}
+        return found
+
+    def _batch_of(self, row: int) -> pa.RecordBatch:
+        group = int(np.searchsorted(self._starts, row, side="right")) - 1
+        if self._batch is None or group != self._group or row < self._first:
+            self._batches = self._file.iter_batches(
+                self._rows_at_once, row_groups=[group], columns=self._columns
+            )
+            self._group, self._first, self._batch = group, int(self._starts[group]), None
+        while self._batch is None or row >= self._first + len(self._batch):
+            if self._batch is not None:
+                self._first += len(self._batch)
+            batch = self._batch = next(self._batches, None)
+            if batch is None:
+                raise AdapterError(f"{self._path} ends before row {row}; {_ADVICE}")
+            batch.validate(full=True)
+        return self._batch
+
+
+# ---- Calibration ---------------------------------------------------------------------------------
+
+_RADIAL = (0.8, 1.2)  # beyond, the polynomial is no lens any more
+_MAX_ZOOM = 2.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's image as recorded. Size and f, c: pixels; OpenCV's five coefficients."""
+
+    width: int
+    height: int
+    f_u: float
+    f_v: float
+    c_u: float
+    c_v: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+
+    @property
+    def is_pinhole(self) -> bool:
+        return not any((self.k1, self.k2, self.p1, self.p2, self.k3))
+
+    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Recorded pixels of rays (x, y, 1), OpenCV axes, and where the lens model holds."""
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        valid = (radial >= _RADIAL[0]) & (radial <= _RADIAL[1])
+        return self.f_u * u + self.c_u, self.f_v * v + self.c_v, valid
+
+    @cached_property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy of the image without distortion, of the same size: the recorded ones, or
+        a longer focal length where its border would show what was not recorded."""
+
+        def fits(zoom: float) -> bool:
+            columns = np.arange(self.width) + 0.5
+            rows = np.arange(self.height) + 0.5
+            u = np.concatenate([columns, columns, 0 * rows + 0.5, 0 * rows + self.width - 0.5])
+            v = np.concatenate([0 * columns + 0.5, 0 * columns + self.height - 0.5, rows, rows])
+            u, v, valid = self.project(*self._rays(u, v, zoom))
+            inside = (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
+            return bool((inside & valid).all())
+
+        low, high = 1.0, _MAX_ZOOM
+        if fits(low):
+            high = low
+        elif not fits(high):
+            raise ValueError("its distortion leaves no picture")
+        while high - low > 1e-6:
+            middle = (low + high) / 2
+            low, high = (low, middle) if fits(middle) else (middle, high)
+        return high * self.f_u, high * self.f_v, self.c_u, self.c_v
+
+    @cached_property
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each undistorted pixel lies in the recorded image, for cv2.remap, whose pixel
+        centres are whole numbers."""
+        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        u, v, _ = self.project(*self._rays(u, v, self.pinhole[0] / self.f_u))
+        u, v = (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32)
+        return cv2.convertMaps(u, v, cv2.CV_16SC2)
+
+    def undistorted(self, image: np.ndarray) -> np.ndarray:
+        return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def _rays(self, u: np.ndarray, v: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+        return (u - self.c_u) / (zoom * self.f_u), (v - self.c_v) / (zoom * self.f_v)
+
+
+class Mount(NamedTuple):
+    """A camera on the car. vehicle_from_camera: float64 [4, 4], OpenCV axes."""
+
+    lens: Lens
+    vehicle_from_camera: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Laser:
+    """vehicle_from_laser: float64 [4, 4]. inclinations_rad: of the range image's rows from its last
+    to its first; or their lowest and highest limit, where rows are evenly spread."""
+
+    name: str
+    vehicle_from_laser: np.ndarray
+    limits_rad: tuple[float, float]
+    inclinations_rad: np.ndarray | None
+
+    @property
+    def highest_rad(self) -> float:
+        return self.limits_rad[1] if self.inclinations_rad is None else self.inclinations_rad.max()
+
+    def directions(self, rows: int, columns: int) -> np.ndarray:
+        """Unit vectors [rows, columns, 3] of a range image's beams, vehicle axes, float64."""
+        low, high = self.limits_rad
+        up = low + (np.arange(rows) + 0.5) / rows * (high - low)
+        if self.inclinations_rad is not None:
+            up = self.inclinations_rad
+        if len(up) != rows:
+            raise AdapterError(f"{len(up)} inclinations for {rows} rows")
+        up = up[::-1, None]
+        turn = self.vehicle_from_laser[:3, :3]
+        around = np.pi * (1 - (2 * np.arange(columns) + 1) / columns)
+        around -= np.arctan2(turn[1, 0], turn[0, 0])
+        flat = np.cos(up)
+        height = np.broadcast_to(np.sin(up), (rows, columns))
+        local = np.stack([flat * np.cos(around), flat * np.sin(around), height], axis=2)
+        return local @ turn.T
+
+
+class Shot(NamedTuple):
+    """When a camera took its image of a frame, the middle of its readout, and where the vehicle
+    was then. pose_ns: the time of the pose that the dataset gives. readout_s: how long the readout
+    took, 0 where that is not known. row: of the image in camera_image."""
+
+    timestamp_ns: int
+    world_from_vehicle: np.ndarray
+    pose_ns: int
+    readout_s: float
+    row: int
+
+
+# ---- The segment ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """What a segment's small tables say. Frames are numbered from 0 in order of time.
+
+    stamps_us: int64 [F], the frames' keys: when the TOP laser begins its turn. world_from_vehicle:
+    float64 [F, 4, 4], at pose_times_ns, int64 [F], about the middle of that turn. cameras, lasers:
+    by name. shots: by frame and camera. problems: a sentence each."""
+
+    files: SegmentFiles
+    stamps_us: np.ndarray
+    world_from_vehicle: np.ndarray
+    pose_times_ns: np.ndarray
+    cameras: Mapping[str, Mount]
+    lasers: Mapping[str, Laser]
+    shots: Mapping[int, Mapping[str, Shot]]
+    problems: tuple[str, ...]
+
+    def frames_of(self, stamps_us: np.ndarray, path: Path) -> np.ndarray:
+        """The frames' numbers of a table's rows, int64."""
+        at = np.clip(np.searchsorted(self.stamps_us, stamps_us), 0, len(self.stamps_us) - 1)
+        if (unknown := self.stamps_us[at] != stamps_us).any():
+            raise AdapterError(
+                f"{path}: {unknown.sum()} rows are of frames without a row in vehicle_pose, such "
+                f"as {stamps_us[unknown][0]}; {_ADVICE}"
+            )
+        return at
+
+
+def read_segment(files: SegmentFiles) -> Segment:
+    """All but images, range images and labels."""
+    if missing := [name for name in _REQUIRED if not files.has(name)]:
+        raise AdapterError(
+            f"segment {files.name} lacks {', '.join(str(files.path(name)) for name in missing)}; a "
+            f"scene needs the components {', '.join(_REQUIRED)}, download them too"
+        )
+    rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
+    stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
+    order = np.argsort(stamps, kind="stable")
+    stamps, poses = stamps[order], poses[order]
+    if (np.diff(stamps) <= 0).any():
+        twice = stamps[1:][np.diff(stamps) <= 0][0]
+        raise rows.fault(STAMP, f"must name each frame once; {twice} stands twice")
+    if np.abs(stamps).max() > _LATEST_S * 1e6:
+        raise rows.fault(STAMP, f"must be Unix time in microseconds; got {stamps.max()}")
+    cameras, lasers = _read_cameras(files), _read_lasers(files)
+    segment = Segment(files, stamps, poses, stamps * 1000 + _SPIN_NS // 2, cameras, lasers, {}, ())
+    shots, problems = _read_shots(segment)
+    times = [
+        own["FRONT"].pose_ns if "FRONT" in (own := shots.get(n, {})) else int(usual)
+        for n, usual in enumerate(segment.pose_times_ns)
+    ]
+    times_ns = np.array(times, np.int64)
+    return replace(segment, pose_times_ns=times_ns, shots=shots, problems=problems)
+
+
+def _read_cameras(files: SegmentFiles) -> dict[str, Mount]:
+    numbers = [f"intrinsic.{n}" for n in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
+    key, pose = "key.camera_name", "extrinsic.transform"
+    rows = Rows(files, "camera_calibration", [key, *numbers, pose, "width", "height"])
+    vehicle_from_camera = rows.poses(pose) @ _CAMERA_FROM_OPENCV
+    sizes = np.stack([rows.finite("width"), rows.finite("height")], axis=1)
+    if not ((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all():
+        raise rows.fault("width", f"and height must be 1 to {MAX_SIDE_PX} pixels; got {sizes[0]}")
+    values = np.stack([rows.finite(name) for name in numbers], axis=1)
+    found = {}
+    for i, number in enumerate(rows.enum(key, CAMERAS)):
+        name = CAMERAS[number - 1]
+        lens = Lens(*map(int, sizes[i]), *map(float, values[i]))
+        try:
+            if min(lens.f_u, lens.f_v) <= 0:
+                raise ValueError("its focal length is not > 0")
+            _ = lens.pinhole
+        except ValueError as error:
+            raise rows.fault("intrinsic.f_u", f"and the others: camera {name}, {error}") from None
+        found[name] = Mount(lens, vehicle_from_camera[i])
+    return {name: found[name] for name in CAMERAS if name in found}
+
+
+def _read_lasers(files: SegmentFiles) -> dict[str, Laser]:
+    key, pose = "key.laser_name", "extrinsic.transform"
+    low, high, values = (f"beam_inclination.{name}" for name in ("min", "max", "values"))
+    rows = Rows(files, "lidar_calibration", [key, pose, low, high, values])
+    poses, lows, highs = rows.poses(pose), rows.finite(low), rows.finite(high)
+    given = rows.lists(values)
+    found = {}
+    for i, number in enumerate(rows.enum(key, LASERS)):
+        own = given[i] if given[i] is not None and len(given[i]) else None
+        name = LASERS[number - 1]
+        found[name] = Laser(name, poses[i], (float(lows[i]), float(highs[i])), own)
+    return {name: found[name] for name in LASERS if name in found}
+
+
+def _read_shots(segment: Segment) -> tuple[dict[int, dict[str, Shot]], tuple[str, ...]]:
+    """Poses at the middle of each image's readout. The dataset's own are up to some milliseconds
+    off it, so they go on with the velocities: position along the linear one, world axes, rotation
+    by the angular one, vehicle axes."""
+    key, pose, time = "key.camera_name", "pose.transform", "pose_timestamp"
+    speeds = [
+        f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz"
+    ]
+    names = ("camera_trigger_time", "camera_readout_done_time", "shutter")
+    shutter = [f"rolling_shutter_params.{name}" for name in names]
+    fields = [STAMP, key, pose, time, *speeds, *shutter]
+    rows = Rows(segment.files, "camera_image", fields)
+    frames = segment.frames_of(rows.stamps(), rows.path)
+    poses, pose_s = rows.poses(pose), rows.finite(time, _LATEST_S)
+    velocity = np.stack([rows.values(name, or_else=0) for name in speeds], axis=1)
+    begun_s, done_s, open_s = (rows.values(name, or_else=0) for name in shutter)
+    if np.abs(pose_s - segment.stamps_us[frames] * 1e-6).max(initial=0) > _NEAR_S:
+        raise rows.fault(time, f"must be seconds of Unix time within {_NEAR_S} s of its frame's")
+    with np.errstate(all="ignore"):
+        offset_s = (begun_s + done_s) / 2 - pose_s
+        known = (np.abs(offset_s) < _NEAR_S) & np.isfinite(velocity).all(axis=1)
+    offset_s[~known] = 0
+    moved = poses.copy()
+    moved[known, :3, 3] += (velocity[:, :3] * offset_s[:, None])[known]
+    turns = Rotation.from_rotvec((velocity[:, 3:] * offset_s[:, None])[known]).as_matrix()
+    moved[known, :3, :3] = poses[known, :3, :3] @ turns
+    pose_ns = np.round(pose_s * 1e9).astype(np.int64)
+    times_ns = pose_ns + np.round(offset_s * 1e9).astype(np.int64)
+    took_s = np.where(known, done_s - begun_s - open_s, 0)
+    found: dict[int, dict[str, Shot]] = {}
+    for i, number in enumerate(rows.enum(key, CAMERAS)):
+        name, frame = CAMERAS[number - 1], int(frames[i])
+        if name not in segment.cameras:
+            raise rows.fault(key, f"names camera {name}, which camera_calibration has not")
+        shot = Shot(
+            int(times_ns[i]), moved[i], int(pose_ns[i]), float(took_s[i]), int(rows.numbers[i])
+        )
+        if name in found.setdefault(frame, {}):
+            raise rows.fault(key, f"has two images of {name} at {segment.stamps_us[frame]}")
+        found[frame][name] = shot
+    problems = []
+    if not known.all():
+        problems.append(
+            f"{(~known).sum()} images have no times of their shutter or no velocity; their cameras "
+            f"stand where the car was at {time}"
+        )
+    return found, tuple(problems)
+
+
+# ---- Images --------------------------------------------------------------------------------------
+
+_IMAGES_AT_ONCE = 16  # some 6 MB of JPEGs, decoded 0.1 GB
+_JPEG_QUALITY = 95
+_THREADS = 4  # decoders and encoders release the interpreter
+_MAX_FAULTS = 3  # images with a sentence of their own
+
+
+def extract_images(
+    segment: Segment, numbers: Sequence[int]
+) -> tuple[dict[int, dict[str, str]], tuple[str, ...]]:
+    """Paths of the frames' images without lens distortion, by frame and camera, and a sentence for
+    what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`), where
+    those that are there already are left as they are."""
+    files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
+    folder = image_folder(segment.files.name, files)
+    wanted = {
+        shot.row: (n, name, folder / name / f"{segment.stamps_us[n]}.jpg")
+        for n in numbers
+        for name, shot in segment.shots.get(n, {}).items()
+    }
+    found: dict[int, dict[str, str]] = {n: {} for n in numbers}
+    faults, missing = [], []
+    for row, (n, name, path) in wanted.items():
+        if _is_there(path):
+            found[n][name] = str(path)
+        else:
+            missing.append(row)
+    column = f"[{COMPONENTS['camera_image']}].image"
+    reader = RowReader(files[0], [column], _IMAGES_AT_ONCE)
+    missing.sort()
+    bar = tqdm(total=len(missing), desc="images", unit="image", disable=None)
+    with ThreadPoolExecutor(_THREADS) as pool, bar:
+        for start in range(0, len(missing), _IMAGES_AT_ONCE):
+            rows = missing[start : start + _IMAGES_AT_ONCE]
+            cells = reader.read(rows)
+            jobs = [
+                (cells[r][column], segment.cameras[wanted[r][1]].lens, wanted[r][2]) for r in rows
+            ]
+            for row, fault in zip(rows, pool.map(_extract, jobs), strict=True):
+                n, name, path = wanted[row]
+                if fault:
+                    faults.append(f"camera {name}, frame {n}: its image {fault}; left out")
+                else:
+                    found[n][name] = str(path)
+            bar.update(len(rows))
+    problems = faults[:_MAX_FAULTS]
+    if len(faults) > _MAX_FAULTS:
+        problems.append(f"{len(faults) - _MAX_FAULTS} more images cannot be used")
+    for name in segment.cameras:
+        if without := [n for n in numbers if name not in segment.shots.get(n, {})]:
+            problems.append(f"camera {name}: no image of {some(without)}")
+    ordered = {n: {name: own[name] for name in CAMERAS if name in own} for n, own in found.items()}
+    return ordered, tuple(problems)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return is_whole_jpeg(path)
+    except ImageFault:
+        return False
+
+
+def _extract(job: tuple[Any, Lens, Path]) -> str:
+    """Write an image without distortion. Returns what is wrong with it, or nothing."""
+    cell, lens, path = job
+    data = b"" if cell.as_buffer() is None else cell.as_buffer().to_pybytes()
+    header = image_header(data)
+    if header is None or header.format != "JPEG" or b"\xff\xd9" not in data[-64:]:
+        return f"of {len(data)} bytes is no whole JPEG"
+    if (header.width, header.height) != (lens.width, lens.height):
+        size = f"{header.width}x{header.height}"
+        return f"is of {size} pixels, its camera of {lens.width}x{lens.height}"
+    if not lens.is_pinhole:
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if image is None:
+            return "cannot be decoded"
+        quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        data = cv2.imencode(".jpg", lens.undistorted(image), quality)[1].tobytes()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new = temporary_beside(path)
+        new.write_bytes(data)
+        os.replace(new, path)
+    except OSError as error:
+        raise AdapterError(
+            f"{path} cannot be written ({error.strerror or error}); images without distortion are "
+            f"kept there, set XDG_CACHE_HOME to a folder with room for them"
+        ) from error
+    return ""
