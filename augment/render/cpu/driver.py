@@ -232,7 +232,8 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     timer = StageTimer(stage_times)
-    if fog is None or clip is not None or not buffers <= {RGB, ALPHA}:
+    is_hidden = fog is not None and fog.sigma_per_m > 0
+    if not is_hidden or clip is not None or not buffers <= {RGB, ALPHA}:
         settings = replace(settings, fog_cut=0.0)
     inputs = gather_inputs(
         parts, camera, settings, fog, clip, with_color=RGB in buffers, culled=True
