@@ -43,6 +43,9 @@ class RasterSettings:
     more light than this share comes through the fog, and finish a pixel once no more than this
     share of the light behind would. Alpha then is that of the splats drawn: whoever sets this puts
     the fog behind them, its airlight or the sky through it. 0 leaves out nothing.
+
+    lod_px: far splats of large backgrounds are drawn merged, in cells of this many pixels at most
+    (augment.lod); 0 draws all as they are.
     """
 
     near_m: float = 0.01
@@ -53,3 +56,4 @@ class RasterSettings:
     transmittance_stop: float = TRANSMITTANCE_STOP
     radius_clip_px: float = 0.0
     fog_cut: float = 0.0
+    lod_px: float = 0.0
