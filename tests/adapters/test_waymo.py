@@ -122,6 +122,29 @@ def test_a_sweeps_columns_and_classes(written: Path) -> None:
     np.testing.assert_array_equal(origins, labels.lidar_origins(1, sweep)[5:9])
 
 
+def test_returns_take_the_classes_of_segmented_images(tmp_path: Path) -> None:
+    root = files.write_segment(tmp_path, frames=2, segmented=(), pictured=(1,))
+    labels = waymo_labels(str(root), {})
+    assert labels.lidar_classes(labels.lidar(0)) is None
+    sweep = labels.lidar(1)
+    classes, seen = labels.lidar_classes(sweep), sweep.columns["camera_class"]
+    first = (sweep.columns["return_number"] == 1) & (seen > 0)
+    assert set(np.unique(seen)) <= {0, 1, 2, 19, 20, 25}
+    street, points = Street((DRIVER, PARKED)), sweep.points_m
+    is_wall = np.abs((points - street.wall) @ street.normal) < 0.01
+    is_road = np.abs(points[:, 2] - ORIGIN[2]) < 0.01
+    # Cameras and lasers stand apart, so edges differ.
+    for part, expected in (
+        (is_wall & ~is_road, SemanticClass.BUILDING),
+        (is_road & ~is_wall, SemanticClass.ROAD),
+        (~is_wall & ~is_road, SemanticClass.VEHICLE),
+    ):
+        own = part & first & (seen != 1)
+        assert own.sum() > 20 and (classes[own] == expected).mean() > 0.9
+    assert (classes[(seen <= 1) | (seen == 25)] == SemanticClass.UNKNOWN).all()
+    assert 0.2 < first.mean() < 0.9
+
+
 def test_points_project_to_a_thousandth_of_a_pixel(written: Path) -> None:
     """Through the scene's pinhole camera and the lens against the dataset's formulas: the pose at
     the middle of the readout, the extrinsic with x out of the lens, OpenCV's model."""
@@ -138,11 +161,7 @@ def test_points_project_to_a_thousandth_of_a_pixel(written: Path) -> None:
             )
             local[:, 1:] *= local[:, :1]
             points = local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-            cv = np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
-            _, _, c_u, c_v = RIG.camera(n)
-            matrix = np.array([[RIG.focal, 0, c_u], [0, RIG.focal, c_v], [0, 0, 1]])
-            zero, lens = np.zeros(3), np.array(RIG.distortion)
-            expected = cv2.projectPoints(cv, zero, zero, matrix, lens)[0][:, 0]
+            expected = np.column_stack(files.pixels_of(RIG, n, middle, points)[:2])
             seen = (points - drive.world_origin_m) @ camera.camera_from_world.numpy()[:3, :3].T
             seen += camera.camera_from_world.numpy()[:3, 3]
             u = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
@@ -373,7 +392,7 @@ def test_what_single_frames_lack_is_said(copy: Path) -> None:
     assert "is no whole JPEG; left out" in said and "of 0 bytes" in said
     assert "is of 30x20 pixels, its camera of 192x" in said
     assert "no image of 1 frame (" in said and "the LiDAR has no row of 1 frame (1)" in said
-    assert "must have height x width x 6 values" in said and "no boxes are known" in said
+    assert "must have height x width x 6 numbers" in said and "no boxes are known" in said
     assert len(drive.problems) == 10 and drive.sweeps == ()
     assert sum(len(frame.image_paths) for frame in drive.frames) == 11
     assert sum(len(frame.cameras) for frame in drive.frames) == 14
