@@ -390,6 +390,12 @@ class WaymoLabels:
 
     segment: Segment
 
+    @property
+    def lidar_top_rad(self) -> float:
+        """That of TOP: the others look 30 degrees up, and 20 m far."""
+        top = self.segment.lasers.get("TOP")
+        return 0.0 if top is None else float(top.highest_rad)
+
     def boxes(self, frame_index: int) -> Boxes:
         return _all_boxes(self.segment).get(frame_index, Boxes.empty())
 
@@ -524,7 +530,7 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
     frames = tuple(_frame(segment, n, origin, paths[n]) for n in chosen.numbers)
     boxes, box_problems = moving_boxes(segment, chosen.numbers, origin)
     sweeps, sweep_problems = read_sweeps(segment, chosen.used, origin)
-    top = segment.lasers.get("TOP")
+    labels = WaymoLabels(segment)
     return RawDrive(
         name=segment.files.name,
         source=format_uri("waymo", path, query),
@@ -532,9 +538,9 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
         held_out=chosen.held_out,
         sweeps=sweeps,
         boxes=boxes,
-        labels=WaymoLabels(segment),
+        labels=labels,
         world_origin_m=origin,
-        lidar_top_deg=0.0 if top is None else float(np.degrees(top.highest_rad)),
+        lidar_top_deg=float(np.degrees(labels.lidar_top_rad)),
         problems=(
             *segment.problems,
             *chosen.problems,

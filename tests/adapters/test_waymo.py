@@ -23,6 +23,7 @@ from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import reflectances
 from augment.errors import AdapterError
+from augment.recorded_sky import lidar_top_rad
 from augment.semantics import SemanticClass
 
 RIG = Rig()
@@ -258,6 +259,8 @@ def test_a_scene_of_a_segment_looks_like_its_images(written: Path, cache: Path) 
     assert any("lens distortion" in p for p in scene.problems)
     assert any(f"{0.044 * files.SPEED / 2:.2f} m" in p for p in scene.problems)
     assert len(scene.problems) == 2
+    # Near lasers look 30 degrees up: their returns do not tell where far walls end.
+    assert lidar_top_rad(scene, [0, 1, 2]) == RIG.inclinations().max() < 0.05
     # Kept scenes come with their images, which may have been deleted meanwhile.
     (folder,) = (cache / "images").iterdir()
     before = {p: p.read_bytes() for p in folder.rglob("*.jpg")}
