@@ -1,12 +1,13 @@
 """Times of passes: `with stopwatch() as seconds:` around, `with timed("flood: bed"):` in a pass,
 which costs a look-up where no stopwatch runs. Where one does, the GPU is waited for at both
-ends of a pass, which makes the whole slower and each time its own.
+ends of a pass, which makes the whole slower and each time its own; and what runs inside can be
+given up between two passes.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -14,14 +15,17 @@ import torch
 
 
 class StageTimer:
-    """seconds: by name, without those of passes inside the pass."""
+    """seconds: by name, without those of passes inside the pass. before: called before each."""
 
-    def __init__(self) -> None:
+    def __init__(self, before: Callable[[], None] | None) -> None:
         self.seconds: dict[str, float] = {}
+        self._before = before
         self._open: list[str] = []
         self._since = time.perf_counter()
 
     def start(self, name: str) -> None:
+        if self._before is not None:
+            self._before()
         self._close()
         self._open.append(name)
 
@@ -62,11 +66,13 @@ class timed:
 
 
 @contextmanager
-def stopwatch() -> Iterator[dict[str, float]]:
-    """Seconds of the passes that run inside, in this thread or task, by name."""
-    timer = StageTimer()
-    before = _listening.set(timer)
+def stopwatch(before: Callable[[], None] | None = None) -> Iterator[dict[str, float]]:
+    """Seconds of the passes that run inside, in this thread or task, by name. before: called before
+    each pass; what it raises ends what runs inside.
+    """
+    timer = StageTimer(before)
+    outer = _listening.set(timer)
     try:
         yield timer.seconds
     finally:
-        _listening.reset(before)
+        _listening.reset(outer)

@@ -38,6 +38,9 @@ class RasterSettings:
     splat's size is the larger half-extent of the box in which its alpha can reach 1/255,
     sqrt(2 ln(255 opacity) max(xx, yy)), with the opacity after antialiasing and the blurred 2D
     covariance, not rounded. As gsplat's `radius_clip`, which rounds the extent up first.
+
+    lod_px: far splats of large backgrounds are drawn merged, in cells of this many pixels at most
+    (augment.lod); 0 draws all as they are.
     """
 
     near_m: float = 0.01
@@ -47,3 +50,4 @@ class RasterSettings:
     mode_depth_floor_m: float = 0.2
     transmittance_stop: float = TRANSMITTANCE_STOP
     radius_clip_px: float = 0.0
+    lod_px: float = 0.0

@@ -281,6 +281,9 @@ def test_moods_are_what_their_names_say():
     assert light("rain", LAND) < light("overcast", LAND) < light("snow-light", LAND)
     assert light("night", SKY) < light("dusk", SKY) < light("overcast", SKY)
     assert warmth("golden-hour") > 0.1 > warmth("hazy-summer") > 0 > warmth("snow-light")
+    assert light("night", SKY) < light("grey-dusk", SKY) < light("rain", SKY)
+    assert light("grey-dusk", LAND) < light("rain", LAND)
+    assert warmth("blue-hour") < warmth("grey-dusk") < 0
     assert warmth("blue-hour") < -0.08 and warmth("blue-hour", SKY) < -0.2
 
 

@@ -9,6 +9,7 @@ import math
 import shlex
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -263,6 +264,40 @@ def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten
         count = len(one.pictures)
         one.set("frame", 1)
         assert not np.array_equal(one.rest(after=count), clear)
+
+
+class SlowDust(DustEffect):
+    """Dust of which a picture of the whole size waits until it may go on."""
+
+    def __init__(self, height: int) -> None:
+        self.height, self.begun, self.may_end = height, threading.Event(), threading.Event()
+
+    def edit_image(self, own, drawn, camera):
+        if camera.height == self.height:
+            self.begun.set()
+            assert self.may_end.wait(60)
+        return super().edit_image(own, drawn, camera)
+
+
+@pytest.mark.long
+def test_a_picture_at_rest_is_given_up_once_something_else_is_asked_for(tmp_path):
+    edits = Edits("clear", SCALE, folder=tmp_path)
+    with served(edits) as (viewer, url), PageClient(url, (320, 180)) as page:
+        count = len(page.rest(after=0)) and len(page.pictures)
+        slow = SlowDust(round(SCALE * viewer.scene.frames[0].cameras["front"].height))
+        effects.add_effect(slow)
+        try:
+            (open_page,) = viewer.pages
+            open_page.edit(edits.with_section("weather.dust"))
+            assert slow.begun.wait(60)
+            open_page.edit(edits)  # without dust
+            slow.may_end.set()
+            page.rest(after=count)
+        finally:
+            slow.may_end.set()
+            effects.remove_effect("dust")
+    kinds = [message["format"] for _, message in page.pictures[count:]]
+    assert kinds.count("png") == 1 and kinds[-1] == "png"  # the dusty one is not among them
 
 
 @pytest.mark.long

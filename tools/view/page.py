@@ -124,8 +124,11 @@ class Page:
         self._effects: dict[str, tuple[Any, Any]] = {}
         self._build()
         self._show_values()
+        self._resize(client.camera.image_width, client.camera.image_height)
         self._to_camera()
-        client.camera.on_update(self._on_camera)
+        # Not before the next message: viser tells of this one too, and would say that the window is
+        # where it was only just told to go.
+        asyncio.get_running_loop().call_soon(client.camera.on_update, self._on_camera)
 
     # ---- The recipe ------------------------------------------------------------------------------
 
@@ -387,7 +390,9 @@ class Page:
         with gui.add_folder("drawn over the picture"):
             self._toggle("boxes", "boxes", "Labelled boxes of the frame.")
             hint = "The sweep as the weather leaves it. Cyan: unchanged; yellow: attenuated; "
-            self._toggle("LiDAR", "lidar", hint + "red: scattered by the air; magenta: moved.")
+            self._toggle(
+                "LiDAR", "lidar", hint + "red: scattered; magenta: moved; white: drops, flakes."
+            )
             self._toggle("cameras", "frustums", "The frame's cameras.")
         hint = "Draw what `climategs render` writes, though the window shows less."
         self._toggle("every pixel", "every_pixel", hint)

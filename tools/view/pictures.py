@@ -232,8 +232,10 @@ def depth_of_page(depth_m: np.ndarray) -> np.ndarray:
 
 # ---- What the page draws over them ---------------------------------------------------------------
 
-# By a return's weather_code: unchanged, attenuated, scattered, lost, moved.
-_CODE_COLORS = np.array([[0, 220, 255], [255, 220, 60], [255, 70, 70], [0, 0, 0], [255, 120, 255]])
+# By a return's weather_code: unchanged, attenuated, scattered, lost, moved, precipitation.
+_CODE_COLORS = np.array(
+    [[0, 220, 255], [255, 220, 60], [255, 70, 70], [0, 0, 0], [255, 120, 255], [255, 255, 255]]
+)
 
 
 def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
@@ -257,4 +259,4 @@ def lidar_points(
         return None
     sweep = drop_lost(weathered_sweep(scene, recipe, frame.index, sweep))
     points = sweep.points_m - np.asarray(scene.world_origin_m)
-    return points, _CODE_COLORS[np.minimum(sweep.columns[CODE_COLUMN], 4)].astype(np.uint8)
+    return points, _CODE_COLORS[sweep.columns[CODE_COLUMN]].astype(np.uint8)

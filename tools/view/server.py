@@ -282,6 +282,8 @@ class Viewer:
         try:
             self._draw(page, wish, moving=moving)
             own.due = due
+        except _Outdated:
+            pass
         except Exception:
             page.show_status("not drawn")
             raise
@@ -327,7 +329,15 @@ class Viewer:
     def _picture(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
     ) -> tuple[Shown, dict[str, float]]:
-        """The picture without bars; seconds of its passes."""
+        """The picture without bars; seconds of its passes.
+
+        Raises:
+            _Outdated: at rest, before a pass: the page is closed or wishes for something else.
+        """
+
+        def check() -> None:
+            if page.is_closed or page.wish is not wish:
+                raise _Outdated
 
         def drawn(recipe: Recipe) -> Shown:
             asked = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
@@ -337,14 +347,15 @@ class Viewer:
         if moving:
             shown, seconds = drawn(recipe), {}
         else:
-            with stopwatch() as seconds:
+            with stopwatch(check) as seconds:
                 shown = drawn(recipe)
         if wish.is_split:
             clear = without_weather(recipe)
             size = shown.rgb.shape
             key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
             if page.before is None or page.before[0] != key:
-                page.before = (key, drawn(clear).rgb)
+                with contextlib.nullcontext() if moving else stopwatch(check):
+                    page.before = (key, drawn(clear).rgb)
             shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
         return shown, seconds
 
@@ -476,6 +487,10 @@ class Viewer:
             what = "a flight" if wish.pose is not None else "an uploaded file"
             return f"# {what}: save the recipe first, and the command will stand here"
         return wish.edits.command(f"{self._where(wish, None)} --out out/view")
+
+
+class _Outdated(Exception):
+    """Nobody waits for the picture any more."""
 
 
 def _paced(factor: float, seconds: float) -> float:

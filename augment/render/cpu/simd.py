@@ -227,6 +227,65 @@ def totals(builder, *rows):
     return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
 
 
+# ---- Pixels of three colours, which lie one after the other --------------------------------------
+# Of 24 such numbers each register has a colour's in lanes that the other two have not: lane
+# (colour + 3 pixel) % 8. So two blends and a permutation sort them, and the same way back.
+
+_MIXED = [[(colour + 3 * pixel) % LANES for pixel in range(LANES)] for colour in range(3)]
+
+
+def _owner(colour: int, lane: int) -> int:
+    """Which of three registers has a colour's number in a lane."""
+    return (colour + 3 * _MIXED[colour].index(lane)) // LANES
+
+
+def _blend(builder, values, choose):
+    """Lane by lane the value that `choose` names."""
+    pairs = [choose(lane) for lane in range(LANES)]
+    two = [lane + LANES * (pick == 1) for lane, pick in enumerate(pairs)]
+    mixed = builder.shuffle_vector(*values[:2], ir.Constant(_I8, two))
+    three = [lane + LANES * (pick == 2) for lane, pick in enumerate(pairs)]
+    return builder.shuffle_vector(mixed, values[2], ir.Constant(_I8, three))
+
+
+@intrinsic
+def load_colours(typingctx, array, index):
+    """Red, green and blue of the eight pixels from array[index] on."""
+    kind = types.UniTuple(float8, 3)
+
+    def codegen(context, builder, sig, args):
+        at = builder.bitcast(_pointer(context, builder, sig.args[0], *args), _F8.as_pointer())
+        rows = [builder.load(builder.gep(at, [_INT(k)]), align=4) for k in range(3)]
+        sorted_rows = []
+        for colour in range(3):
+            mixed = _blend(builder, rows, lambda lane, c=colour: _owner(c, lane))
+            lanes = ir.Constant(_I8, _MIXED[colour])
+            sorted_rows.append(builder.shuffle_vector(mixed, mixed, lanes))
+        return context.make_tuple(builder, kind, sorted_rows)
+
+    return kind(array, types.uint64), codegen
+
+
+@intrinsic
+def store_colours(typingctx, array, index, red, green, blue):
+    """What `load_colours` loads."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args[:2])
+        at = builder.bitcast(at, _F8.as_pointer())
+        mixed = []
+        for colour, value in enumerate(args[2:]):
+            lanes = [_MIXED[colour].index(lane) for lane in range(LANES)]
+            mixed.append(builder.shuffle_vector(value, value, ir.Constant(_I8, lanes)))
+        for k in range(3):
+            own = [next(c for c in range(3) if _owner(c, lane) == k) for lane in range(LANES)]
+            row = _blend(builder, mixed, lambda lane, own=own: own[lane])
+            builder.store(row, builder.gep(at, [_INT(k)]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, float8, float8, float8), codegen
+
+
 @_operation(types.boolean, float8)
 def any_not_negative(builder, value):
     """Whether the sign bit of any lane is clear."""
