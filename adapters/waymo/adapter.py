@@ -98,9 +98,9 @@ class Returns(NamedTuple):
     camera_classes: np.ndarray | None
 
 
-def frame_returns(segment: Segment, frame: int) -> Returns | None:
+def frame_returns(segment: Segment, frame: int, every: int = 1) -> Returns | None:
     """The returns of a frame, lasers in their order, each laser's first returns first; None where
-    the table has no row of it."""
+    the table has no row of it. every: take one return in so many, other ones in the next frame."""
     scans = _range_images(segment, "lidar", frame, 4)
     if not scans:
         return None
@@ -115,7 +115,7 @@ def frame_returns(segment: Segment, frame: int) -> Returns | None:
         own = zip(images, labels.get(laser, nothing), seen.get(laser, nothing), strict=True)
         for number, (image, classes, pixels) in enumerate(own, start=1):
             if image is not None:
-                parts.append(beams.returns(image, number, classes, pixels, pictures))
+                parts.append(beams.returns(image, number, classes, pixels, pictures, every))
     if not parts:
         return None
     found = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -139,6 +139,7 @@ class _Beams(NamedTuple):
         labels: np.ndarray | None,
         pixels: np.ndarray | None,
         pictures: Mapping[int, np.ndarray],
+        every: int,
     ) -> Returns:
         """Those of a range image [H, W, 4]. labels: objects and classes [H, W, 2]. pixels: camera,
         x, y of two cameras that see a return [H, W, 6]. pictures: classes [h, w] by camera."""
@@ -165,6 +166,7 @@ class _Beams(NamedTuple):
         directions = _directions(laser, rows, columns)
         with np.errstate(invalid="ignore"):
             hit = np.flatnonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+        hit = hit[self.frame % every :: every]
         values = image.reshape(-1, 4)[hit]
         mount = laser.vehicle_from_laser[:3, 3]
         offsets = values[:, :1].astype(np.float64) * directions.reshape(-1, 3)[hit]
@@ -619,24 +621,24 @@ def read_sweeps(
     every second return is taken, or every third, and so on, so that there are at most
     _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
-    missing, problems, step = [], [], 1
+    missing, problems, step = [], [], 0
     rows = _index(segment, "lidar", "key.laser_name", LASERS)
     in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
     for n in tqdm(in_file, desc="LiDAR", unit="sweep", disable=None):
         try:
-            returns = frame_returns(segment, n)
+            returns = frame_returns(segment, n, step or 1)
         except AdapterError as error:
             problems.append(f"frame {n}: its LiDAR returns are left out: {error}")
             continue
         if returns is None:
             missing.append(n)
             continue
-        if not sweeps:
-            step = -(-len(returns.points_m) * len(numbers) // _MAX_RETURNS)
-        own = slice(n % step, None, step)
-        points = returns.points_m[own]
-        semantic = _semantic(returns.classes, returns.camera_classes, len(returns.points_m))[own]
-        sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns[own], semantic)
+        if not step:  # as if all frames had as many as the first
+            step = max(1, -(-len(returns.points_m) * len(numbers) // _MAX_RETURNS))
+            returns = frame_returns(segment, n, step) if step > 1 else returns
+        points = returns.points_m
+        semantic = _semantic(returns.classes, returns.camera_classes, len(points))
+        sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns, semantic)
         keep = is_usable(sweep, points, segment.world_from_vehicle[n], EGO_M)
         sweeps[n] = sweep.select(keep)
     if len(problems) > _MAX_FAULTS:

@@ -278,6 +278,19 @@ def test_frames_that_are_held_out_give_no_returns(written: Path) -> None:
     assert [frame.index for frame in alone.frames] == [1] and len(alone.sweeps) == 1
 
 
+def test_long_drives_are_built_from_some_returns_of_every_frame(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = read(written)
+    monkeypatch.setattr("adapters.waymo.adapter._MAX_RETURNS", sum(map(len, whole.sweeps)) // 3)
+    some = read(written)
+    assert any("one return in 4, of 3 frames" in problem for problem in some.problems)
+    for all_of_it, sweep in zip(whole.sweeps, some.sweeps, strict=True):
+        assert 0.2 < len(sweep) / len(all_of_it) < 0.3
+        assert set(map(bytes, sweep.points)) < set(map(bytes, all_of_it.points))
+    assert len(some.labels.lidar(0)) == len(whole.labels.lidar(0))  # labels have all of them
+
+
 def test_segments_go_by_their_names_or_first_parts(written: Path, tmp_path: Path) -> None:
     root = tmp_path / "waymo"
     shutil.copytree(written, root / "validation")
