@@ -128,6 +128,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             sh_degree=render.sh_degree,
             transmittance_stop=render.transmittance_stop,
             radius_clip_px=render.radius_clip_px,
+            fog_cut=render.fog_cut,
             lod_px=render.lod_px,
         ),
         buffers=buffers,
