@@ -334,7 +334,7 @@ _NEAR_NS = 25_000_000  # images come every 50 ms
 # The car (4.9 m by 1.9 m, origin at the rear axle). Published sweeps hold no return in it.
 _EGO_M = np.array([[-1.3, -1.1, -0.5], [4.0, 1.1, 1.9]])
 # Of a whole log: an image every few metres shows all there is, and a voxel is hit more than once.
-_MAX_COLOUR_IMAGES, _MAX_RETURNS = 200, 8_000_000
+_MAX_COLOUR_IMAGES, _MAX_RETURNS = 150, 8_000_000
 _GREY_LEVELS = 6  # apart, colours of a grey image are the JPEG's rounding
 
 

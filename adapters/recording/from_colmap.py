@@ -33,11 +33,12 @@ from augment.jobs.files import encode_depth
 CAMERA = "camera"  # of images that lie in no folder of their own
 _JPEG_QUALITY = 97
 _MAX_ERROR_PX = 2.0  # of a point's reprojection
-# The road, in units of the cameras' height above it.
-_ON_ROAD, _MAX_TILT_DEG, _MIN_ON_ROAD = 0.03, 20.0, 30
+# The road: heights of its points stray by this part of their distance from the cameras.
+_ON_ROAD, _MAX_TILT_DEG, _MIN_ON_ROAD = 0.01, 8.0, 30
+_MAX_RESIDUAL = 0.1  # of the cameras' height
 _TRIES, _MOST_POINTS, _SEED = 2000, 20_000, 20260101
 _MIN_PATH_HEIGHTS = 2.0
-_LOW_DEG = 5.0  # points that are seen further below the horizon may be the road's
+_LOW_DEG = 3.0  # points that are seen further below the horizon may be the road's
 # Depth between points: across triangles whose corners are this near in pixels of the width, and in
 # depth; where the cameras drove, the road itself has points.
 _MAX_EDGE, _MAX_RATIO = 1 / 6, 1.5
@@ -205,19 +206,20 @@ def find_road(shots: Sequence[Shot]) -> Road:
     rng = np.random.default_rng(_SEED)
     if len(points) > _MOST_POINTS:
         points = points[np.sort(rng.choice(len(points), _MOST_POINTS, replace=False))]
+    far = np.linalg.norm(points - centres.mean(axis=0), axis=1)
     best, road = 0, None
     for _ in range(_TRIES if len(points) >= _MIN_ON_ROAD else 0):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         plane = _plane_under(np.cross(b - a, c - a), a, centres, up)
         if plane is None:
             continue
-        heights = (points @ plane[0] + plane[1]) / plane[2]
+        heights = (points @ plane[0] + plane[1]) / far
         score = int((np.abs(heights) < _ON_ROAD).sum()) - 2 * int((heights < -3 * _ON_ROAD).sum())
         if score > best:
             best, road = score, plane
     for _ in range(3 if road is not None else 0):
         assert road is not None
-        own = points[np.abs(points @ road[0] + road[1]) < _ON_ROAD * road[2]]
+        own = points[np.abs(points @ road[0] + road[1]) < _ON_ROAD * far]
         normal = np.linalg.svd(own - own.mean(axis=0))[2][2] if len(own) > 2 else road[0]
         road = _plane_under(normal, own.mean(axis=0), centres, up) or road
     if road is None or best < _MIN_ON_ROAD:
@@ -227,9 +229,16 @@ def find_road(shots: Sequence[Shot]) -> Road:
             f"{_MIN_ON_ROAD} are needed. Film with the road in view, hold the camera level, take "
             f"more frames"
         )
-    distance = np.abs(points @ road[0] + road[1]) / road[2]
-    own = distance[distance < _ON_ROAD]
-    return Road(*road, len(own), float(np.median(own)))
+    distance = np.abs(points @ road[0] + road[1])
+    own = distance[distance < _ON_ROAD * far]
+    found = Road(*road, len(own), float(np.median(own)) / road[2])
+    if found.residual > _MAX_RESIDUAL:
+        raise AdapterError(
+            f"no road is clear under the cameras: {found.points} points of the best plane stray "
+            f"from it by {100 * found.residual:.0f} % of the cameras' height (median; at most "
+            f"{100 * _MAX_RESIDUAL:.0f}). Film with more of the road in view, take more frames"
+        )
+    return found
 
 
 def _plane_under(
