@@ -79,10 +79,23 @@ def covered_plane(starts, opacities, places, covariances, out):
 # Of one thread: it runs beside the renderer, on those that write files.
 @serial_kernel
 def count_occlusion(
-    depth, instance, actors, windows, across, down, axes, eyes, owned, labelled, near_m, found
+    depth,
+    instance,
+    actors,
+    windows,
+    across,
+    down,
+    axes,
+    eyes,
+    owned,
+    labelled,
+    near_m,
+    found,
+    owners,
 ):
     """found [B, 6]: pixels that show each box, pixels that show what stands before it, and left,
-    top, right, bottom of the former, right and bottom excluded.
+    top, right, bottom of the former, right and bottom excluded. owners [H, W]: 1 + the smallest of
+    the boxes that each pixel shows by its depth, 0 = none; or [0, 0] where nobody asks.
 
     depth [H, W]: z, 0 = none. instance [H, W]: actors' numbers, or [0, 0] where they are not known.
     actors [B]: of the boxes, 0 = none. windows [B, 4]: left, top, right, bottom of where a box can
@@ -92,6 +105,10 @@ def count_occlusion(
     box is nearer is not seen.
     """
     knows_actors = instance.size > 0
+    volumes = np.empty(len(found), np.float64)
+    for box in range(len(found)):
+        low, high = labelled[box, 0], labelled[box, 1]
+        volumes[box] = (high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])
     boxes_of = np.empty(65536, np.int64)  # the first box of each actor
     for actor in range(len(boxes_of)):
         boxes_of[actor] = -1
@@ -141,6 +158,10 @@ def count_occlusion(
                 if nearest <= z and z <= farthest:
                     if own == 0 and number == 0:
                         _add(found[box], row, column)
+                        if owners.size > 0:
+                            other = np.int64(owners[row, column]) - 1
+                            if other < 0 or volumes[box] < volumes[other]:
+                                owners[row, column] = box + 1
                     elif number > 0 and enter <= leave:
                         found[box, 1] += 1  # another actor, in this box
                 elif z < nearest and enter <= leave:

@@ -108,7 +108,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     placed = {effect.name: placed[effect.name] for effect in effects.EFFECTS}
     output, render = recipe.output, recipe.render
     depth_buffer = DEPTH_ESTIMATORS.get(output.depth)
-    finds_boxes = (output.labels or output.instance) and scene.labels is not None
+    finds_boxes = bool(output.labels or output.instance) and scene.labels is not None
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if output.semantic or output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
@@ -131,6 +131,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             sh_degree=render.sh_degree,
             transmittance_stop=render.transmittance_stop,
             radius_clip_px=render.radius_clip_px,
+            fog_cut=render.fog_cut,
             lod_px=render.lod_px,
         ),
         buffers=buffers,

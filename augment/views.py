@@ -125,6 +125,8 @@ def _masks(view: ViewPlan, drawn: Drawn) -> dict[str, Tensor]:
 
 def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
     """z of the surfaces by the planned estimator if among the buffers, else by the labels'."""
+    if plan.depth_buffer is None and not plan.finds_boxes:
+        return None
     by = plan.depth_buffer if plan.depth_buffer in buffers else None
     z = getattr(raster, by or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -33,8 +33,8 @@ from augment.effects.falling.shutter import STANDING, Motion
 from augment.effects.snow.light import display_from_linear, light_of
 from augment.memo import memo_of
 from augment.render.buffers import CPU, kernels_for
-from augment.render.composite import ROWS
 from augment.render.fog import MAX_EXPONENT, Fog
+from augment.render.layout import LANES
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene
@@ -50,7 +50,8 @@ _SAMPLES = 4096  # of directions
 _AROUND_M = 30.0  # how far away most of what lights a drop is
 _REFRACTED, _SCATTERED = 0.94, 0.5  # how much of its light a drop, or a flake, has from behind it
 _AMONG_FLAKES = 0.5  # of a flake's light, which the flakes around it have scattered
-SWAY_REACH_S = 1.3  # kernels._sway moves no flake farther than its speed in so long
+CLEAR = 0.95  # of a pixel: where near drops leave less it is the mask's
+SWAY_REACH_S = 0.95  # kernels._sway moves no flake farther than its speed in so long
 
 
 @dataclass(frozen=True)
@@ -170,8 +171,10 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     cells_m = sizes.cells_m
     speeds = np.linalg.norm(velocity - motion.velocity_mps, axis=1)
     speeds += np.linalg.norm(motion.turn_radps) * farthest
-    reach = cells_m * math.sqrt(0.75) + half_s * speeds + APERTURE_M / 2
-    reach += sizes.quantiles_m[:, -1] + SWAY_REACH_S * falling.sway_mps
+    spare = half_s * speeds + sizes.quantiles_m[:, -1] / 2 + SWAY_REACH_S * falling.sway_mps
+    spare += APERTURE_M / 2 * np.maximum(1, farthest / FOCUS_M)
+    spare += kernels.LEAST_RADIUS / math.sqrt(camera.fx * camera.fy) * farthest
+    reach = cells_m * math.sqrt(0.75) + spare
     # Of the image's sides, inwards; then of its front.
     normals = np.array([
         [camera.fx, 0, camera.cx], [-camera.fx, 0, camera.width - camera.cx],
@@ -187,16 +190,26 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     return Walk(
         slabs,
         columns,
-        np.stack([cells_m, reach, farthest], 1),
+        np.stack([cells_m, reach, farthest, spare], 1),
         rng.integers(0, 2**64, len(farthest), np.uint64),
         moves,
-        np.array([falling.sway_mps, seconds]),
+        _sways(falling.sway_mps, seconds),
         sizes.quantiles_m,
         cell_counts(),
         planes,
         np.ascontiguousarray(poses[:, :3]),
         np.array([*lens, NEAR_M, APERTURE_M, FOCUS_M], np.float64),
     )
+
+
+def _sways(speed_mps: float, seconds: float) -> np.ndarray:
+    """As kernels.find_drops takes them. Turns, which reference.sway counts in radians: whole ones
+    left out, which would take the digits of what is added.
+    """
+    rates = [2.0 + 0.7 * wave for wave in range(3)]
+    radians = np.array([*(rate * seconds for rate in rates), 4 * seconds])
+    per_number = (8 * seconds + 50) * 2.0**-21
+    return np.append((speed_mps, seconds), np.append(radians, per_number) / (2 * math.pi) % 1)
 
 
 def _columns_of(
@@ -232,28 +245,38 @@ def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
         found = np.empty((int(held.sum()), kernels.NUM_NUMBERS), np.float32)
         offsets, counts = np.cumsum(held) - held, np.empty_like(held)
         kernels.find_drops(*walk, offsets, counts, found)
-    within = np.arange(len(found)) - np.repeat(offsets, held)
-    return found[within < np.repeat(counts, held)]
+    return np.concatenate([found[o : o + c] for o, c in zip(offsets, counts, strict=True)])
+
+
+def _listed(drops: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """drops, listed and begins as kernels.cover_pixels takes them."""
+    bands = -(-height // kernels.ROWS)
+    begins, listed = np.empty(bands + 1, np.int64), np.empty(4 * len(drops), np.int64)
+    needed = kernels.list_drops(drops, bands, begins, listed)
+    if needed > len(listed):
+        listed = np.empty(needed, np.int64)
+        kernels.list_drops(drops, bands, begins, listed)
+    return drops, listed, begins
 
 
 def left_clear(
     drops: Float32[np.ndarray, "N 9"], alpha: np.ndarray, depth: np.ndarray
 ) -> Float32[np.ndarray, "H W"]:
     """Share of each pixel that none of the drops covers. alpha, depth: float32 [H, W]."""
-    clear = np.ones_like(depth)
-    bands = -(-len(depth) // kernels.ROWS)
-    tops = np.minimum(drops[:, 1], drops[:, 3]) - drops[:, 7]
-    ends = np.maximum(drops[:, 1], drops[:, 3]) + drops[:, 7]
-    edges = np.clip(np.stack([tops, ends]) / kernels.ROWS, 0, bands - 1).astype(np.int64)
-    counts = edges[1] - edges[0] + 1
-    of_drops = np.repeat(np.arange(len(drops)), counts)
-    within = np.arange(len(of_drops)) - np.repeat(np.cumsum(counts) - counts, counts)
-    of_bands = (edges[0][of_drops] + within).astype(np.int16)
-    listed = of_drops[np.argsort(of_bands, kind="stable")]
-    begins = np.append(0, np.cumsum(np.bincount(of_bands, minlength=bands)))
+    surfaces = [_wide(image) for image in (alpha, depth)]
+    clear = np.empty_like(surfaces[0])
     with kernel_threads(1):
-        kernels.cover_pixels(drops, listed, begins, alpha, depth, clear)
-    return clear
+        flat = (image.reshape(-1) for image in surfaces)
+        kernels.cover_pixels(*_listed(drops, len(depth)), *flat, clear)
+    return clear[:, : depth.shape[1]]
+
+
+def _wide(image: np.ndarray) -> np.ndarray:
+    """The image, contiguous and as wide as kernels need it."""
+    missing = max(0, LANES - image.shape[1])
+    if missing:
+        image = np.pad(image, [(0, 0), (0, missing)] + [(0, 0)] * (image.ndim - 2))
+    return np.ascontiguousarray(image)
 
 
 # ---- On a picture --------------------------------------------------------------------------------
@@ -304,25 +327,30 @@ def draw_falling(
     fog: Fog | None = None,
     motion: Motion = STANDING,
     backend: str = CPU,
-) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
-    """The picture behind what falls, and the share of each pixel that no drawn drop covers.
+) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """The picture behind what falls, and where drawn drops leave less than CLEAR of a pixel.
 
     depth: z, metres; 0 where there is no surface. scene: whose light it is. fog: in the air as
     well. backend: on the CPU pixels go through a kernel, equal to the definition in
     augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
     """
-    surfaces = [t.detach().float().cpu().contiguous().numpy() for t in (alpha, depth)]
+    surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
     drops = find_drops(walk_of(falling, camera, motion, scene.name))
-    clear = left_clear(drops, *surfaces)
     extinction = falling.sizes.extinction_per_m
     glow = _in_fog(glow_of(scene), fog, float(camera.centre[2]), extinction)
     veil = veil_of(falling, camera, glow)
     if kernels_for(backend, rgb, alpha, depth) != CPU:
         from augment.effects.falling.reference import blend_by_torch
 
-        left = torch.from_numpy(clear).to(rgb.device)
-        return blend_by_torch(rgb, alpha, depth, left, veil), left
-    sharp = rgb.detach().contiguous().numpy()
-    with kernel_threads(ROWS):
-        kernels.blend_falling(sharp, *surfaces, clear, *veil._replace(upwards=veil.upwards[()]))
-    return torch.from_numpy(sharp), torch.from_numpy(clear)
+        clear = torch.from_numpy(left_clear(drops, *surfaces)).to(rgb.device)
+        return blend_by_torch(rgb, alpha, depth, clear, veil), clear < CLEAR
+    own = rgb.detach().numpy()
+    wide, *surfaces = (_wide(image) for image in (own, *surfaces))
+    mask = np.empty(wide.shape[:2], bool)
+    with kernel_threads(1):
+        kernels.blend_falling(
+            *(image.reshape(-1) for image in (wide, *surfaces)), *_listed(drops, len(mask)),
+            np.float32(CLEAR), *veil._replace(upwards=veil.upwards[()]), mask,
+        )  # fmt: skip
+    width = camera.width
+    return torch.from_numpy(wide[:, :width]), torch.from_numpy(mask[:, :width])

@@ -27,7 +27,6 @@ from recipes.schema import Recipe
 from recipes.snowfall import Snowfall
 
 STREAKS, FLAKES = "rain streaks and veil", "snowflakes and veil"
-MASK_SHARE = 0.05  # of a pixel, covered by near drops: from here on it is the mask's
 
 
 class FallingEffect(Effect):
@@ -122,7 +121,7 @@ def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> 
     alpha, depth = drawn.raster.alpha, drawn.raster.expected_depth
     assert alpha is not None and depth is not None
     with timed(step):
-        rgb, clear = draw_falling(
+        rgb, near = draw_falling(
             drawn.rgb,
             alpha,
             depth,
@@ -133,5 +132,5 @@ def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> 
             motion=motion_of(own.scene, camera),
             backend=own.backend,
         )
-    masks = {**drawn.masks, mask: clear < 1 - MASK_SHARE}
+    masks = {**drawn.masks, mask: near}
     return replace(drawn, rgb=rgb, masks=masks)

@@ -9,10 +9,11 @@ from numba import prange
 
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL, NUM_CLASSES
 from augment.kernels import mix
-from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu import simd as v8
+from augment.render.cpu.jit import inner, kernel, serial_kernel
+from augment.render.cpu.simd import LOG2_E, exp2_fine
 from augment.render.fog import MAX_EXPONENT
-from augment.render.layout import U
-from augment.render.picture_kernels import decay
+from augment.render.layout import LANES, U
 from augment.rng import STEP_X
 
 ROWS = 16  # image rows of a band, which a thread draws at a time
@@ -32,23 +33,33 @@ def _unit(bits, shift):
 
 
 @inner()
-def _sway(out, point, time, phase, sway):
-    """Adds to a point where the air's eddies and a flake's own flutter have it.
+def _cosine(turns):
+    """cos(2 pi turns), within 1e-9; without a branch, which no processor could foresee."""
+    x = 2 * math.pi * (0.25 - abs(turns - math.floor(turns + 0.5)))  # whose sine it is
+    q = x * x
+    p = 1 - q * (1 / 110) * (1 - q * (1 / 156))
+    p = 1 - q * (1 / 20) * (1 - q * (1 / 42) * (1 - q * (1 / 72) * p))
+    return x * (1 - q * (1 / 6) * p)
 
-    sway: speed of each of the two, m/s. Eddies: three waves across their direction of travel, so
-    the air is neither pressed nor thinned; flutter: a level circle of the flake's own.
+
+@inner()
+def _sway(x, y, z, sways, flutter):
+    """How far the air's eddies and a flake's own flutter move it, along x, y and z.
+
+    sways: as of find_drops. flutter: turns of the flake. Eddies: three waves across their direction
+    of travel, so the air is neither pressed nor thinned; flutter: a level circle of its own.
     """
-    x, y, z = point[0], point[1], point[2]
-    for wave in range(3):
-        along = x if wave == 0 else y if wave == 1 else z
-        pace = 2.0 + 0.7 * wave
-        angle = (1.1 + 0.4 * wave) * along + pace * time
-        size = 0.6 * sway / pace
-        out[(wave + 1) % 3] += size * math.sin(angle)
-        out[(wave + 2) % 3] += size * math.cos(angle)
-    pace = 4 + 8 * phase
-    out[0] += sway / pace * math.sin(pace * time + 50 * phase)
-    out[1] += sway / pace * math.cos(pace * time + 50 * phase)
+    speed, per_turn = sways[0], 1 / (2 * math.pi)
+    a, b, c = 0.6 / 2.0 * speed, 0.6 / 2.7 * speed, 0.6 / 3.4 * speed
+    d = speed / (4 + 8 * (flutter * _HALF))
+    along_x = 1.1 * per_turn * x + sways[2]
+    along_y = 1.5 * per_turn * y + sways[3]
+    along_z = 1.9 * per_turn * z + sways[4]
+    around = sways[5] + flutter * sways[6]
+    dx = b * _cosine(along_y) + c * _cosine(along_z - 0.25) + d * _cosine(around - 0.25)
+    dy = a * _cosine(along_x - 0.25) + c * _cosine(along_z) + d * _cosine(around)
+    dz = a * _cosine(along_x) + b * _cosine(along_y - 0.25)
+    return dx, dy, dz
 
 
 @kernel
@@ -61,10 +72,12 @@ def find_drops(
     covers as much as in its middle, radius beyond which nothing, covered share. Empty: counts are
     of all drops in the cells, which takes next to no time.
 
-    slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 3]: size, how far a
-    drop can be from its cell's middle, depth to which the class is drawn. keys [B]: of the hashes.
-    moves [B, 3, 3]: where the lattice has moved to as the shutter opens, between, as it closes.
-    sways: their speed, and the time. quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]:
+    slabs [S, 2]: class, x of the cells. columns [B, 2]: first y, end. cells [B, 4]: size, how far
+    what is seen of a drop can be from its cell's middle, depth to which the class is drawn, how far
+    it can be from the drop's place in the lattice. keys [B]: of the hashes. moves [B, 3, 3]: where
+    the lattice has moved to as the shutter opens, between, as it closes. sways: their speed, the
+    time, turns of the three eddies, those of a flake's flutter and what its number adds to them.
+    quantiles [B, Q]. shares: as drops.cell_counts. planes [5, 4]:
     inwards normal and offset of the view's sides and its front. shutter [2, 3, 4]:
     camera_from_world as the shutter opens and closes. lens: fx, fy, cx, cy, width, height, least
     depth, diameter of the aperture, depth in focus. All float64 but for the integers and found.
@@ -74,7 +87,7 @@ def find_drops(
         b, i = slabs[slab, 0], slabs[slab, 1]
         size, reach, farthest = cells[b, 0], cells[b, 1], cells[b, 2]
         number = np.int64(0)
-        at, ends = np.empty(3), np.empty((2, 3))
+        spare, at, ends = cells[b, 3], np.empty(3), np.empty((2, 3))
         for j in range(columns[b, 0], columns[b, 1]):
             x = (np.float64(i) + 0.5) * size + moves[b, 1, 0]
             y = (np.float64(j) + 0.5) * size + moves[b, 1, 1]
@@ -109,13 +122,23 @@ def find_drops(
                         number += 1
                         continue
                     bits = mix(cell + np.uint64(drop + 1) * _STEP)
+                    at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 1, 0]
+                    at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 1, 1]
+                    at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 1, 2]
+                    inside, ahead = np.inf, 0.0
+                    for n in range(5):
+                        ahead = planes[n, 0] * at[0] + planes[n, 1] * at[1] + planes[n, 2] * at[2]
+                        ahead += planes[n, 3]
+                        inside = min(inside, ahead)
+                    if inside < -spare or ahead > farthest + spare:
+                        continue
                     more = mix(bits ^ _STEP)
-                    at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 0, 0]
-                    at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 0, 1]
-                    at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 0, 2]
+                    for c in range(3):
+                        at[c] += moves[b, 0, c] - moves[b, 1, c]
                     if sways[0] > 0:  # which moves it less than its size while the shutter is open
-                        ends[0, 0], ends[0, 1], ends[0, 2] = at[0], at[1], at[2]
-                        _sway(at, ends[0], sways[1], _unit(more, 21), sways[0])
+                        flutter = np.float64((more >> np.uint64(21)) & np.uint64(0x1FFFFF))
+                        dx, dy, dz = _sway(at[0], at[1], at[2], sways, flutter)
+                        at[0], at[1], at[2] = at[0] + dx, at[1] + dy, at[2] + dz
                     for end in range(2):
                         if end == 1:
                             for c in range(3):
@@ -177,113 +200,261 @@ def find_drops(
         counts[slab] = number
 
 
+@serial_kernel
+def list_drops(drops, bands, begins, listed):
+    """Rows of drops, those that reach into each of `bands` bands of ROWS image rows, in order.
+
+    begins [bands + 1]: where each band's begin in `listed`, which may be too short: then it is not
+    filled. Returns how long it has to be.
+    """
+    for band in range(bands + 1):
+        begins[band] = 0
+    most = np.float32(bands - 1)
+    per_row, zero = np.float32(1 / ROWS), np.float32(0)
+    for is_filling in range(2):
+        for row in range(len(drops)):
+            v0, v1, outside = drops[row, 1], drops[row, 3], drops[row, 7]
+            top = np.int64(min(max((min(v0, v1) - outside) * per_row, zero), most))
+            end = np.int64(min(max((max(v0, v1) + outside) * per_row, zero), most))
+            for band in range(top, end + 1):
+                if is_filling == 1:
+                    listed[begins[band]] = row
+                begins[band] += 1
+        if is_filling == 1:  # each ends where the next one began
+            for band in range(bands, 0, -1):
+                begins[band] = begins[band - 1]
+            begins[0] = 0
+        else:
+            total = 0
+            for band in range(bands + 1):
+                total, begins[band] = total + begins[band], total
+            if total > len(listed):
+                return total
+    return begins[bands]
+
+
+@inner()
+def _nearest_in_row(row, width, alpha, depth, eight):
+    """Depth of the nearest surface in an image row. eight: spare."""
+    zeros, never = v8.splat(np.float32(0)), v8.splat(np.float32(np.inf))
+    found = never
+    for j in range(0, width, LANES):
+        pixel = U(row * width + min(j, width - LANES))
+        z = v8.load(depth, pixel)
+        shown = v8.both(v8.greater(z, zeros), v8.greater(v8.load(alpha, pixel), zeros))
+        found = v8.minimum(found, v8.select(shown, z, never))
+    v8.store(eight, U(0), found)
+    nearest = eight[0]
+    for lane in range(1, LANES):
+        nearest = min(nearest, eight[lane])
+    return nearest
+
+
+@inner()
+def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, clear):
+    """clear: share of each pixel of image rows top to bottom that none of the drops covers, in
+    their order. alpha, depth: of all pixels.
+    """
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    far, last_block = np.float32(width), width - LANES
+    zeros, ones, soft = v8.splat(zero), v8.splat(one), v8.splat(np.float32(1 / SOFT))
+    for i in range(U((bottom - top) * width)):
+        clear[i] = one
+    for place in range(first, end):
+        drop = drops[listed[place]]
+        u0, v0, near, outside, share = drop[0], drop[1], drop[4], drop[7], drop[8]
+        du, dv, farther = drop[2] - u0, drop[3] - v0, drop[5] - near
+        per_length = one / max(du * du + dv * dv, np.float32(1e-12))
+        beyond = outside * outside
+        ramp = share / (beyond - drop[6] * drop[6])
+        # A streak that is about upright is looked at over its whole width in all rows.
+        leans = abs(du) > np.float32(LANES / 2) and abs(dv) > np.float32(1e-3)
+        per_row = one / dv if leans else zero
+        begin = max(top, np.int64(min(v0, drop[3]) - outside + np.float32(ROWS)) - ROWS)
+        last = min(bottom, np.int64(max(max(v0, drop[3]) + outside, zero)) + 1)
+        left = np.int64(max(min(u0, drop[2]) - outside, zero))
+        right = np.int64(min(max(max(u0, drop[2]) + outside + one, zero), far))
+        for row in range(begin, last):
+            v = np.float32(row) + half - v0
+            if leans:  # the piece of the streak that is so near to the row
+                middle, reach = v * per_row, outside * abs(per_row)
+                ua = u0 + min(max(middle - reach, zero), one) * du
+                ub = u0 + min(max(middle + reach, zero), one) * du
+                left = np.int64(max(min(ua, ub) - outside, zero))
+                right = np.int64(min(max(max(ua, ub) + outside + one, zero), far))
+            ax, base = v8.splat(du * per_length), v8.splat(v * dv * per_length)
+            for j in range(left, right, LANES):
+                at = min(j, last_block)  # the last eight pixels of a row take those before them
+                x = v8.splat(np.float32(at) + half - u0) + v8.lane_numbers()
+                along = v8.minimum(v8.maximum(v8.fmuladd(x, ax, base), zeros), ones)
+                x = v8.fmuladd(along, v8.splat(-du), x)
+                y = v8.fmuladd(along, v8.splat(-dv), v8.splat(v))
+                away = v8.fmuladd(x, x, y * y)
+                covered = (v8.splat(beyond) - away) * v8.splat(ramp)
+                covered = v8.minimum(v8.maximum(covered, zeros), v8.splat(share))
+                pixel = U(row * width + at)
+                surface = v8.load(depth, pixel)
+                per_z = v8.fmuladd(along, v8.splat(farther), v8.splat(near))
+                behind = (ones - surface * per_z) * soft
+                hidden = v8.load(alpha, pixel) * v8.minimum(v8.maximum(behind, zeros), ones)
+                hidden = v8.select(v8.greater(surface, zeros), hidden, zeros)
+                covered = covered * (ones - hidden)
+                if at < j:
+                    numbers = v8.lane_numbers() + v8.splat(np.float32(at - j))
+                    covered = v8.select(v8.at_least(numbers, zeros), covered, zeros)
+                own = U((row - top) * width + at)
+                v8.store(clear, own, v8.load(clear, own) * (ones - covered))
+
+
 @kernel
 def cover_pixels(drops, listed, begins, alpha, depth, clear):
     """clear [H, W]: share of each pixel that none of the drops covers, in their order.
 
-    drops: as found by find_drops. listed: rows of it, those that reach into band b of ROWS image
-    rows from begins[b] to begins[b + 1]. alpha, depth [H, W]: of the surfaces; depth 0 where none
-    is.
+    drops: as found by find_drops. listed, begins: as of list_drops. alpha, depth [H W]: of the
+    surfaces; depth 0 where none is. W >= LANES.
     """
     height, width = clear.shape
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    end = np.float32(width)
     for band in prange(len(begins) - 1):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
-        for place in range(begins[band], begins[band + 1]):
-            drop = drops[listed[place]]
-            u0, v0, near, outside, share = drop[0], drop[1], drop[4], drop[7], drop[8]
-            du, dv, farther = drop[2] - u0, drop[3] - v0, drop[5] - near
-            per_length = one / max(du * du + dv * dv, np.float32(1e-12))
-            beyond = outside * outside
-            ramp = share / (beyond - drop[6] * drop[6])
-            leans = abs(dv) > np.float32(1e-3)
-            per_row = one / dv if leans else zero
-            first = max(top, np.int64(min(v0, drop[3]) - outside + np.float32(ROWS)) - ROWS)
-            last = min(bottom, np.int64(max(max(v0, drop[3]) + outside, zero)) + 1)
-            for row in range(first, last):
-                i = U(row)  # what is not signed needs no check
-                v = np.float32(row) + half - v0
-                # The piece of the streak that is so near to the row.
-                a, b = zero, one
-                if leans:
-                    middle, reach = v * per_row, outside * abs(per_row)
-                    a = min(max(middle - reach, zero), one)
-                    b = min(max(middle + reach, zero), one)
-                ua, ub = u0 + a * du, u0 + b * du
-                ax, base = du * per_length, v * dv * per_length
-                left = np.int64(max(min(ua, ub) - outside, zero))
-                right = np.int64(min(max(max(ua, ub) + outside + one, zero), end))
-                for column in range(left, right):
-                    j = U(column)
-                    x, y = np.float32(column) + half - u0, v
-                    along = min(max(x * ax + base, zero), one)
-                    x -= along * du
-                    y -= along * dv
-                    covered = min(max((beyond - (x * x + y * y)) * ramp, zero), share)
-                    # Without a branch, which no processor could foresee; 1 / z of the drop is
-                    # near + along * farther.
-                    surface = depth[i, j]
-                    behind = (one - surface * (near + along * farther)) * np.float32(1 / SOFT)
-                    hidden = alpha[i, j] * min(max(behind, zero), one)
-                    covered *= one - (hidden if surface > zero else zero)
-                    clear[i, j] *= one - covered
+        own = np.empty(ROWS * width, np.float32)
+        _cover_band(
+            drops, listed, begins[band], begins[band + 1],
+            top, bottom, width, alpha, depth, own,
+        )  # fmt: skip
+        for row in range(top, bottom):
+            for j in range(U(width)):
+                clear[U(row), j] = own[U((row - top) * width) + j]
+
+
+@inner()
+def _classes_in_row(nearest, bands, own):
+    """What blend_falling's bands say of a row: how many rows `own` [NUM_CLASSES, 5] has of classes
+    that are not all veil where the nearest surface is, and slope and offset of the optical depth
+    of the others, which grows with z alone.
+    """
+    count, slope, offset = 0, np.float32(0), np.float32(0)
+    for b in range(NUM_CLASSES):
+        if bands[b, 4] > nearest:
+            for k in range(5):
+                own[count, k] = bands[b, k]
+            count += 1
+        else:
+            slope += bands[b, 0]
+            offset += bands[b, 0] * (bands[b, 2] * bands[b, 2] * bands[b, 3] - bands[b, 4])
+    return count, slope, offset
+
+
+@inner()
+def _decay(x):
+    """exp(-x) where 0 <= x, of 80 where that is more."""
+    x = v8.minimum(v8.maximum(x, v8.splat(np.float32(0))), v8.splat(np.float32(MAX_EXPONENT)))
+    return exp2_fine(x * v8.splat(-LOG2_E))
+
+
+@inner()
+def _blend_pixels(pixels, at, u, lengths, shown, clear, tau, sky, light):
+    """Eight pixels behind the veil and the drops, in place.
+
+    shown: alpha. tau: the veil's optical depth at unit depth. sky: transmittance up to the sky.
+    light [3, 4]: airlight; light of a drop in the mean, what of it grows to the right, and ahead.
+    """
+    zeros, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    veil = sky + shown * (_decay(tau * lengths) - sky)
+    per_length = one / lengths
+    red, green, blue = v8.load_colours(pixels, at)
+    red = _blend_colour(v8.maximum(red, zeros), light[0], u, veil, clear, per_length)
+    green = _blend_colour(v8.maximum(green, zeros), light[1], u, veil, clear, per_length)
+    blue = _blend_colour(v8.maximum(blue, zeros), light[2], u, veil, clear, per_length)
+    v8.store_colours(pixels, at, red, green, blue)
+
+
+@inner()
+def _blend_colour(own, light, u, veil, clear, per_length):
+    air = v8.splat(light[0])
+    glow = v8.splat(light[1]) + (v8.splat(light[2]) * u + v8.splat(light[3])) * per_length
+    out = glow + clear * (air + veil * (own * own - air) - glow)
+    return v8.sqrt(v8.maximum(out, v8.splat(np.float32(0))))
+
+
+@inner()
+def _blend_row(
+    row, width, rgb, alpha, depth, clear, first, nearest,
+    rays, climb, bands, upwards, light, own, rest,
+):  # fmt: skip
+    """A row of blend_falling. clear: from place `first` on. own, rest: spare."""
+    zeros, half, least = v8.splat(np.float32(0)), np.float32(0.5), np.float32(1e-6)
+    count, slope, offset = _classes_in_row(nearest, bands, own)
+    v = (np.float32(row) + half - rays[3]) * rays[1]
+    flat, level = v8.splat(np.float32(1) + v * v), climb[1] * v + climb[2]
+    left, right = (half - rays[2]) * rays[0], (np.float32(width) - rays[2]) * rays[0]
+    shows_sky = max(climb[0] * left, climb[0] * right) + level > least
+    for j in range(0, width, LANES):
+        # The last eight of a row take pixels before them, which are not written.
+        at = min(j, width - LANES)
+        pixel = U(row * width + at)
+        u = v8.splat(np.float32(at) + half - rays[2]) + v8.lane_numbers()
+        u = u * v8.splat(rays[0])
+        lengths = v8.sqrt(flat + u * u)
+        z = v8.load(depth, pixel)
+        tau = v8.splat(slope) * z + v8.splat(offset)
+        for b in range(U(count)):
+            inside = v8.maximum(z - v8.splat(own[b, 1]), zeros)
+            inside = v8.minimum(inside, v8.splat(own[b, 2]))
+            beyond = v8.maximum(z - v8.splat(own[b, 4]), zeros)
+            tau = tau + v8.splat(own[b, 0]) * (inside * inside * v8.splat(own[b, 3]) + beyond)
+        sky = zeros
+        if shows_sky:  # below the horizon nothing is seen through so much
+            steep = v8.splat(climb[0]) * u + v8.splat(level)
+            sky = _decay(v8.splat(upwards) * lengths / v8.maximum(steep, v8.splat(least)))
+        shown = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
+        through = v8.load(clear, first + U(at))
+        if at == j:
+            _blend_pixels(rgb, U(3) * pixel, u, lengths, shown, through, tau, sky, light)
+        else:
+            for k in range(U(3 * LANES)):
+                rest[k] = rgb[U(3) * pixel + k]
+            _blend_pixels(rest, U(0), u, lengths, shown, through, tau, sky, light)
+            for k in range(U(3 * (j - at)), U(3 * LANES)):
+                rgb[U(3) * pixel + k] = rest[k]
 
 
 @kernel
-def blend_falling(rgb, alpha, depth, clear, rays, climb, bands, upwards, airlight, glow):
-    """rgb [H, W, 3] behind the veil and the drops, in place.
+def blend_falling(
+    rgb, alpha, depth, drops, listed, begins, least,
+    rays, climb, bands, upwards, airlight, glow, mask,
+):  # fmt: skip
+    """rgb [3 H W] behind the veil and the drops, in place; mask [H, W]: where a drawn drop leaves
+    less than `least` of a pixel clear.
 
-    clear: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb [3]: the world's z along the
-    camera's axes. bands [NUM_CLASSES, 5]: extinction of a class, depth where it begins, over which
-    depth it grows, half its inverse, depth from which on it is whole. upwards: optical depth
-    straight up. airlight [3]. glow [3, 4]: light of a drop by direction along the camera's axes,
-    and in the mean. Light is squares of display-encoded colours. All float32.
+    alpha, depth, drops, listed, begins: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb
+    [3]: the world's z along the camera's axes. bands [NUM_CLASSES, 5]: extinction of a class, depth
+    where it begins, over which depth it grows, half its inverse, depth from which on it is whole.
+    upwards: optical depth straight up. airlight [3]. glow [3, 4]: light of a drop by direction
+    along the camera's axes, and in the mean. Light is squares of display-encoded colours. All
+    float32.
     """
-    height, width = depth.shape
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    most = np.float32(MAX_EXPONENT)
-    for i in prange(height):
-        # In loops without branches, of few arrays each, so that LLVM writes vectors.
-        v = (np.float32(i) + half - rays[3]) * rays[1]
-        tau, lengths = np.zeros(width, np.float32), np.empty(width, np.float32)
-        for b in range(NUM_CLASSES):
-            extinction, begin, grows = bands[b, 0], bands[b, 1], bands[b, 2]
-            half_inverse, whole = bands[b, 3], bands[b, 4]
+    height, width = mask.shape
+    for band in prange(len(begins) - 1):
+        top = np.int64(band) * ROWS
+        bottom = min(top + ROWS, height)
+        clear, nearest = np.empty(ROWS * width, np.float32), np.empty(ROWS, np.float32)
+        light, own = np.empty((3, 4), np.float32), np.empty((NUM_CLASSES, 5), np.float32)
+        rest = np.empty(3 * LANES, np.float32)
+        for row in range(top, bottom):  # which brings the surfaces into the cache, in order
+            nearest[row - top] = _nearest_in_row(row, width, alpha, depth, rest)
+        _cover_band(
+            drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, clear
+        )
+        for row in range(top, bottom):
+            first = U((row - top) * width)
             for j in range(U(width)):
-                z = depth[i, j]
-                inside = min(max(z - begin, zero), grows)
-                tau[j] += extinction * (inside * inside * half_inverse + max(z - whole, zero))
-        across, left = rays[0], half - rays[2]
-        sideways, level = climb[0], climb[1] * v + climb[2]
-        for j in range(U(width)):
-            u = (np.float32(np.int32(j)) + left) * across
-            lengths[j] = math.sqrt(one + u * u + v * v)
-        for j in range(U(width)):
-            u = (np.float32(np.int32(j)) + left) * across
-            # Of the sky: straight up over the sine of the elevation.
-            slope = max(sideways * u + level, np.float32(1e-6))
-            sky = decay(min(upwards * lengths[j] / slope, most))
-            shown = alpha[i, j] if depth[i, j] > zero else zero
-            tau[j] = sky + shown * (decay(min(tau[j] * lengths[j], most)) - sky)
-            lengths[j] = one / lengths[j]
-        red, green, blue = airlight[0], airlight[1], airlight[2]
-        red_mean, green_mean, blue_mean = glow[0, 3], glow[1, 3], glow[2, 3]
-        red_right, green_right, blue_right = glow[0, 0], glow[1, 0], glow[2, 0]
-        red_ahead = glow[0, 1] * v + glow[0, 2]
-        green_ahead = glow[1, 1] * v + glow[1, 2]
-        blue_ahead = glow[2, 1] * v + glow[2, 2]
-        for j in range(U(width)):
-            u = (np.float32(np.int32(j)) + left) * across
-            seen, through, k = tau[j], clear[i, j], lengths[j]
-            r, g, b = max(rgb[i, j, 0], zero), max(rgb[i, j, 1], zero), max(rgb[i, j, 2], zero)
-            light = red_mean + (red_right * u + red_ahead) * k
-            r = light + through * (red + seen * (r * r - red) - light)
-            light = green_mean + (green_right * u + green_ahead) * k
-            g = light + through * (green + seen * (g * g - green) - light)
-            light = blue_mean + (blue_right * u + blue_ahead) * k
-            b = light + through * (blue + seen * (b * b - blue) - light)
-            rgb[i, j, 0] = math.sqrt(max(r, zero))
-            rgb[i, j, 1] = math.sqrt(max(g, zero))
-            rgb[i, j, 2] = math.sqrt(max(b, zero))
+                mask[U(row), j] = clear[first + j] < least
+            v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
+            for c in range(3):
+                light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
+                light[c, 3] = glow[c, 1] * v + glow[c, 2]
+            _blend_row(
+                row, width, rgb, alpha, depth, clear, first, nearest[row - top],
+                rays, climb, bands, upwards, light, own, rest,
+            )  # fmt: skip

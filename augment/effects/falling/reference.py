@@ -25,7 +25,7 @@ def find_drops_by_numpy(walk: Walk) -> Float32[np.ndarray, "N 9"]:
 
 
 def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
-    size, reach, farthest = walk.cells[number]
+    size, reach, farthest, _ = walk.cells[number]
     rows = walk.slabs[walk.slabs[:, 0] == number, 1]
     if len(rows) == 0:
         return np.zeros((0, 9))
@@ -67,7 +67,10 @@ def _drops_of_class(walk: Walk, number: int) -> np.ndarray:
 
 
 def sway(at: np.ndarray, time: float, phase: np.ndarray, speed: float) -> np.ndarray:
-    """As kernels._sway, [N, 3]."""
+    """Where eddies and flutter move flakes, [N, 3]: as kernels._sway.
+
+    phase: of the flutter, 0 to 1. speed: of eddies and of flutter, m/s.
+    """
     out = np.zeros_like(at)
     for wave in range(3):
         pace = 2.0 + 0.7 * wave
