@@ -400,7 +400,7 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
         rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1)
         # OpenCV has whole numbers at the middle of pixels, COLMAP at their corners.
         at = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*u.shape, 2).astype(np.float32) - 0.5
-        image = cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        image = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
         flags = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         target.write_bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
     size = {"width": int(plain.width), "height": int(plain.height)}
