@@ -350,6 +350,7 @@ def _check_settings(settings: RasterSettings) -> None:
             f"> 0 and at most {most}, since median depth is where less than half the light is left",
         ),
         "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
+        "fog_cut": (0 <= s.fog_cut <= most, f">= 0 and at most {most}"),
         "lod_px": (0 <= s.lod_px < math.inf, "finite and >= 0 (pixels)"),
         "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
     }
