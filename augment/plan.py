@@ -16,6 +16,7 @@ from augment.base_photo import RECORDED, check_base
 from augment.bounds import actor_boxes, owners_seen
 from augment.cameras import Camera
 from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
+from augment.lod import check_background
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
@@ -99,6 +100,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"(augment.jobs.quality)"
         )
     check_base(recipe, scene)
+    if any(effect.of(recipe) is not None for effect in effects.EFFECTS):
+        check_background(scene.background)  # whose numbers effects work with
     placed = dict[str, Placed]()
     for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
         placed[effect.name] = effect.place(recipe, scene, placed)

@@ -19,9 +19,23 @@ from augment.errors import ClimateGSError
 from augment.jobs.quality import Trial
 from recipes.schema import KNOBS, TIERS, knobs_of
 from tests.streets import SMALL_STREET, open_street
-from tools.bench import EFFECTS, dataset, fit, flood, gpu, jobs, raster, scenes, snow, style, trade
+from tools.bench import (
+    EFFECTS,
+    dataset,
+    fit,
+    flood,
+    gpu,
+    jobs,
+    lod,
+    raster,
+    scenes,
+    snow,
+    style,
+    trade,
+)
 from tools.bench.gpu import GpuCase, Timing, measure
 from tools.bench.harness import WallClock, rounds, run_in_subprocess
+from tools.bench.pictures import DUSK, SHOWN, SWEEPS, recipe_of
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect
 from tools.bench.trade import (
     DEPTH,
@@ -99,6 +113,17 @@ def test_raster_measures_stages_work_and_the_reference():
     assert 0 < case["visible"] <= 400 and case["listed_pairs"] <= case["pairs"]
     assert beside["pixels"] == 64 * 48 and beside["flipped"] <= 3
     assert beside["p999"] <= 1e-4  # the agreement that backends promise
+
+
+@pytest.mark.long
+def test_levels_of_detail_are_measured_on_a_long_street():
+    tables = check_figures(lod.measure(quick=True, repeats=1))
+    views = {name: figures for name, *figures in next(iter(tables.values()))}
+    assert all(ms > 0 for ms, *_ in views.values())
+    errors = [views[f"lod_px {px:g}"][-2] for px in lod.SIZES_PX]  # FLIP
+    assert 0 <= errors[0] <= errors[-1] < 0.1
+    levels = [count for _, _, count, _ in tables["Levels"]]
+    assert levels == sorted(levels, reverse=True)
 
 
 @pytest.mark.long
@@ -369,3 +394,19 @@ def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
     assert rows[DEPTH, "none"]["off_5cm"] is None
     assert rows[DEPTH, "median"]["depth_against"] == trade.TRUTH  # the street's surfaces
     assert 0.01 < rows[DEPTH, "median"]["abs_rel"] < 0.3  # a pixel of this picture is 15 of its own
+
+
+# ---- the documentation's pictures ----------------------------------------------------------------
+
+
+def test_the_documentations_pictures_show_what_their_captions_say():
+    for preset in SHOWN:
+        day, dusk = (recipe_of(preset, sets) for sets in ((), DUSK))
+        assert dusk.weather == day.weather and day.sections().keys() & {
+            "weather.rain",
+            "weather.snowfall",
+        }
+        assert dusk.style is not None and dusk.style.preset == "grey-dusk"
+    sections = [recipe_of("clear", sets).sections() for sets in SWEEPS.values()]
+    shown = [section.rpartition(".")[2] for each in sections for section in each]
+    assert shown == ["smog", "flood", "rain", "snowfall", "snow"]
