@@ -267,11 +267,11 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    return sum(name.lower().endswith((".ply", ".splat")) for name in _names(folder)) == 1
+    return sum(name.lower().endswith((".ply", ".splat", ".spz")) for name in _names(folder)) == 1
 
 
 def _is_splat_file(path: Path) -> bool:
-    return path.suffix.lower() == ".splat" or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+    return path.suffix.lower() in (".splat", ".spz") or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
 
 def _is_multi_part(path: Path) -> bool:
@@ -329,8 +329,8 @@ FOLDERS = (
     Signature(
         "gaussians",
         _holds_splats,
-        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply or "
-        ".splat file in it",
+        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
+        ".splat or .spz file in it",
     ),
 )
 FILES = (
@@ -345,5 +345,5 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply or .splat file"),
+    Signature("gaussians", _is_splat_file, "a .ply, .splat or .spz file"),
 )
