@@ -20,7 +20,7 @@ ROWS = 16  # image rows of a band, which a thread draws at a time
 FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
 SOFT = 0.03  # of its depth: so far behind a surface a drop is hidden
 LEAST_RADIUS = 1.25  # pixels; a smaller one would show where pixels lie
-EDGE = 0.01  # of alpha, from 0 and 1: from here on a pixel shows both surfaces and sky
+EDGE = 0.02  # of alpha, and of green from the sky: from here on a pixel shows both
 NUM_NUMBERS = 9  # of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
@@ -367,9 +367,11 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, shown, clear, tau, sky,
     red, green, blue = v8.load_colours(pixels, at)
     r, g, b = red, green, blue
     edge = v8.minimum(shown, one - shown) - v8.splat(np.float32(EDGE))
-    is_mixed = splats.size > 0 and v8.any_not_negative(edge)
-    if is_mixed:
+    is_mixed = False
+    if splats.size > 0 and v8.any_not_negative(edge):
         r, g, b = v8.load_colours(splats, U(3) * pixel)
+        edge = v8.minimum(edge, green - g - v8.splat(np.float32(EDGE)))
+        is_mixed = v8.any_not_negative(edge)
     edge = v8.at_least(edge, zeros)
     red = _veil(v8.maximum(red, zeros), r, is_mixed, edge, light[0], shown, near, sky)
     green = _veil(v8.maximum(green, zeros), g, is_mixed, edge, light[1], shown, near, sky)

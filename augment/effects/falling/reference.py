@@ -176,6 +176,8 @@ def blend_by_torch(
         ahead = airlight + near[..., None] * (ahead - airlight)
         behind = airlight + sky[..., None] * (behind - airlight)
         both = parts * ahead.clamp_min(0).sqrt() + rest * behind.clamp_min(0).sqrt()
-        mixed = torch.where(torch.minimum(parts, rest) >= EDGE, both**2, mixed)
+        green = rgb[..., 1:2] - splats[..., 1:2]
+        is_mixed = torch.minimum(torch.minimum(parts, rest), green) >= EDGE
+        mixed = torch.where(is_mixed, both**2, mixed)
     own = mixed
     return (light + clear[..., None].to(rgb.dtype) * (own - light)).clamp_min(0).sqrt()
