@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import ClassVar
 
 import cv2
@@ -234,12 +235,14 @@ class Outlines:
 @dataclass(frozen=True, eq=False)
 class Occlusion:
     """Pixels of boxes. shown: that show each. hidden: inside its outline, that show what stands
-    before it. xyxy: left, top, right, bottom of the shown ones, NaN where there are none.
+    before it. xyxy: left, top, right, bottom of the shown ones, NaN where there are none. owners:
+    1 + the smallest of the boxes that a pixel shows by depth, 0 = none; None unless asked for.
     """
 
     shown: Int64[np.ndarray, " B"]
     hidden: Int64[np.ndarray, " B"]
     xyxy: Float64[np.ndarray, "B 4"]
+    owners: UInt16[np.ndarray, "H W"] | None = None
 
 
 def outline_placed(placed: PlacedBoxes, camera: Camera) -> Outlines:
@@ -292,6 +295,8 @@ def find_occlusion(
     depth_m: Float32[np.ndarray, "H W"],
     instance: UInt16[np.ndarray, "H W"] | None = None,
     actors: UInt16[np.ndarray, " B"] | None = None,
+    *,
+    with_owners: bool = False,
 ) -> Occlusion:
     """Which pixels show each box, and which show what stands before it.
 
@@ -314,6 +319,7 @@ def find_occlusion(
     eyes = box_from_world @ (world_from_camera[:3, 3] - placed.centres_m)[..., None]
     half = placed.sizes_m / 2
     found = np.zeros((count, 6), np.int64)
+    owners = np.zeros(depth_m.shape if with_owners else (0, 0), np.uint16)
     count_occlusion(
         np.ascontiguousarray(depth_m),
         np.ascontiguousarray(instance),
@@ -327,9 +333,11 @@ def find_occlusion(
         np.stack([np.maximum(placed.low_m, -half), np.minimum(placed.high_m, half)], axis=1),
         NEAR_M,
         found,
+        owners,
     )
     shown, bounds = found[:, 0], found[:, 2:].astype(np.float64)
-    return Occlusion(shown, found[:, 1], np.where(shown[:, None] > 0, bounds, np.nan))
+    modal = np.where(shown[:, None] > 0, bounds, np.nan)
+    return Occlusion(shown, found[:, 1], modal, owners if with_owners else None)
 
 
 def _edges_in_image(
@@ -502,3 +510,59 @@ def with_boxes(
                 own = free[rows, columns]
                 painted[rows[own], columns[own]] = numbers[number]
     return painted
+
+
+# ---- Masks of an instance image's objects, as COCO writes them -----------------------------------
+
+
+def encode_masks(
+    instance: UInt16[np.ndarray, "H W"], numbers: UInt16[np.ndarray, " B"]
+) -> dict[str, np.ndarray]:
+    """Of each box the pixels that have its number: left, top, right, bottom (excluded) and pixels,
+    int64 [B], and rle, texts [B]: COCO's compressed run lengths. Zeros and empty where no pixel
+    has the number, or it is 0.
+
+    COCO counts down the columns, by turns pixels that are not the object's and pixels that are.
+    From the fourth on a count is the difference to the last but one. Each goes out in groups of
+    five bits, the lowest first, as the character 48 + group, plus 32 where more follow; the last
+    group's fifth bit is the sign (pycocotools 2.0, maskApi.c).
+    """
+    height = instance.shape[0]
+    flat = cv2.transpose(instance).ravel()
+    starts = np.concatenate([[0], np.flatnonzero(flat[1:] != flat[:-1]) + 1])
+    ends, values = np.append(starts[1:], flat.size), flat[starts]
+    shown = np.flatnonzero(values)
+    shown = shown[np.argsort(values[shown], kind="stable")]
+    objects, first = np.unique(values[shown], return_index=True)
+    runs = dict(zip(objects.tolist(), np.split(shown, first[1:]), strict=bool(len(objects))))
+    sides = np.zeros((5, len(numbers)), np.int64)
+    counts = [np.zeros(0, np.int64) for _ in numbers]
+    for box, number in enumerate(numbers.tolist()):
+        if (own := runs.get(number)) is None:
+            continue
+        begin, end = starts[own], ends[own]
+        edges = np.stack([begin, end], axis=1).ravel()
+        edges = edges if edges[-1] == flat.size else np.append(edges, flat.size)
+        counts[box] = np.diff(edges, prepend=0)
+        counts[box][3:] -= np.diff(edges, prepend=0)[1:-2]
+        columns, last = begin // height, (end - 1) // height
+        spans = bool((columns != last).any())  # from one column's foot to the next one's head
+        top = 0 if spans else (begin % height).min()
+        bottom = height if spans else ((end - 1) % height).max() + 1
+        sides[:, box] = columns.min(), top, last.max() + 1, bottom, (end - begin).sum()
+    names = ("left", "top", "right", "bottom", "pixels")
+    return {**dict(zip(names, sides, strict=True)), "rle": _as_texts(counts)}
+
+
+def _as_texts(counts: list[np.ndarray]) -> np.ndarray:
+    """Differences of run lengths as COCO's texts."""
+    joined = np.concatenate([np.zeros(0, np.int64), *counts])
+    groups = joined[:, None] >> np.arange(0, 35, 5)  # [N, 7]: of 35 bits
+    rest = groups >> 5  # what follows is zeros, or ones of a negative number
+    is_last = np.where(groups & 16, rest == -1, rest == 0)
+    last = is_last.argmax(axis=1)[:, None]
+    used, more = np.arange(7) <= last, np.arange(7) < last
+    text = ((groups & 31) + 48 + 32 * more)[used].astype(np.uint8).tobytes().decode("ascii")
+    ends = np.concatenate([[0], np.cumsum(used.sum(axis=1))])  # of the counts' characters
+    bounds = ends[np.concatenate([[0], np.cumsum([len(own) for own in counts])]).astype(np.int64)]
+    return np.array([text[a:b] for a, b in pairwise(bounds.tolist())], object)

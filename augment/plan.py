@@ -13,9 +13,10 @@ import numpy as np
 
 from augment import effects
 from augment.base_photo import RECORDED, check_base
-from augment.bounds import actor_boxes, actor_poses, owners_seen
+from augment.bounds import actor_boxes, owners_seen
 from augment.cameras import Camera
 from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
+from augment.lod import check_background
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
@@ -99,13 +100,15 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"(augment.jobs.quality)"
         )
     check_base(recipe, scene)
+    if any(effect.of(recipe) is not None for effect in effects.EFFECTS):
+        check_background(scene.background)  # whose numbers effects work with
     placed = dict[str, Placed]()
     for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
         placed[effect.name] = effect.place(recipe, scene, placed)
     placed = {effect.name: placed[effect.name] for effect in effects.EFFECTS}
     output, render = recipe.output, recipe.render
     depth_buffer = DEPTH_ESTIMATORS.get(output.depth)
-    finds_boxes = (output.labels or output.instance) and scene.labels is not None
+    finds_boxes = bool(output.labels or output.instance) and scene.labels is not None
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if output.semantic or output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
@@ -128,6 +131,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             sh_degree=render.sh_degree,
             transmittance_stop=render.transmittance_stop,
             radius_clip_px=render.radius_clip_px,
+            fog_cut=render.fog_cut,
+            lod_px=render.lod_px,
         ),
         buffers=buffers,
         image_buffers=frozenset(image_buffers),
@@ -250,7 +255,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     active = plan.active(scene, backend=backend)
     looking = [c for own in active for c in own.effect.cameras(own, camera) or ()]
     cameras = tuple(looking) or (camera,)
-    poses = actor_poses(scene, camera)
+    poses = scene.poses_at(camera.timestamp_ns)
     sight = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
     drawn = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)
     seen, skipped = list[Active](), dict[str, str]()

@@ -21,7 +21,7 @@ from recipes.files import file_below
 _DOMAIN = "climategs recipe draw 1"  # a change of the scheme changes this, never silently a number
 
 Triple = tuple[float, float, float]  # a colour, or three rates
-Plain = bool | int | float | str | Triple | None
+Plain = bool | int | float | str | Triple | tuple[str, ...] | None
 
 
 @dataclass(frozen=True)

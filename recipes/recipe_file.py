@@ -124,6 +124,12 @@ class Leaf:
         return self.kind in (int, float)
 
     @cached_property
+    def listed(self) -> tuple[str, ...]:
+        """The words that a list in its place may hold; none where it takes no list."""
+        items = [part.get("items", {}) for part in self._schema.get("anyOf", ())]
+        return tuple(str(word) for item in items for word in item.get("enum", ()))
+
+    @cached_property
     def channel(self) -> Leaf | None:
         """What each of the three numbers of a colour or rates is."""
         if self.kind is not tuple:
@@ -174,6 +180,8 @@ class Leaf:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.is_number:
             text = self._allowed_number(value) + (f" ({self.unit})" if self.unit else "")
+        elif self.listed:
+            text = f"true, false or a list of {', '.join(self.listed)}"
         elif self.kind is bool or "anyOf" in self._schema:
             *first, last = ("true", "false", *self.words)
             text = f"{', '.join(first)} or {last}"
@@ -223,16 +231,18 @@ class Leaf:
             channels = handler(node)
             fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
             return Fixed(as_triple(fixed)) if len(fixed) == 3 else Channels(channels)
-        if isinstance(node, ListNode):
+        if self.listed and isinstance(node, ListNode):
+            value: Any = tuple(getattr(item, "value", None) for item in node)
+        elif isinstance(node, ListNode):
             raise refusal(f"must be {self.allowed()}{guess_value(node, self)}")
-        # a name may look like a number
-        value = node.text if self.kind is str and node.value is not None else node.value
+        else:  # a name may look like a number
+            value = node.text if self.kind is str and node.value is not None else node.value
         try:
             read = handler(value)
         except ValidationError:
             raise refusal(f"must be {self.allowed(value)}{guess_value(node, self)}") from None
         is_file = self.annotation == FilePath and read is not None
-        return _named_file(node) if is_file else Fixed(read)
+        return _named_file(node) if is_file else Fixed(read)  # type: ignore[arg-type]
 
 
 def refusal(text: str) -> PydanticCustomError:

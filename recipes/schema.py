@@ -13,13 +13,24 @@ import operator
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
 from recipes.effect import Column, EffectModel, Knob, Section, Value
-from recipes.fields import Closed, Flag, Number, Seed, Whole, changed, found, is_given, replaced
+from recipes.fields import (
+    Closed,
+    Flag,
+    Number,
+    Seed,
+    Unit,
+    Whole,
+    changed,
+    found,
+    is_given,
+    replaced,
+)
 from recipes.flood import Flood
 from recipes.lens_drops import LensDrops
 from recipes.rain import Rain
@@ -158,7 +169,7 @@ class Weather(Closed):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px")
+    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px", "fog_cut", "lod_px")
     knobs = (
         Knob(
             "scale",
@@ -168,6 +179,7 @@ class Render(Section):
             tiers={"draft": 0.75},
         ),
         Knob("radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out", 4),
+        Knob("lod_px", (2.0, 1.0, 0.5, 0.0), "far splats are merged in cells as large", 13),
         Knob(
             "transmittance_stop",
             (0.05, 0.01, 1e-3, 1e-4),
@@ -175,6 +187,7 @@ class Render(Section):
             5,
             tiers={"draft": 0.01, "balanced": 0.01},
         ),
+        Knob("fog_cut", (0.02, 0.002, 0.0), "splats behind so much fog are left out", 5.5),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
 
@@ -202,6 +215,13 @@ class Render(Section):
     radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
     """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
     picture, are left out; 0 leaves out none."""
+    fog_cut: Number = Field(default=0.002, ge=0, le=0.1)
+    """Splats of which smog lets no more than this share through are left out, and pixels finished
+    once no more of what is behind would be seen: at 0.002 half a level of 255. It counts where the
+    picture alone is wanted: depth, classes, snow and water are drawn through any smog."""
+    lod_px: Number = Field(default=0.0, ge=0, le=64)
+    """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
+    this in the picture, pixels; 0 draws all as they are. For scenes of many millions."""
 
 
 class Sensor(Section):
@@ -221,10 +241,30 @@ class Sensor(Section):
     lens_drops: LensDrops | None = None
 
 
+LabelFormat = Literal["coco", "kitti", "yolo"]
+ANY_LABEL = "*"  # in a category's label: any characters
+
+
+class Category(Closed):
+    """One row of the table from the dataset's labels to categories."""
+
+    label: str = Field(min_length=1, max_length=200, title="a label, where * stands for any text")
+    """The dataset's label, or several by `*`, as in vehicle.*; of several rows the first counts."""
+    name: str = Field(
+        pattern=r"^[^\s\x00-\x1f]([^\x00-\x1f]{0,62}[^\s\x00-\x1f])?$", title="up to 64 characters"
+    )
+    """The category; several rows may have the same."""
+
+    def takes(self, label: str) -> bool:
+        """Whether a label of the dataset is of this row."""
+        parts = map(re.escape, self.label.split(ANY_LABEL))
+        return re.fullmatch(".*".join(parts), label, re.DOTALL) is not None
+
+
 class Output(Section):
     """What is written for each image."""
 
-    later_fields = ("surface", "trust")
+    later_fields = ("surface", "trust", "categories", "min_visibility", "on_hidden")
     knobs = (
         Knob("depth", ("none", "expected", "median", "mode"), "depth estimator", 11, False),
         Knob(
@@ -256,10 +296,24 @@ class Output(Section):
     """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's
     weather would have them, false writes none; auto is weather where the recipe has snow or a flood
     and surface is not scene, else true: smog, rain and snowfall alone put no surface there."""
-    labels: Flag = True
-    """Pass 3D boxes through."""
+    labels: Flag | Annotated[tuple[LabelFormat, ...], Field(min_length=1)] = True
+    """Pass 3D boxes through; a list writes them for trainers too: 2D boxes, masks of the pixels
+    that show each object, and 3D labels."""
+    categories: tuple[Category, ...] | None = Field(default=None, max_length=256)
+    """Labels of the dataset to categories of coco, kitti and yolo, in their order; null for the
+    labels themselves. Labels of no row are left out."""
+    min_visibility: Unit = 0.0
+    """Objects of which the weather leaves less than this are hidden, in coco, kitti and yolo."""
+    on_hidden: Literal["leave_out", "mark"] = "leave_out"
+    """Hidden objects are left out, or marked: iscrowd in coco, DontCare in kitti; yolo has no
+    mark."""
     trust: Flag = False
     """Write which pixels can be believed: those that the scene's images saw from near enough."""
+
+    @property
+    def label_formats(self) -> tuple[LabelFormat, ...]:
+        """What labels are written as besides their tables."""
+        return () if isinstance(self.labels, bool) else tuple(sorted(set(self.labels)))
 
 
 class Recipe(Closed):

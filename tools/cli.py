@@ -446,6 +446,31 @@ class MirrorOptions(Command):
         return mirror_again(self.out, self.scene, links=self.links)
 
 
+class LabelsOptions(Command):
+    """Write an output's labels for trainers: COCO, KITTI, YOLO, as its recipes' output.labels says.
+
+    `render` and `generate` do so at their end; this divides the scenes, or changes what is written
+    without rendering again. Later jobs keep to what was said here.
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote.
+        split: Parts and their shares of the scenes, as in train=0.8 val=0.2.
+        seed: What the split is drawn from.
+        overrides: Change output.labels, categories, min_visibility or on_hidden, as for render.
+    """
+
+    out: Positional[Annotated[Path, _local("copy the output here")]]
+    split: tuple[str, ...] = ()
+    seed: int = 0
+    overrides: Overrides = ()
+
+    def run(self) -> int:
+        from tools.export import label_files
+
+        print("\n".join(label_files(self.out, self.split, self.seed, self.overrides)))
+        return 0
+
+
 class ApplyOptions(SceneCommand):
     """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
 
@@ -533,6 +558,7 @@ COMMANDS = {
     "style": style,
     "export": ExportOptions,
     "mirror": MirrorOptions,
+    "labels": LabelsOptions,
 }
 # Commands of commands, which take over where the first word names one.
 GROUPS = {"style": {"apply": ApplyOptions, "train": StyleTrainOptions, "presets": presets}}

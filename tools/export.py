@@ -1,5 +1,6 @@
 """`climategs export`: a scene for other programs, or in one file to share; `--layout source` and
-`climategs mirror`: a variant as a copy of the dataset it was made from.
+`climategs mirror`: a variant as a copy of the dataset it was made from; `climategs labels`: what
+trainers read.
 """
 
 from __future__ import annotations
@@ -267,6 +268,50 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
             f"{written_as} for the dataset's copy: `climategs mirror {out} --scene URI` makes it "
             f"from the images there; or choose another output folder, or add --overwrite"
         )
+
+
+def label_files(
+    out: Path, split: Sequence[str] = (), seed: int = 0, changes: Sequence[str] = ()
+) -> list[str]:
+    """Writes the labels of an output in its recipes' formats; without a split, seed or change as
+    the last time. Returns sentences: what was written, and which labels were not.
+
+    Raises:
+        ClimateGSError: the split is none. OutputError: nothing asks for formats.
+    """
+    from augment.dataset.label_files import WHOLE, LabelsAsked, write_labels
+
+    asked = None
+    if split or seed or changes:
+        shares = _shares(split) if split else WHOLE
+        asked = LabelsAsked(split=shares, seed=seed, changes=tuple(changes))
+    try:
+        done = write_labels(out, asked)
+    except ValueError as error:
+        raise ClimateGSError(f"--split {' '.join(split)}: {error}") from error
+    counts = [f"{name} {done.objects[name]} in {done.images[name]} images" for name in done.images]
+    parts = ", ".join(f"{name} {count}" for name, count in done.parts.items())
+    lines = [f"labels: {done.folder} ({'; '.join(counts)}; parts: {parts})"]
+    if hidden := max(done.hidden.values(), default=0):
+        lines.append(f"  {hidden} objects are hidden by the weather (output.min_visibility)")
+    if done.unmapped:
+        listed = ", ".join(f"{label} ({count})" for label, count in done.unmapped.items())
+        lines.append(f"  of no category, and left out: {listed}")
+    if done.unused:
+        lines.append(f"  rows of output.categories that no label is of: {', '.join(done.unused)}")
+    return lines
+
+
+def _shares(split: Sequence[str]) -> dict[str, float]:
+    """`train=0.8` and so on."""
+    shares = {}
+    for text in split:
+        name, _, share = text.partition("=")
+        try:
+            shares[name] = float(share)
+        except ValueError:
+            raise ClimateGSError(f"--split {text}: write NAME=SHARE, as in train=0.8") from None
+    return shares
 
 
 def export_scene(options: ExportOptions) -> int:

@@ -22,6 +22,7 @@ from adapters.camera_files.paths import frames_from_path_file
 from augment import effects
 from augment.boxes import PlacedBoxes, find_occlusion
 from augment.cameras import Camera, Frame
+from augment.dataset.label_files import NothingLabelled
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import ClimateGSError
 from augment.geometry import rigid
@@ -49,7 +50,7 @@ from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video, write_rgb
-from tools.export import mirror_outputs, recipes_for_source
+from tools.export import label_files, mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
 from tools.output import compiling_noted, fill, print_images, print_note
 
@@ -232,6 +233,9 @@ def generate_dataset(options: GenerateOptions) -> int:
         print(shares.sentence)
     for uri, why in result.unusable.items():
         print_note(f"cannot be used: {uri}: {why}")
+    if store.local_dir is not None:
+        firsts = [template.resolve(0) for template in recipes.templates.values()]
+        _write_labels(store.local_dir, firsts, result.written + result.skipped)
     print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
     return 1 if result.failed or result.unusable else 0
 
@@ -384,6 +388,7 @@ def render_recipes(options: RenderOptions) -> int:
     if shares := shares_of(result.timings, held_up=options.workers):
         print(shares.sentence)
     print(f"manifest: {result.manifest}")
+    _write_labels(out, recipes, result.written + result.skipped)
     if options.layout == "source":
         names = [variant_name(resolved) for resolved in recipes]
         for sentence in mirror_outputs(scene, out, variants=names, links=options.links):
@@ -391,6 +396,16 @@ def render_recipes(options: RenderOptions) -> int:
     if options.sheet and result.written + result.skipped:
         print(f"pictures: {draw_sheet(out)}")
     return 1 if result.failed else 0
+
+
+def _write_labels(out: Path, recipes: Sequence[Recipe], images: int) -> None:
+    """For trainers, where a recipe asks for that."""
+    if not images or not any(recipe.output.label_formats for recipe in recipes):
+        return
+    try:
+        print("\n".join(label_files(out)))
+    except NothingLabelled as error:  # the scenes have no boxes, say
+        print_note(f"note: {error}")
 
 
 def _cameras(

@@ -12,6 +12,7 @@ from augment.dataset.clips_pairs import (
     clean_frames,
     split_by_scene,
 )
+from augment.dataset.label_files import LabelsAsked, write_labels
 from augment.dataset.live import SceneDataset
 from augment.dataset.samples import collate_frames
 from augment.dataset.weather_dataset import WeatherDataset
@@ -19,6 +20,7 @@ from augment.dataset.weather_dataset import WeatherDataset
 __all__ = [
     "Boxes2d",
     "ClipDataset",
+    "LabelsAsked",
     "MixedDataset",
     "PairedDataset",
     "SceneDataset",
@@ -30,4 +32,5 @@ __all__ = [
     "collate_frames",
     "split_by_scene",
     "torchvision_sample",
+    "write_labels",
 ]

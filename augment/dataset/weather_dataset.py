@@ -286,7 +286,7 @@ class RowReader:
 
     def _box_weather(self, row: Row, count: int) -> Iterator[tuple[str, BoxNumbers]]:
         for kind, table in box_tables().items():
-            if (path := row[f"{kind}_path"]) is None:
+            if (path := row[f"{kind}_path"]) is None or not table.sampled:
                 continue
             numbers = self.parsed(kind, path, table.read).get((row["frame"], row["camera"]))
             with self._named(path):

@@ -46,12 +46,12 @@ BoxWeather = Mapping[str, BoxNumbers]
 
 @dataclass(frozen=True)
 class BoxTable:
-    """How the numbers of one kind are stored. name: as of the manifest's column of paths, without
-    `_path`. file: inside a variant's folder. kind: what the file says that it holds. columns: the
-    file's, with their types. derived: what follows from the others; those that are columns are
-    there for other readers. sampled: those that samples of the datasets have. visible, hidden: the
-    column that says how much of a box the effect leaves to be seen, or takes; 0 to 1, NaN where it
-    says nothing.
+    """How the numbers of one kind are stored. name: as of the manifest's column of paths,
+    without `_path`. file: inside a variant's folder. kind: what the file says that it holds.
+    columns: the file's, with their types, `object` for texts. derived: what follows from the
+    others; those that are columns are there for other readers. sampled: those that samples of
+    the datasets have. visible, hidden: the column that says how much of a box the effect leaves
+    to be seen, or takes; 0 to 1, NaN where it says nothing.
     """
 
     name: str
@@ -105,8 +105,11 @@ class BoxTable:
         }
         for name, kind in self.columns.items():
             joined = _joined([numbers[name] for numbers in listed], kind)
-            is_count = kind is np.int64
-            columns[name] = pa.array(joined, mask=joined == NOT_COUNTED) if is_count else joined
+            if kind is object:
+                columns[name] = pa.array(joined, pa.string())
+            else:
+                is_count = kind is np.int64
+                columns[name] = pa.array(joined, mask=joined == NOT_COUNTED) if is_count else joined
         images = [[*item, count] for item, count in zip(order, counts, strict=True)]
         return parquet_bytes(pa.table(columns), {"kind": self.kind, "images": images})
 
@@ -129,6 +132,8 @@ class BoxTable:
         return items
 
     def _column(self, data: pa.ChunkedArray, name: str) -> np.ndarray:
+        if self.columns[name] is object:
+            return np.array(texts_of(data), object)
         if self.columns[name] is np.int64:
             data = data.fill_null(NOT_COUNTED)
         return data.to_numpy().astype(self.columns[name], casting="safe", copy=False)
@@ -177,4 +182,15 @@ BOXES_2D = BoxTable(
     },
     sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
     derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
+)
+# Which pixels show each box: in the instance image, where the recipe has one, else by depth, the
+# smallest box that has the surface. Their bounds, from the first pixel's edge to the last one's,
+# how many they are, and COCO's run lengths; zeros and an empty text where there are none.
+MASK_SIDES = ("left", "top", "right", "bottom")
+MASKS = BoxTable(
+    name="box_mask",
+    file="labels/masks.parquet",
+    kind="boxes masks",
+    columns={**dict.fromkeys((*MASK_SIDES, "pixels"), np.int64), "rle": object},
+    sampled=(),
 )

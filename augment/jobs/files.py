@@ -27,6 +27,7 @@ from augment import effects
 from augment.boxes import (
     Instances,
     PlacedBoxes,
+    encode_masks,
     find_occlusion,
     instances_of,
     outline_placed,
@@ -35,7 +36,15 @@ from augment.boxes import (
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.box_tables import BOXES_2D, MODAL_SIDES, SIDES, BoxNumbers, BoxTable, BoxWeather
+from augment.jobs.box_tables import (
+    BOXES_2D,
+    MASKS,
+    MODAL_SIDES,
+    SIDES,
+    BoxNumbers,
+    BoxTable,
+    BoxWeather,
+)
 from augment.jobs.layout import TRUST, share_columns
 from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
@@ -61,19 +70,32 @@ class View(Protocol):
 def box_tables() -> dict[str, BoxTable]:
     """All tables of what is measured of boxes, by name: that of the boxes, then the effects'."""
     own = (e.table for e in reversed(effects.EFFECTS) if e.table is not None)
-    return {table.name: table for table in (BOXES_2D, *own)}
+    return {table.name: table for table in (BOXES_2D, MASKS, *own)}
 
 
 def measure_boxes(
-    boxes: Boxes, instances: Instances, world_origin_m: np.ndarray, camera: Camera, view: View
-) -> BoxWeather:
-    """The boxes of a frame in one of its images. camera: at the written resolution."""
+    boxes: Boxes,
+    instances: Instances,
+    world_origin_m: np.ndarray,
+    camera: Camera,
+    view: View,
+    *,
+    masks: bool = False,
+) -> dict[str, BoxNumbers]:
+    """The boxes of a frame in one of its images. camera: at the written resolution. masks: also
+    those by depth.
+    """
     placed = PlacedBoxes.of(boxes, world_origin_m)
     measured: dict[str, BoxNumbers] = {}
     if view.surface is not None:
         numbers = instances.of(boxes.track_ids)
-        columns = _measure_2d(placed, numbers, len(instances.actors), camera, view)
+        columns, owners = _measure_2d(
+            placed, numbers, len(instances.actors), camera, view, masks=masks
+        )
         measured[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
+        if owners is not None:
+            places = np.arange(1, len(boxes) + 1).astype(np.uint16)
+            measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(owners, places))
     for effect in effects.EFFECTS:
         table, seen = effect.table, view.effects.get(effect.name)
         if table is not None and seen is not None:
@@ -91,12 +113,21 @@ def _grown(placed: PlacedBoxes, view: View) -> PlacedBoxes:
 
 
 def _measure_2d(
-    placed: PlacedBoxes, instance: np.ndarray, num_actors: int, camera: Camera, view: View
-) -> dict[str, np.ndarray]:
+    placed: PlacedBoxes,
+    instance: np.ndarray,
+    num_actors: int,
+    camera: Camera,
+    view: View,
+    *,
+    masks: bool,
+) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    """Columns of the boxes in 2D; and which box each pixel shows, if masks ask."""
     outlines, surface = outline_placed(placed, camera), view.surface
     actors = np.where(instance <= num_actors, instance, 0)
-    found = find_occlusion(_grown(placed, view), camera, surface.depth_m, surface.actors, actors)
-    return {
+    found = find_occlusion(
+        _grown(placed, view), camera, surface.depth_m, surface.actors, actors, with_owners=masks
+    )
+    columns = {
         "instance": instance.astype(np.int64),
         **dict(zip(SIDES, outlines.xyxy.T.copy(), strict=True)),
         **dict(zip(MODAL_SIDES, found.xyxy.T.copy(), strict=True)),
@@ -104,6 +135,7 @@ def _measure_2d(
         "hidden_pixels": found.hidden,
         "truncated_fraction": outlines.truncated_fraction,
     }
+    return columns, found.owners
 
 
 def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
@@ -634,7 +666,7 @@ class WritePump:
 
 def uses_boxes(recipe: Recipe) -> bool:
     """Whether images of the recipe take the boxes of their frame."""
-    return recipe.output.labels or recipe.output.instance
+    return bool(recipe.output.labels) or recipe.output.instance
 
 
 def label_view(
@@ -649,24 +681,28 @@ def label_view(
     image; and what is measured of them, where labels are written. camera: at the written
     resolution.
     """
-    measured: BoxWeather = {}
+    measured: dict[str, BoxNumbers] = {}
+    wants_masks = bool(recipe.output.label_formats)
     if recipe.output.labels:
-        measured = measure_boxes(boxes, instances, world_origin_m, camera, view)
+        by_depth = wants_masks and not recipe.output.instance
+        measured = measure_boxes(boxes, instances, world_origin_m, camera, view, masks=by_depth)
     surface = view.surface
     if view.instance is None or surface is None:
         return view, measured
     assert surface.shown_depth_m is not None and surface.shown_classes is not None
-    placed = PlacedBoxes.of(boxes, world_origin_m)
+    placed, numbers = PlacedBoxes.of(boxes, world_origin_m), instances.of(boxes.track_ids)
     if not surface.is_bare:
         placed = _grown(placed, view)
     painted = with_boxes(
         view.instance,
         placed,
-        instances.of(boxes.track_ids),
+        numbers,
         camera,
         surface.shown_depth_m,
         surface.shown_classes,
         len(instances.actors),
     )
+    if wants_masks:
+        measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(painted, numbers))
     changed: Any = view
     return dataclasses.replace(changed, instance=painted), measured

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from augment import effects
 from augment.errors import OutputError
-from augment.jobs.box_tables import BOXES_2D
+from augment.jobs.box_tables import BOXES_2D, MASKS
 from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
@@ -53,7 +53,7 @@ TRUST = "trust"  # the mask of what of a picture can be believed, see augment.tr
 def path_kinds() -> tuple[str, ...]:
     """In the order of the manifest's columns: `image` and so on, its column being `image_path`."""
     tables = [e.table.name for e in reversed(effects.EFFECTS) if e.table]
-    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D.name, *tables, _LAST)
+    return (*_IMAGES, *mask_names(), *_LABELS, BOXES_2D.name, MASKS.name, *tables, _LAST)
 
 
 def mask_names() -> tuple[str, ...]:
@@ -84,7 +84,8 @@ def box_weather_files(recipe: Recipe) -> dict[str, str]:
     if not recipe.output.labels:
         return {}
     own = [e.table for e in reversed(effects.EFFECTS) if e.table and e.of(recipe) is not None]
-    return {table.name: table.file for table in (BOXES_2D, *own)}
+    masks = [MASKS] if recipe.output.label_formats else []
+    return {table.name: table.file for table in (BOXES_2D, *masks, *own)}
 
 
 def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str, str | None]:

@@ -138,6 +138,8 @@ def composite_sky(
     """
     sky, fog = sky_behind(sky, fog)
     if isinstance(sky, ConstantSky) and fog is None:  # no direction matters
+        if kernels_for(backend, rgb, alpha) == CPU:
+            return _composite_constant(rgb, alpha, sky)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.device, rgb.dtype)
     if camera.is_orthographic:
         raise ValueError(
@@ -153,6 +155,16 @@ def composite_sky(
         tau = sky_optical_depth(fog, slope, float(camera.centre[2]))
         color = blend_airlight(color, tau, fog, slope)
     return rgb + (1 - alpha)[..., None] * color
+
+
+def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
+    out = np.empty((*alpha.shape, 3), np.float32)
+    color = sky.rgb.detach().to(torch.float32).numpy()
+    with kernel_threads(ROWS):
+        composite_kernels.composite_constant(
+            rgb.detach().contiguous().numpy(), alpha.detach().contiguous().numpy(), color, out
+        )
+    return torch.from_numpy(out)
 
 
 def _composite_cubemap(

@@ -10,6 +10,7 @@ from numba import prange
 from numba.core import types
 from numba.extending import intrinsic
 
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner, kernel
 from augment.render.fog import MAX_EXPONENT
 from augment.render.layout import LANES, U
@@ -60,6 +61,18 @@ def layered_way(distance, eye, up):
 
 
 @kernel
+def composite_constant(rgb, alpha, color, out):
+    """out = rgb + (1 - alpha) color [3]."""
+    red, green, blue = color[0], color[1], color[2]
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            share = np.float32(1) - alpha[i, j]
+            out[i, j, 0] = rgb[i, j, 0] + share * red
+            out[i, j, 1] = rgb[i, j, 1] + share * green
+            out[i, j, 2] = rgb[i, j, 2] + share * blue
+
+
+@kernel
 def composite_cubemap(
     rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, gains, airlight, varying, out
 ):
@@ -71,52 +84,82 @@ def composite_cubemap(
     """
     height, width = alpha.shape
     half, one = np.float32(0.5), np.float32(1)
+    texels, line = faces.reshape(-1), U(3 * faces.shape[1])
     scale = np.float32(faces.shape[1] - 2) * half
-    middle = scale + half  # of a face, from the centre of the first texel of its border
     for i in prange(height):
+        places = np.empty(4 * _AHEAD, np.float32)
         v = (np.float32(i) + half - cy) * ify
         bx = rotation[0, 1] * v + rotation[0, 2]
         by = rotation[1, 1] * v + rotation[1, 2]
         bz = rotation[2, 1] * v + rotation[2, 2]
-        for j in range(width):
-            u = (np.float32(j) + half - cx) * ifx
-            x = rotation[0, 0] * u + bx
-            y = rotation[1, 0] * u + by
-            z = rotation[2, 0] * u + bz
-            ax, ay, az = abs(x), abs(y), abs(z)
-            if ax >= ay and ax >= az:
-                major, t = ax, -y
-                face = 0 if x >= 0 else 1
-                s = -z if x >= 0 else z
-            elif ay >= az:
-                major, s = ay, x
-                face = 2 if y >= 0 else 3
-                t = z if y >= 0 else -z
-            else:
-                major, t = az, -y
-                face = 4 if z >= 0 else 5
-                s = x if z >= 0 else -x
-            inverse = scale / major
-            column, row = s * inverse + middle, t * inverse + middle
-            c0, r0 = int(column), int(row)
-            c1, r1 = c0 + 1, r0 + 1
-            fc, fr = column - np.float32(c0), row - np.float32(r0)
-            transmittance = one - alpha[i, j]
-            visible = one
-            gain = np.float32(0)
-            if strength >= 0:
-                visible = np.float32(0)
-                slope = z / math.sqrt(x * x + y * y + z * z)
-                if z > 0:
-                    visible = math.exp(-strength / slope)
-                gain = airlight_gain(slope, gains)
-            for c in range(3):
-                top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
-                bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
-                color = top * (one - fr) + bottom * fr
-                air = airlight[c] + gain * varying[c]
-                color = visible * color + (one - visible) * air
-                out[i, j, c] = rgb[i, j, c] + transmittance * color
+        colors, alphas, target = rgb[i], alpha[i], out[i]
+        for first in range(U(0), U(width), U(_AHEAD)):
+            for k in range(U(0), U(_AHEAD), U(LANES)):
+                u = v8.splat(np.float32(first + k)) + v8.lane_numbers()
+                u = (u + v8.splat(half) - v8.splat(cx)) * v8.splat(ifx)
+                x = v8.splat(rotation[0, 0]) * u + v8.splat(bx)
+                y = v8.splat(rotation[1, 0]) * u + v8.splat(by)
+                z = v8.splat(rotation[2, 0]) * u + v8.splat(bz)
+                _place_eight(x, y, z, scale, np.float32(faces.shape[1]), places, k)
+            for k in range(min(U(_AHEAD), U(width) - first)):
+                j = first + k
+                at = U(np.int32(places[k])) * line + U(3) * U(np.int32(places[k + U(_AHEAD)]))
+                fc, fr = places[k + U(2 * _AHEAD)], places[k + U(3 * _AHEAD)]
+                transmittance = one - alphas[j]
+                visible, gain = one, np.float32(0)
+                if strength >= 0:
+                    u = (np.float32(j) + half - cx) * ifx
+                    x = rotation[0, 0] * u + bx
+                    y = rotation[1, 0] * u + by
+                    z = rotation[2, 0] * u + bz
+                    visible = np.float32(0)
+                    slope = z / math.sqrt(x * x + y * y + z * z)
+                    if z > 0:
+                        visible = math.exp(-strength / slope)
+                    gain = airlight_gain(slope, gains)
+                for c in range(U(3)):
+                    top = texels[at + c] * (one - fc) + texels[at + U(3) + c] * fc
+                    below = at + line + c
+                    bottom = texels[below] * (one - fc) + texels[below + U(3)] * fc
+                    color = top * (one - fr) + bottom * fr
+                    if strength >= 0:
+                        air = airlight[c] + gain * varying[c]
+                        color = visible * color + (one - visible) * air
+                    target[j, c] = colors[j, c] + transmittance * color
+
+
+_AHEAD = 64  # pixels whose places in the cube map are found before they are read
+
+
+@inner()
+def _place_eight(x, y, z, scale, side, places, at):
+    """Where eight directions meet a cube map with a border: rows of _AHEAD each of the texel above
+    and to the left, its row counted through all faces and its column, and of the parts of a texel
+    to the right of its centre and below. scale: half a face in texels. side: with the border.
+    """
+    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
+    ax, ay, az = v8.absolute(x), v8.absolute(y), v8.absolute(z)
+    by_x, by_y = v8.both(v8.at_least(ax, ay), v8.at_least(ax, az)), v8.at_least(ay, az)
+    right, ahead, up = v8.at_least(x, zero), v8.at_least(y, zero), v8.at_least(z, zero)
+    major = v8.select(by_x, ax, v8.select(by_y, ay, az))
+    s = v8.select(by_y, x, v8.select(up, x, v8.negate(x)))
+    s = v8.select(by_x, v8.select(right, v8.negate(z), z), s)
+    t = v8.select(by_y, v8.select(ahead, z, v8.negate(z)), v8.negate(y))
+    t = v8.select(by_x, v8.negate(y), t)
+    face = v8.select(by_y, _one_of(ahead, 2, 3), _one_of(up, 4, 5))
+    face = v8.select(by_x, _one_of(right, 0, 1), face)
+    inverse, middle = v8.splat(scale) / major, v8.splat(scale) + half
+    column, row = s * inverse + middle, t * inverse + middle
+    left, above = v8.floor(column), v8.floor(row)
+    v8.store(places, at, face * v8.splat(side) + above)
+    v8.store(places, at + U(_AHEAD), left)
+    v8.store(places, at + U(2 * _AHEAD), column - left)
+    v8.store(places, at + U(3 * _AHEAD), row - above)
+
+
+@inner()
+def _one_of(mask, a, b):
+    return v8.select(mask, v8.splat(np.float32(a)), v8.splat(np.float32(b)))
 
 
 @kernel
@@ -136,11 +179,12 @@ def map_colors(rgb, matrix):
     m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
     for i in prange(rgb.shape[0]):
-        for j in range(rgb.shape[1]):
-            r, g, b = rgb[i, j, 0], rgb[i, j, 1], rgb[i, j, 2]
-            rgb[i, j, 0] = m00 * r + m01 * g + m02 * b + m03
-            rgb[i, j, 1] = m10 * r + m11 * g + m12 * b + m13
-            rgb[i, j, 2] = m20 * r + m21 * g + m22 * b + m23
+        row = rgb[i].reshape(-1)
+        for j in range(U(0), U(row.size), U(3)):
+            r, g, b = row[j], row[j + U(1)], row[j + U(2)]
+            row[j] = m00 * r + m01 * g + m02 * b + m03
+            row[j + U(1)] = m10 * r + m11 * g + m12 * b + m13
+            row[j + U(2)] = m20 * r + m21 * g + m22 * b + m23
 
 
 # ---- Numba kernel: colour maps folded into spherical harmonics, as fast as memory gives and takes.

@@ -38,6 +38,14 @@ class RasterSettings:
     splat's size is the larger half-extent of the box in which its alpha can reach 1/255,
     sqrt(2 ln(255 opacity) max(xx, yy)), with the opacity after antialiasing and the blurred 2D
     covariance, not rounded. As gsplat's `radius_clip`, which rounds the extent up first.
+
+    fog_cut: where colour and alpha alone are asked for, a backend may leave out splats of which no
+    more light than this share comes through the fog, and finish a pixel once no more than this
+    share of the light behind would. Alpha then is that of the splats drawn: whoever sets this puts
+    the fog behind them, its airlight or the sky through it. 0 leaves out nothing.
+
+    lod_px: far splats of large backgrounds are drawn merged, in cells of this many pixels at most
+    (augment.lod); 0 draws all as they are.
     """
 
     near_m: float = 0.01
@@ -47,3 +55,5 @@ class RasterSettings:
     mode_depth_floor_m: float = 0.2
     transmittance_stop: float = TRANSMITTANCE_STOP
     radius_clip_px: float = 0.0
+    fog_cut: float = 0.0
+    lod_px: float = 0.0

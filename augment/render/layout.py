@@ -135,6 +135,7 @@ V_SUN, V_WRAP = 53, 56  # towards the light, in the camera's axes; how far it is
 V_LIT = 57  # 1 where the part is lit pixel by pixel, else 0
 V_MAPS = 58  # how many colour maps the part has
 V_RADIUS_CLIP = 59  # pixels; splats no larger are left out; negative for none
+V_FOG_FAR = 60  # metres from the eye beyond which the fog leaves nothing of a splat to be drawn
 VIEW = 64
 
 # What a part is read from: arrays of these by address.

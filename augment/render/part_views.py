@@ -23,6 +23,7 @@ from augment.render.sh import MAX_DEGREE
 from augment.scene import PosedGaussians
 
 _NO_CLIP = 1e30  # a height at which everything is on the kept side
+_NO_FAR = 1e18  # metres; its square is still finite
 _NO_RADIUS_CLIP = -1.0  # no splat is as small, not even one of alpha 1/255 in its centre only
 
 
@@ -93,6 +94,10 @@ def part_views(
             above = float(camera.centre[2]) - fog.base_z_m
             views[:, layout.V_EYE_HEIGHT] = above / fog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / fog.scale_height_m
+    views[:, layout.V_FOG_FAR] = _NO_FAR
+    if fog is not None and fog.scale_height_m is None and settings.fog_cut > 0:
+        far = -math.log(settings.fog_cut) / max(fog.sigma_per_m, 1 / _NO_FAR)
+        views[:, layout.V_FOG_FAR] = min(far, _NO_FAR)
     views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS

@@ -14,6 +14,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
+from augment.lod import choose_parts
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -123,11 +124,18 @@ def rasterize(
         )
     image = _Image(parts, camera, frozenset(buffers), settings, fog, clip, pixel_mask)
     chosen = _choose(image, backend)
-    stop = settings.transmittance_stop
+    if settings.lod_px > 0 and not _tracked(parts):
+        levels = choose_parts(parts, camera, settings)
+        return levels.restore_ids(_render(image._replace(parts=levels.parts), chosen))
+    return _render(image, chosen)
+
+
+def _render(image: _Image, backend: str) -> RenderOutput:
+    stop = image.settings.transmittance_stop
     if stop <= TRANSMITTANCE_STOP:
-        return _draw(image, chosen)
-    drawn = _draw(image._replace(buffers=image.buffers | {ALPHA}), chosen)
-    opaque = renormalise_alpha(drawn, stop, backend=chosen)
+        return _draw(image, backend)
+    drawn = _draw(image._replace(buffers=image.buffers | {ALPHA}), backend)
+    opaque = renormalise_alpha(drawn, stop, backend=backend)
     return opaque if ALPHA in image.buffers else dataclasses.replace(opaque, alpha=None)
 
 
@@ -342,6 +350,8 @@ def _check_settings(settings: RasterSettings) -> None:
             f"> 0 and at most {most}, since median depth is where less than half the light is left",
         ),
         "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
+        "fog_cut": (0 <= s.fog_cut <= most, f">= 0 and at most {most}"),
+        "lod_px": (0 <= s.lod_px < math.inf, "finite and >= 0 (pixels)"),
         "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
     }
     for name, (is_good, expected) in rules.items():

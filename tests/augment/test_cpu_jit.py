@@ -1,9 +1,10 @@
-"""The CPU backend's building blocks: the kernel cache, eight-wide arithmetic, exp2 and log2."""
+"""The CPU backend's building blocks: the kernel cache, vectors, exp2 and log2."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -151,6 +152,37 @@ def test_lanes(which, function):
     assert apply(which, x).tolist() == function(x).astype(np.float32).tolist()
 
 
+@kernel
+def turned(rows, table, out):
+    """Eight and sixteen at once: turned rows, 2**x of lanes above -1, and rows of an image."""
+    for part in prange(2):
+        if part == 0:
+            kind = v8.lane_numbers()
+            v8.turn(kind, table, rows, U(3), U(9), out, U(0))
+            v8.store(out, U(512), v8.exp2_where(v8.at_least(kind, v8.splat(np.float32(3))), kind))
+        else:
+            kind = v8.wide_columns()
+            v8.turn(kind, table, rows, U(3), U(9), out, U(16))
+            for row in range(v8.rows_in(kind)):
+                v8.store(out, U(544) + row * U(8), v8.load_row(kind, table, row))
+
+
+def test_turned_rows_stop_at_the_last_and_masked_lanes_are_zero():
+    table = np.arange(320, dtype=np.float32)
+    rows, out = np.arange(19, 0, -1, dtype=np.int32), np.zeros(600, np.float32)
+    with kernel_threads():
+        turned(rows, table, out)
+    taken = rows[np.minimum(3 + np.arange(v8.WIDE), 9)]
+    fields = table.reshape(20, 16)[taken].T
+    assert np.array_equal(out[:512].reshape(16, 32)[:, :8], fields[:, :8])
+    assert np.array_equal(out[:512].reshape(16, 32)[:, 16 : 16 + v8.WIDE], fields)
+    assert out[512:520] == pytest.approx([0, 0, 0, 8, 16, 32, 64, 128], rel=3e-6)
+    assert out[512:515].tolist() == [0, 0, 0]
+    each = v8.WIDE // 8
+    for row in range(each):
+        assert out[544 + 8 * row : 552 + 8 * row].tolist() == [*range(row, v8.WIDE, each)]
+
+
 ROOT = Path(__file__).parents[2]
 SECONDS = 120  # for a fresh process on a busy machine; a worker that hangs would wait for ever
 
@@ -211,6 +243,54 @@ with ThreadPoolExecutor(4) as pool:
 assert numba.threading_layer() == "workqueue"
 print("done")
 """
+
+
+PICTURES = """
+import dataclasses, hashlib, sys, torch
+from augment.render.buffers import BUFFERS
+from augment.render.constants import RasterSettings
+from augment.render.cpu.simd import WIDE
+from augment.render.layout import HeightClip
+from augment.render.rasterize import rasterize
+from augment.scene import PosedGaussians
+from tests.augment.hard_scenes import KINDS, hard_gaussians, in_weather, wide_camera
+
+camera, everything = wide_camera(60.0, (75, 53)), frozenset(BUFFERS)
+cases = (("clear", {"rgb", "alpha"}, None), ("clear", everything, None),
+         ("clear", everything, HeightClip(0.1, "above")), ("light", {"rgb", "overlay"}, None))
+digest = hashlib.sha256()
+for kind in KINDS:
+    scene = hard_gaussians(kind, camera, 700)
+    for weather, names, clip in cases:
+        for stop in (1e-4, 0.02):
+            picture = rasterize([in_weather(scene, weather)], camera, buffers=frozenset(names),
+                                clip=clip, settings=RasterSettings(transmittance_stop=stop),
+                                backend="cpu")
+            for name in sorted(names):
+                digest.update(getattr(picture, name).numpy().tobytes())
+scene = hard_gaussians("plain", camera, 700)
+sh = scene.sh.clone().requires_grad_()
+part = PosedGaussians(dataclasses.replace(scene, sh=sh))
+rasterize([part], camera, buffers=frozenset({"rgb", "alpha"}),
+          backend="cpu").rgb.square().sum().backward()
+digest.update(sh.grad.numpy().tobytes())
+print(WIDE, digest.hexdigest())
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(v8.WIDE != 16, reason="the processor has no AVX-512")
+def test_pictures_and_gradients_have_the_same_bits_with_eight_and_sixteen_lanes():
+    older = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", PICTURES], cwd=ROOT, capture_output=True, text=True, check=True,
+            env={**os.environ, **more},
+        ).stdout.split()
+        for more in ({}, older)
+    ]  # fmt: skip
+    assert [lanes for lanes, _ in found] == ["16", "8"]
+    assert found[0][1] == found[1][1]
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:

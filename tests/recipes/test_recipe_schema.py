@@ -22,7 +22,7 @@ from recipes.load import dump_recipe, load_recipe, parse_recipe, preset_names
 from recipes.rain import Rain
 from recipes.ranges import words
 from recipes.recipe_file import Leaf, recipe_file, recipe_json_schema, write_schema
-from recipes.schema import Output, Quality, Recipe, Render, Sensor, Smog, Weather
+from recipes.schema import Category, Output, Quality, Recipe, Render, Sensor, Smog, Weather
 from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.snowfall import Snowfall
 from recipes.style import Style, style_preset_names
@@ -223,7 +223,8 @@ def test_every_field_changes_the_hash() -> None:
     weather = Weather(smog=smog, flood=flood, snow=snow, rain=rain, snowfall=snowfall)
     camera = Sensor(lens_drops=LensDrops(count=5))
     style = Style(image="a.png", digest="0" * 64)
-    base = Recipe(weather=weather, style=style, camera=camera)
+    output = Output(categories=(Category(label="car", name="Car"),))
+    base = Recipe(weather=weather, style=style, camera=camera, output=output)
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
     hashes.add(base.model_copy(update={"camera": Sensor()}).hash)

@@ -297,8 +297,11 @@ class SceneStyle:
 
     def _mapped(self, part: PosedGaussians, backend: str) -> PosedGaussians:
         if self.folds and part.gaussians.sh is self.bare.background.sh:
-            sh = self._folded_on_gpu if backend == CUDA else self._folded
-            return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
+            own, sh = part.gaussians, self._folded_on_gpu if backend == CUDA else self._folded
+            folded = memo_of(own).get(  # one object, of which levels of detail are made once
+                ("folded", id(sh)), lambda: dataclasses.replace(own, sh=sh)
+            )
+            return dataclasses.replace(part, gaussians=folded)
         if self.levels is None or part.instance_id > 0:
             return dataclasses.replace(part, color_maps=self.maps.splats)
         maps, rows = self._level_maps

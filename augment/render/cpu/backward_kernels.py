@@ -24,10 +24,19 @@ from numba import prange
 
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
-from augment.render.cpu.blend import Work, alpha_of, is_closed, remaining_transmittance, shrink
+from augment.render.cpu.blend import (
+    Work,
+    aligned_floats,
+    alpha_of,
+    is_closed,
+    remaining_transmittance,
+    shrink,
+)
 from augment.render.cpu.geometry import (
     BATCH,
     ITEMS,
+    PLACES,
+    STARTS,
     dot,
     find_spans,
     from_eye,
@@ -77,9 +86,10 @@ def blend_backward(splats, frame, slopes, shares, reached):
     for group in prange((reached.size + GROUP - 1) // GROUP):
         columns, s = (frame.size[0] + TILE_W - 1) // TILE_W, slopes
         state, rows = np.empty(PLANES, np.float32), np.empty(2 * STRIPS, np.int64)
-        staged, spans = np.empty(RECORD * BATCH, np.float32), np.empty(2 * BATCH, np.int32)
-        values, places = np.empty(2 * ITEMS, np.float32), np.empty(2 * ITEMS, np.int32)
-        work = Work(state, staged, spans, values, places, rows, None, None, None, None)
+        staged, spans = aligned_floats(RECORD * BATCH), np.empty(2 * BATCH, np.int32)
+        values, places = np.empty(2 * ITEMS, np.float32), np.empty(ITEMS, np.int32)
+        starts = aligned_floats(STARTS)
+        work = Work(state, staged, spans, starts, values, places, rows, None, None, None, None)
         for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
             first, last = splats.tile_offsets[tile], splats.tile_offsets[tile + 1]
             left, top = tile % columns * TILE_W, tile // columns * TILE_H
@@ -124,36 +134,34 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
 def _replay_list(splats, first, last, corner, limits, work, d_depth, shares):
     """Fill the shares of a tile's list as far as light reaches; returns how far that is."""
     state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
-    values, places = work.values, work.places
-    records, ids = splats.records, splats.tile_splat_ids
+    values, places, starts = work.values, work.places, work.starts
+    records, ids, columns = splats.records, splats.tile_splat_ids, v8.lane_numbers()
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
         if first < last:
-            shrink(state, strip, rows)
+            shrink(state, strip, rows, columns)
     for at in range(first, last, BATCH):
         if is_closed(rows):
             return at - first
-        count = min(BATCH, last - at)
-        for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
+        count = U(min(BATCH, last - at))
+        for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), U(count), corner, staged)
-        for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
+        stage(records, ids, U(at), count, corner, staged)
+        for i in range(U(at) * U(SHARE), (U(at) + count) * U(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
-            find_spans(staged, U(count), strip, rows, limits[1], spans)
-            items = list_items(staged, U(count), strip, spans, values, places)
-            if items == U(0):
-                continue
-            places[items] = 0
+            found = find_spans(staged, count, strip, rows, limits[1], spans, starts)
+            list_items(staged, found, U(strip), spans, starts, columns, values, places)
             item = U(0)
-            for k in range(U(count)):
+            while found != U(0):
+                k = v8.lowest_bit(found)
+                found &= found - U(1)
                 end = item + U(spans[U(BATCH) + k] - spans[k])
-                if end > item:
-                    _add_share(work, k, item, end, limits, d_depth, shares, (U(at) + k) * U(SHARE))
+                _add_share(work, k, item, end, limits, d_depth, shares, (U(at) + k) * U(SHARE))
                 item = end
-            shrink(state, strip, rows)
+            shrink(state, strip, rows, columns)
     return last - first
 
 
@@ -176,12 +184,12 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     s0, sx, sxx, sy, sxy, syy = zero, zero, zero, zero, zero, zero
     sr, sg, sb, sz, ax, ay = zero, zero, zero, zero, zero, zero
     for i in range(item, end):
-        at = U(places[i + U(ITEMS)])
+        at = U(places[i]) % U(PLACES) * U(LANES)
         row = np.float32(at % U(STRIP) // U(LANES)) + np.float32(0.5)
         dy = v8.splat(row - staged[U(L.MEAN_Y) * n + k])
         off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
         e = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
-        alpha = alpha_of(staged, values, k, i, alpha_max, log_cut)
+        alpha = alpha_of(e, alpha_max, log_cut)
         transmittance = v8.load(state, at)
         weight = alpha * transmittance
         after = transmittance - weight

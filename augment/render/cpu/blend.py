@@ -26,7 +26,9 @@ from augment.render.cpu.geometry import (
     L_RED,
     LINES,
     LIT,
+    PLACES,
     SHARE,
+    STARTS,
     SURFACE,
     find_spans,
     is_lit,
@@ -40,7 +42,7 @@ from augment.render.cpu.geometry import (
     surface_depth,
 )
 from augment.render.cpu.jit import inner, kernel
-from augment.render.cpu.simd import exp2
+from augment.render.cpu.simd import ROWS, WIDE
 from augment.render.layout import (
     BIN_SHIFT,
     BLOCK,
@@ -181,7 +183,7 @@ def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids,
                         heads[tile] = at + 1
 
 
-# ---- Numba functions: mode depth, eight pixels at a time (see augment.render.mode_depth) ---------
+# ---- Numba functions: mode depth, item by item (see augment.render.mode_depth) -------------------
 # Sums are kept times the cluster's weight, so that a sample that joins costs no division and no
 # root.
 
@@ -200,25 +202,27 @@ _SLACK = np.float32(1e-4)
 
 @inner()
 def add_sample(state, at, depth, weight, floor):
-    """Eight pixels' next samples. state, at: their place in the plane FIRST."""
-    zero, none = v8.splat(np.float32(0)), v8.splat(np.float32(-1))
-    first, mass = v8.load(state, at + FIRST), v8.load(state, at + MASS)
-    moment, square = v8.load(state, at + MOMENT), v8.load(state, at + SQUARE)
+    """An item's pixels' next samples. state, at: their place in the plane FIRST."""
+    zero, none = v8.splat_as(depth, np.float32(0)), v8.splat_as(depth, np.float32(-1))
+    first, mass = v8.load_as(depth, state, at + FIRST), v8.load_as(depth, state, at + MASS)
+    moment, square = v8.load_as(depth, state, at + MOMENT), v8.load_as(depth, state, at + SQUARE)
     off = depth - first
     aside = v8.fmuladd(off, mass, v8.negate(moment))  # mass (z - mean)
     spread = _spread(mass, moment, square)
     is_farther = v8.at_least(aside, zero)
-    reach = v8.select(is_farther, v8.splat(_FARTHER), v8.splat(_NEARER))
-    reach_2 = v8.select(is_farther, v8.splat(_FARTHER_2), v8.splat(_NEARER_2))
-    by_floor = v8.splat(floor) * reach * mass - v8.absolute(aside)
+    reach = v8.select(is_farther, v8.splat_as(depth, _FARTHER), v8.splat_as(depth, _NEARER))
+    reach_2 = v8.select(is_farther, v8.splat_as(depth, _FARTHER_2), v8.splat_as(depth, _NEARER_2))
+    by_floor = v8.splat_as(depth, floor) * reach * mass - v8.absolute(aside)
     by_spread = v8.fmuladd(reach_2, spread, v8.negate(aside * aside))
     joins = v8.greater(v8.maximum(by_floor, by_spread), zero)
     begins = v8.select(joins, none, v8.select(v8.greater(weight, zero), zero, none))
     if v8.any_not_negative(begins):
         is_new = v8.at_least(begins, zero)
-        best = v8.load(state, at + HEAVIEST)
+        best = v8.load_as(depth, state, at + HEAVIEST)
         heavier = v8.both(is_new, v8.greater(mass, best))
-        mode = v8.select(heavier, _mode(first, mass, moment, spread), v8.load(state, at + MODE))
+        mode = v8.select(
+            heavier, _mode(first, mass, moment, spread), v8.load_as(depth, state, at + MODE)
+        )
         v8.store(state, at + HEAVIEST, v8.select(heavier, mass, best))
         v8.store(state, at + MODE, mode)
         v8.store(state, at + FIRST, v8.select(is_new, depth, first))
@@ -236,10 +240,15 @@ def can_grow(state, at, transmittance):
 
     transmittance: what light is left, negative where blending has stopped.
     """
-    none = v8.splat(np.float32(-1))
-    mass, best = v8.load(state, at + MASS), v8.load(state, at + HEAVIEST)
-    most = mass + transmittance + v8.splat(_SLACK) - best
-    return v8.select(v8.greater(transmittance, v8.splat(np.float32(0))), most, none)
+    none = v8.splat_as(transmittance, np.float32(-1))
+    mass, best = (
+        v8.load_as(transmittance, state, at + MASS),
+        v8.load_as(transmittance, state, at + HEAVIEST),
+    )
+    most = mass + transmittance + v8.splat_as(transmittance, _SLACK) - best
+    return v8.select(
+        v8.greater(transmittance, v8.splat_as(transmittance, np.float32(0))), most, none
+    )
 
 
 @inner()
@@ -258,15 +267,16 @@ def close_clusters(state, start):
 def _spread(mass, moment, square):
     """mass^2 times the variance."""
     spread = v8.fmuladd(mass, square, v8.negate(moment * moment))
-    return v8.maximum(spread, v8.splat(np.float32(0)))
+    return v8.maximum(spread, v8.splat_as(spread, np.float32(0)))
 
 
 @inner()
 def _mode(first, mass, moment, spread):
-    return first + (moment - v8.splat(_BACK) * v8.sqrt(spread)) / mass
+    return first + (moment - v8.splat_as(first, _BACK) * v8.sqrt(spread)) / mass
 
 
 GROUP = 8  # tiles a thread takes at a time
+LINE = 16  # float32 of a cache line
 
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
 # is negative where blending has stopped; its size is then the final one. An image needs its plane
@@ -326,6 +336,7 @@ class Work(NamedTuple):
     state: Any
     staged: Any
     spans: Any
+    starts: Any
     values: Any
     places: Any
     rows: Any
@@ -352,11 +363,12 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
     work = Work(
-        np.empty(STATE, np.float32),
-        np.empty(RECORD * BATCH, np.float32),
+        aligned_floats(STATE + LINE),  # v8.load_row reads a number beyond
+        aligned_floats(RECORD * BATCH),
         np.empty(2 * BATCH, np.int32),
+        aligned_floats(STARTS),
         np.empty(2 * ITEMS, np.float32),
-        np.empty(2 * ITEMS, np.int32),
+        np.empty(ITEMS, np.int32),
         np.empty(2 * STRIPS, np.int64),
         np.empty(LINES, np.float32),
         np.empty(ITEMS, np.float32),
@@ -373,6 +385,12 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
             _clear(state, used, size[0] - left, size[1] - top)
         else:
             _copy(states, U(tile * used), state, U(0), U(used))
+        for y in range(min(TILE_H, size[1] - top)):
+            at = U((top + y) * size[0] + left)
+            v8.prefetch_to_write(images.alpha, at)
+            if wanted is None or wanted & RGB:
+                for line in range(U(0), U(3 * TILE_W), U(LINE)):
+                    v8.prefetch_to_write(images.rgb, U(3) * at + line)
         corner = (np.float32(left), np.float32(top))
         is_open = _blend_list(splats, first, last, corner, frame.limits, wanted, work)
         if is_open and not is_last:
@@ -383,6 +401,14 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, wanted):
                 close_clusters(state, P_MODE)
             _write_pixels(state, left, top, size, images, wanted)
             tiles[tile] = CLOSED
+
+
+@inner()
+def aligned_floats(count):
+    """So many float32 that begin where a cache line does."""
+    room = np.empty(count + LINE, np.float32)
+    past = (U(room.ctypes.data) // U(room.itemsize)) % U(LINE)
+    return room[LINE - np.int64(past) :][:count]
 
 
 @inner()
@@ -400,71 +426,80 @@ def _clear(state, used, width, height):
         value = nobody if P_ID <= i < P_MODE else value
         v8.store(state, i, v8.splat(value))
     if width < TILE_W or height < TILE_H:
-        for pixel in range(PIXELS):
-            x = pixel // STRIP * LANES + pixel % LANES
-            y = pixel % STRIP // LANES
-            if x >= width or y >= height:
-                state[pixel] = np.float32(-1)
+        for y in range(TILE_H):
+            for x in range(TILE_W):
+                if x >= width or y >= height:
+                    state[_place_of(x, y)] = np.float32(-1)
+
+
+@inner()
+def _place_of(x, y):
+    """Where a pixel of the tile stands in a plane of its state."""
+    row = x // LANES * TILE_H + y
+    return row // ROWS * WIDE + x % LANES * ROWS + row % ROWS
 
 
 @inner()
 def _blend_list(splats, first, last, corner, limits, wanted, work):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     state, staged, spans, rows = work.state, work.staged, work.spans, work.rows
-    records, ids = splats.records, splats.tile_splat_ids
+    records, ids, columns = splats.records, splats.tile_splat_ids, v8.wide_columns()
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
-        shrink(state, strip, rows)
+        shrink(state, strip, rows, columns)
     for at in range(first, last, BATCH):
         if is_closed(rows):
             return False
-        count = min(BATCH, last - at)
-        for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
+        count = U(min(BATCH, last - at))
+        for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
-        stage(records, ids, U(at), U(count), corner, staged)
+        stage(records, ids, U(at), count, corner, staged)
         any_cut = False
         if wanted is not None:
             if wanted & LIT_RGB:
-                stage_lights(splats.lights, ids, U(at), U(count), work.lit)
+                stage_lights(splats.lights, ids, U(at), count, work.lit)
             if wanted & CLIP:
                 bent = wanted & SURFACES != 0
-                any_cut = stage_cuts(splats.cuts, ids, U(at), U(count), staged, bent, work.lines)
+                any_cut = stage_cuts(splats.cuts, ids, U(at), count, staged, bent, work.lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
-            find_spans(staged, U(count), strip, rows, limits[1], spans)
-            items = list_items(staged, U(count), strip, spans, work.values, work.places)
-            if items == U(0):
+            found = find_spans(staged, count, strip, rows, limits[1], spans, work.starts)
+            if found == U(0):
                 continue
+            items = list_items(
+                staged, found, U(strip), spans, work.starts, columns, work.values, work.places
+            )
             now = wanted
             if wanted is not None:
                 if wanted & CLIP and wanted & SURFACES:
-                    list_lines(work.lines, SURFACE, U(count), strip, spans, work.surfaces)
+                    list_lines(work.lines, SURFACE, found, spans, U(strip), columns, work.surfaces)
                 if any_cut:
-                    list_lines(work.lines, SHARE, U(count), strip, spans, work.edges)
+                    list_lines(work.lines, SHARE, found, spans, U(strip), columns, work.edges)
                     now = wanted | CUT
-                elif wanted & ORDERED and not _can_change(state, strip, rows, wanted):
+                elif wanted & ORDERED and not _can_change(state, strip, rows, wanted, columns):
                     now = wanted & ~ORDERED
-            _blend_items(work, items, limits, now)
-            shrink(state, strip, rows)
+            _blend_items(work, items, columns, limits, now)
+            shrink(state, strip, rows, columns)
     return not is_closed(rows)
 
 
 @inner()
-def _can_change(state, strip, rows, wanted):
+def _can_change(state, strip, rows, wanted, columns):
     """Whether a pixel of the strip may still find its median depth or a heavier splat or cluster.
 
     It finds none once its transmittance has fallen below one half and the best weight so far,
     which most pixels reach early: the rest of the list costs them no more than colour does.
     """
-    most = v8.splat(np.float32(-1))
-    for row in range(rows[2 * strip], rows[2 * strip + 1]):
+    most = v8.splat_as(columns, np.float32(-1))
+    half = v8.splat_as(columns, np.float32(0.5))
+    for row in range(rows[2 * strip] // ROWS * ROWS, rows[2 * strip + 1], ROWS):
         at = U(strip * STRIP + row * LANES)
-        transmittance = v8.load(state, at)
+        transmittance = v8.load_as(columns, state, at)
         if wanted & MEDIAN:
-            most = v8.maximum(most, transmittance - v8.splat(np.float32(0.5)))
+            most = v8.maximum(most, transmittance - half)
         if wanted & IDS:
-            most = v8.maximum(most, transmittance - v8.load(state, at + P_BEST))
+            most = v8.maximum(most, transmittance - v8.load_as(columns, state, at + P_BEST))
         if wanted & MODES:
             most = v8.maximum(most, can_grow(state, at + P_MODE, transmittance))
     return v8.any_not_negative(most)
@@ -479,50 +514,65 @@ def is_closed(rows):
 
 
 @inner()
-def shrink(state, strip, rows):
+def shrink(state, strip, rows, columns):
     """Leave out a strip's first and last rows while no pixel of them is open."""
     low, high = rows[2 * strip], rows[2 * strip + 1]
-    base = strip * STRIP
-    while low < high and not v8.any_not_negative(v8.load(state, U(base + low * LANES))):
+    while low < high and not _is_open(state, strip, low, columns):
         low += 1
-    while low < high and not v8.any_not_negative(v8.load(state, U(base + (high - 1) * LANES))):
+    while low < high and not _is_open(state, strip, high - 1, columns):
         high -= 1
     rows[2 * strip], rows[2 * strip + 1] = low, high
 
 
 @inner()
-def _blend_items(work, items, limits, wanted):
+def _is_open(state, strip, row, columns):
+    each = v8.rows_in(columns)
+    first = U(row) - U(row) % each
+    left = v8.load_as(columns, state, U(strip * STRIP) + first * U(LANES))
+    if each == U(1):
+        return v8.any_not_negative(left)
+    at, here = v8.row_numbers(columns), v8.splat_as(columns, np.float32(U(row) - first))
+    here = v8.both(v8.at_least(at, here), v8.at_least(here, at))
+    return v8.any_not_negative(v8.select(here, left, v8.splat_as(columns, np.float32(-1))))
+
+
+@inner()
+def _blend_items(work, items, columns, limits, wanted):
     """Blend all items in turn. The next one's alpha is begun before this one is blended."""
     state, staged, values, places = work.state, work.staged, work.values, work.places
     lines, lit = work.lines, work.lit
-    alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
-    least, end = v8.splat(limits[2]), v8.splat(limits[7])
-    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
-    n = U(BATCH)
+    alpha_max, log_cut = v8.splat_as(columns, limits[0]), v8.splat_as(columns, limits[1])
+    least, end = v8.splat_as(columns, limits[2]), v8.splat_as(columns, limits[7])
+    zero = v8.splat_as(columns, np.float32(0))
+    n, ends_early = U(BATCH), limits[7] > limits[2]
     places[items] = 0  # one item is read beyond the last
-    splat = U(places[0])
-    alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
-    if wanted is not None and wanted & CUT:
-        alpha = alpha * kept_share(lines, work.edges, splat, U(0))
+    coded = U(places[0])
+    next_e = log2_alpha(staged, values, coded // U(PLACES), U(0), columns)
+    next_alpha = alpha_of(next_e, alpha_max, log_cut)
     for item in range(items):
-        following = U(places[item + U(1)])
-        next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
+        splat, place, e, alpha = coded // U(PLACES), coded % U(PLACES), next_e, next_alpha
+        coded = U(places[item + U(1)])
+        next_e = log2_alpha(staged, values, coded // U(PLACES), item + U(1), columns)
+        next_alpha = alpha_of(next_e, alpha_max, log_cut)
         if wanted is not None and wanted & CUT:
-            next_alpha = next_alpha * kept_share(lines, work.edges, following, item + U(1))
-        at = U(places[item + U(ITEMS)])
-        transmittance = v8.load(state, at)
+            alpha = alpha * kept_share(lines, work.edges, splat, item, columns)
+        at = place * U(WIDE)
+        transmittance = v8.load_as(columns, state, at)
         weight = alpha * transmittance
         after = transmittance - weight
         kept = v8.greater(after, least)
+        left = v8.select(kept, after, v8.minus_abs(transmittance))
+        if ends_early:
+            left = remaining_transmittance(transmittance, after, kept, end)
+        v8.store(state, at, left)
         weight = v8.select(kept, weight, zero)
-        v8.store(state, at, remaining_transmittance(transmittance, after, kept, end))
         if wanted is None or wanted & RGB:
             _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(L.BLUE) * n + splat])
         if wanted is not None:
             if wanted & LIT_RGB and is_lit(lit, splat):
-                share = weight * light_share(lit, staged, values, splat, item, at, limits)
+                share = weight * light_share(lit, staged, splat, e, place, columns, limits)
                 _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
                 _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
                 _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
@@ -530,35 +580,43 @@ def _blend_items(work, items, limits, wanted):
                 _add(state, at + P_OVERLAY, weight, staged[U(L.IS_OVERLAY) * n + splat])
             if wanted & SURFACES:
                 centre = staged[U(L.DEPTH) * n + splat]
-                depth = v8.splat(centre)
+                depth = v8.splat_as(columns, centre)
                 if wanted & CLIP:
-                    depth = surface_depth(lines, work.surfaces, splat, item, centre, limits[3])
+                    depth = surface_depth(
+                        lines, work.surfaces, splat, item, columns, centre, limits[3]
+                    )
                 if wanted & EXPECTED:
-                    sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
+                    sums = v8.fmuladd(weight, depth, v8.load_as(columns, state, at + P_DEPTH))
                     v8.store(state, at + P_DEPTH, sums)
                 if wanted & MODES:
                     add_sample(state, at + P_MODE, depth, weight, limits[4])
             if wanted & MEDIAN:
+                half = v8.splat_as(columns, np.float32(0.5))
                 crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
-                depth = v8.splat(staged[U(L.DEPTH) * n + splat])
-                before = v8.load(state, at + P_MEDIAN)
+                depth = v8.splat_as(columns, staged[U(L.DEPTH) * n + splat])
+                before = v8.load_as(columns, state, at + P_MEDIAN)
                 v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
             if wanted & IDS:
-                best = v8.load(state, at + P_BEST)
+                best = v8.load_as(columns, state, at + P_BEST)
                 heavier = v8.greater(weight, best)
                 v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
-                number = v8.splat(staged[U(L.SPLAT_ID) * n + splat])
-                v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
-        alpha, splat = next_alpha, following
+                number = v8.splat_as(columns, staged[U(L.SPLAT_ID) * n + splat])
+                before = v8.load_as(columns, state, at + P_ID)
+                v8.store(state, at + P_ID, v8.select(heavier, number, before))
 
 
 @inner()
-def alpha_of(staged, values, splat, item, alpha_max, log_cut):
-    sharp = v8.splat(staged[U(L.SHARP_X) * U(BATCH) + splat])
-    off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
-    e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
-    alpha = v8.minimum(exp2(e), alpha_max)
-    return v8.select(v8.at_least(e, log_cut), alpha, v8.splat(np.float32(0)))
+def log2_alpha(staged, values, splat, item, columns):
+    """Of a splat at an item's pixels (see augment.render.layout)."""
+    sharp = v8.splat_as(columns, staged[U(L.SHARP_X) * U(BATCH) + splat])
+    rows = U(ITEMS) // v8.rows_in(columns)
+    off = v8.fmuladd(sharp, columns, v8.by_row(columns, values, item + rows))
+    return v8.fmuladd(v8.negate(off), off, v8.by_row(columns, values, item))
+
+
+@inner()
+def alpha_of(e, alpha_max, log_cut):
+    return v8.minimum(v8.exp2_where(v8.at_least(e, log_cut), e), alpha_max)
 
 
 @inner()
@@ -570,37 +628,59 @@ def remaining_transmittance(transmittance, after, kept, end):
 
 @inner()
 def _add(state, at, weight, value):
-    v8.store(state, at, v8.fmuladd(weight, v8.splat(value), v8.load(state, at)))
+    before = v8.load_as(weight, state, at)
+    v8.store(state, at, v8.fmuladd(weight, v8.splat_as(weight, value), before))
 
 
 @inner()
 def _write_pixels(state, left, top, size, images, wanted):
     """Pixels of a finished tile to the images."""
+    columns = v8.wide_columns()
+    one, least = v8.splat(np.float32(1)), v8.splat(np.float32(DEPTH_EPS))
     for y in range(U(min(TILE_H, size[1] - top))):
         for strip in range(U(STRIPS)):
-            at = strip * U(STRIP) + y * U(LANES)
             column = left + np.int64(strip) * LANES
+            at = U(_place_of(np.int64(strip) * LANES, np.int64(y)))
             pixel = U((top + np.int64(y)) * size[0] + column)
-            for lane in range(U(max(min(LANES, size[0] - column), 0))):
-                opacity = np.float32(1) - abs(state[at + lane])
-                images.alpha[pixel + lane] = opacity
-                if wanted is None or wanted & RGB:
-                    first = U(3) * (pixel + lane)
-                    images.rgb[first] = state[at + lane + P_RED]
-                    images.rgb[first + U(1)] = state[at + lane + P_GREEN]
-                    images.rgb[first + U(2)] = state[at + lane + P_BLUE]
-                if wanted is not None:
-                    if wanted & EXPECTED:
-                        weighted = state[at + lane + P_DEPTH]
-                        images.expected[pixel + lane] = weighted / max(
-                            opacity, np.float32(DEPTH_EPS)
-                        )
-                    if wanted & MEDIAN:
-                        images.median[pixel + lane] = state[at + lane + P_MEDIAN]
-                    if wanted & IDS:
-                        number = np.float32(state[at + lane + P_ID]).view(np.int32)
-                        images.ids[pixel + lane] = number
-                    if wanted & MODES:
-                        images.mode[pixel + lane] = state[at + lane + P_MODE + MODE]
-                    if wanted & OVERLAY:
-                        images.overlay[pixel + lane] = state[at + lane + P_OVERLAY]
+            count = min(LANES, size[0] - column)
+            opacity = one - v8.absolute(v8.load_row(columns, state, at))
+            _write(images.alpha, pixel, opacity, count)
+            if wanted is None or wanted & RGB:
+                red = v8.load_row(columns, state, at + P_RED)
+                green = v8.load_row(columns, state, at + P_GREEN)
+                blue = v8.load_row(columns, state, at + P_BLUE)
+                if count >= LANES:
+                    v8.store_colours(images.rgb, U(3) * pixel, red, green, blue)
+                else:
+                    for k in range(U(count)):
+                        first = U(3) * (pixel + k)
+                        images.rgb[first] = v8.lane(red, k)
+                        images.rgb[first + U(1)] = v8.lane(green, k)
+                        images.rgb[first + U(2)] = v8.lane(blue, k)
+            if wanted is not None:
+                if wanted & EXPECTED:
+                    weighted = v8.load_row(columns, state, at + P_DEPTH)
+                    depth = weighted / v8.maximum(opacity, least)
+                    _write(images.expected, pixel, depth, count)
+                if wanted & MEDIAN:
+                    value = v8.load_row(columns, state, at + P_MEDIAN)
+                    _write(images.median, pixel, value, count)
+                if wanted & IDS:
+                    number = v8.load_row(columns, state, at + P_ID)
+                    _write(images.ids.view(np.float32), pixel, number, count)
+                if wanted & MODES:
+                    value = v8.load_row(columns, state, at + P_MODE + MODE)
+                    _write(images.mode, pixel, value, count)
+                if wanted & OVERLAY:
+                    value = v8.load_row(columns, state, at + P_OVERLAY)
+                    _write(images.overlay, pixel, value, count)
+
+
+@inner()
+def _write(image, at, values, count):
+    """The first of eight values, as many as lie in the image."""
+    if count >= LANES:
+        v8.store(image, at, values)
+    else:
+        for k in range(count):
+            image[at + U(k)] = v8.lane(values, U(k))

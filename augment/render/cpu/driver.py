@@ -1,6 +1,7 @@
 """The CPU rasteriser: arrays for the numba kernels, and the order in which they run.
 
-    rank      z and a generous box of every Gaussian                      (project)
+    choose    blocks of Gaussians that the view may see                   (order)
+    rank      z and a generous box of their Gaussians                     (project)
     then slice by slice along z, until no tile is open:
       project   record, tiles and colour of the slice's splats            (project)
       sort      by z, ties by index
@@ -18,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,11 +37,17 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import (
+    ALPHA_MIN,
+    MAX_TRANSMITTANCE_STOP,
+    TRANSMITTANCE_STOP,
+    RasterSettings,
+)
 from augment.render.cpu import blend as blend_kernels
 from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
-from augment.render.fog import Fog
+from augment.render.cpu.order import order_of
+from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, thread_count
@@ -53,8 +60,8 @@ from augment.scene import Gaussians, PosedGaussians
 class Inputs:
     """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
 
-    addresses, sizes, first_ids, views, blocks: see project. modes: see layout. arrays: what the
-    addresses point to, kept alive by this.
+    addresses, sizes, first_ids, views, blocks, orders: see project; None where every part stands in
+    its own order. modes: see layout. arrays: what the addresses point to, kept alive by this.
     """
 
     addresses: np.ndarray
@@ -64,13 +71,20 @@ class Inputs:
     blocks: np.ndarray
     modes: np.ndarray
     arrays: list[np.ndarray]
+    orders: np.ndarray | None = None
 
     @property
     def read(self) -> project_kernels.Parts:
         """What kernels read of it."""
+        orders = np.zeros(len(self.sizes), np.uint64) if self.orders is None else self.orders
         return project_kernels.Parts(
-            self.addresses, self.sizes, self.first_ids, self.views, self.blocks, self.modes
+            self.addresses, self.sizes, self.first_ids, orders, self.views, self.blocks, self.modes
         )
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether any part stands in another order than its own."""
+        return self.orders is not None and bool(self.orders.any())
 
     @property
     def slots(self) -> int:
@@ -86,19 +100,32 @@ def gather_inputs(
     clip: HeightClip | None = None,
     *,
     with_color: bool,
+    culled: bool = False,
 ) -> Inputs:
-    """Addresses and numbers of all parts; their tensors are not copied if they are contiguous."""
-    arrays, addresses, sizes, blocks = [], [], [], []
+    """Addresses and numbers of all parts; their tensors are not copied if they are contiguous.
+
+    culled: whether blocks that the view cannot see are left out.
+    """
+    arrays, addresses, orders, blocks = [], [], [], []
     for number, part in enumerate(parts):
         g, count = part.gaussians, len(part.gaussians)
-        tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
-        own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+        order = order_of(g) if culled else None
+        if order is None:
+            firsts = range(0, count, layout.BLOCK)
+            kept = [(first, min(first + layout.BLOCK, count)) for first in firsts]
+            tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
+            own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+        else:
+            kept = order.blocks_seen(part, camera, settings, fog, clip).tolist()
+            own = [order.means, *(order.sorted(t).rows for t in (g.quats, g.scales, g.opacities))]
+            own.append(g.sh.detach().to(torch.float32).contiguous().numpy())
+            arrays.append(order.ids)
         own += _looks(part)
         arrays += own
         addresses.append([array.ctypes.data for array in own])
-        sizes.append([count, g.sh.shape[1]])
-        firsts = range(0, count, layout.BLOCK)
-        blocks += [(number, first, min(first + layout.BLOCK, count)) for first in firsts]
+        orders.append(0 if order is None else order.ids.ctypes.data)
+        blocks += [(number, first, last) for first, last in kept]
+    sizes = [(len(part.gaussians), part.gaussians.sh.shape[1]) for part in parts]
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, fog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
@@ -110,6 +137,7 @@ def gather_inputs(
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=modes,
         arrays=arrays,
+        orders=np.array(orders, np.uint64),
     )
 
 
@@ -204,7 +232,12 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     timer = StageTimer(stage_times)
-    inputs = gather_inputs(parts, camera, settings, fog, clip, with_color=RGB in buffers)
+    is_hidden = fog is not None and fog.sigma_per_m > 0
+    if not is_hidden or clip is not None or not buffers <= {RGB, ALPHA}:
+        settings = replace(settings, fog_cut=0.0)
+    inputs = gather_inputs(
+        parts, camera, settings, fog, clip, with_color=RGB in buffers, culled=True
+    )
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = Tiles(camera, images, settings, scratch)
@@ -212,15 +245,25 @@ def rasterize_cpu(
             tiles.leave_out(pixel_mask)
         depths, edges = rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
+            if fog is not None and settings.fog_cut > 0:
+                nearest_m = float(np.uint32(bins[0] << layout.BIN_SHIFT).view(np.float32))
+                tiles.stop_at(settings.fog_cut / _clearest(fog, camera, nearest_m))
             splats = project(inputs, depths, bins, tiles, scratch)
             timer.end_stage("project")
-            slots, rects = sort(splats, bins[0], scratch)
+            slots, rects = sort(splats, bins[0], scratch, is_ordered=inputs.is_ordered)
             timer.end_stage("sort")
             timer.count("visible", len(slots))
             tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], timer=timer)
             if not tiles.open.any():
                 break
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
+
+
+def _clearest(fog: Fog, camera: Camera, distance_m: float) -> float:
+    """No more light comes through the fog from anywhere at this distance: that from straight up."""
+    eye_z_m, way_m = float(camera.centre[2]), np.array([distance_m])
+    depth = float(optical_depth_of_arrays(fog, way_m, eye_z_m, eye_z_m + way_m)[0])
+    return math.exp(-min(depth, MAX_EXPONENT))
 
 
 class StageTimer:
@@ -303,9 +346,11 @@ def project(
 
 
 def sort(
-    splats: project_kernels.Splats, first_bin: int, scratch: Scratch
+    splats: project_kernels.Splats, first_bin: int, scratch: Scratch, *, is_ordered: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slots nearest first (ties in index order), and their tiles in that order."""
+    """Slots nearest first (ties in index order), and their tiles in that order. is_ordered: whether
+    any part's slots are in another order than its Gaussians.
+    """
     # Bin after bin, and in each of them block after block.
     bin_offsets = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
     heads = bin_offsets[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
@@ -315,6 +360,8 @@ def sort(
     rects = scratch.array("sorted_rects", (count,), np.uint64)
     blend_kernels.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
     blend_kernels.sort_bins(bin_offsets, keys, slots, splats.rects, spare_keys, spare_slots, rects)
+    if is_ordered:
+        project_kernels.order_ties(keys, slots, rects, splats.records)
     return slots, rects
 
 
@@ -345,7 +392,7 @@ class Tiles:
             ],
             np.float32,
         )
-        self.frame = blend_kernels.Frame(size, limits)
+        self.frame, self._stop = blend_kernels.Frame(size, limits), settings.transmittance_stop
         # Alpha is always written, so that kernels come in fewer variants.
         spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
         none = {name: np.empty(0, _DTYPES.get(name, np.float32)) for name in BUFFERS}
@@ -364,6 +411,11 @@ class Tiles:
         self.open[~drawn.reshape(-1)] = blend_kernels.CLOSED
         for image in self._images:
             image.fill(0)
+
+    def stop_at(self, transmittance: float) -> None:
+        """Finish pixels that let no more than this through, or than the settings say."""
+        stop = min(max(transmittance, self._stop), MAX_TRANSMITTANCE_STOP)
+        self.frame.limits[-1] = stop  # see blend.Frame
 
     def open_sums(self) -> np.ndarray:
         """int32 [rows + 1, columns + 1]: open tiles above and to the left."""

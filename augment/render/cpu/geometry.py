@@ -2,96 +2,140 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from augment.render import layout as L
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner
-from augment.render.cpu.simd import scalar_fmuladd
-from augment.render.layout import CUT, LANES, RECORD, STRIP, TILE_H, U
+from augment.render.cpu.simd import WIDE
+from augment.render.layout import CUT, LANES, TILE_H, U
 
 # ---- What a batch of splats asks for in a tile, row by row ---------------------------------------
-# A tile is worked on in strips one register wide. The rows in which an ellipse meets a strip are an
-# interval (both are convex); they become a flat list of (row, splat) items, which one loop without
-# branches can blend.
+# A tile is worked on in strips eight pixels wide. The rows in which an ellipse meets a strip are an
+# interval (both are convex); they become a flat list of (rows, splat) items, which one loop without
+# branches can blend. An item is as many rows as a register holds: one, or two that begin at an even
+# row, whose pixels then lie in turn (simd.wide_columns). What an item's rows hold does not depend
+# on how many they are.
 
 BATCH = 32  # splats between two looks at what is still open
-ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the surplus
+ITEMS = BATCH * TILE_H + TILE_H  # a batch's rows at most, and room for the surplus
+STARTS = 3 * BATCH
+
+PLACES = 256  # an item is its splat times this, plus its rows' place in the state, in registers
+
+_NEVER = -1e30  # log2 of an alpha that is not drawn
+
+
+def _row_tables() -> tuple[np.ndarray, ...]:
+    """For lists whose first row is even, and odd: how far their rows lie from the start of their
+    half, where their half starts, and, by how many they are, what keeps the others undrawn.
+    """
+    rows = np.arange(TILE_H) - np.arange(2)[:, None]  # [2, H] from the first
+    halves = np.where(rows >= LANES, LANES, 0)
+    counts = np.arange(TILE_H + 1)[:, None]
+    drawn = (rows[:, None] >= 0) & (rows[:, None] < counts)  # [2, H + 1, H]
+    tables = rows - halves, halves, np.where(drawn, 0, _NEVER)
+    return tuple(table.astype(np.float32).reshape(-1) for table in tables)
+
+
+_STEPS, _HALVES, _UNDRAWN = _row_tables()
 
 
 @inner()
 def stage(records, tile_splat_ids, at, count, corner, staged):
-    """Records of a batch, turned to one row a field, relative to the tile's corner."""
-    n, (left, top) = U(BATCH), corner
-    for k in range(count):
-        record = U(tile_splat_ids[at + k]) * U(RECORD)
-        for field in range(U(RECORD)):
-            staged[field * n + k] = records[record + field]
-        staged[U(L.MEAN_X) * n + k] -= left
-        staged[U(L.MEAN_Y) * n + k] -= top
+    """Records of a batch, turned to one row a field, relative to the tile's corner.
+
+    count must be > 0. What stands beyond it is of no splat of the batch.
+    """
+    n, wide = U(BATCH), v8.wide_columns()
+    left, top = v8.splat_as(wide, corner[0]), v8.splat_as(wide, corner[1])
+    for k in range(U(0), count, U(WIDE)):
+        v8.turn(wide, records, tile_splat_ids, at + k, at + count - U(1), staged, k)
+        v8.store(staged, U(L.MEAN_X) * n + k, v8.load_as(wide, staged, U(L.MEAN_X) * n + k) - left)
+        v8.store(staged, U(L.MEAN_Y) * n + k, v8.load_as(wide, staged, U(L.MEAN_Y) * n + k) - top)
 
 
 @inner()
-def find_spans(staged, count, strip, rows, log_cut, spans):
-    """Rows in which each ellipse meets the strip: first, and one past the last.
+def find_spans(staged, count, strip, rows, log_cut, spans, starts):
+    """Rows in which each ellipse meets the strip: first, and one past the last. Returns the bits of
+    the splats that have any.
 
     An ellipse is highest where its ridge says (L.LEAN_X L.RADIUS_Y from its mean), or, where that
-    column lies outside the strip, in the strip's nearest column.
+    column lies outside the strip, in the strip's nearest column. starts: what list_items begins
+    with, of each splat: how far its first row lies below its mean, how many (sharp) pixels the
+    first column is off the mean, and by how many each row is farther off the ridge.
     """
-    zero, half = np.float32(0), np.float32(0.5)
-    n = U(BATCH)
-    west = np.float32(strip * LANES) + half
-    east = west + np.float32(LANES - 1)
-    low, high = np.float32(rows[2 * strip]), np.float32(rows[2 * strip + 1])
-    for k in range(count):
-        mean_x, mean_y = staged[k], staged[n + k]
-        budget = staged[U(L.LOG_OPACITY) * n + k] - log_cut
-        top = staged[U(L.LEAN_X) * n + k] * staged[U(L.RADIUS_Y) * n + k]
-        fall, lean = staged[U(L.FALL_X) * n + k], staged[U(L.LEAN_Y) * n + k]
-        blunt = staged[U(L.BLUNT_Y) * n + k]
-        d = min(max(top, west - mean_x), east - mean_x)
-        left_over = scalar_fmuladd(-fall * d, d, budget)
-        reach = math.sqrt(max(left_over, zero)) * blunt
-        end = scalar_fmuladd(lean, d, mean_y) + reach + half
-        end = end if left_over >= zero else zero
-        d = min(max(-top, west - mean_x), east - mean_x)
-        left_over = scalar_fmuladd(-fall * d, d, budget)
-        reach = math.sqrt(max(left_over, zero)) * blunt
-        begin = min(max(scalar_fmuladd(lean, d, mean_y) - reach + half, low), high)
-        spans[k] = np.int32(begin)
-        spans[n + k] = np.int32(max(min(end, high), begin))
+    n, wide, found = U(BATCH), v8.wide_columns(), U(0)
+    zero, half = v8.splat_as(wide, np.float32(0)), v8.splat_as(wide, np.float32(0.5))
+    first_x = np.float32(strip * LANES) + np.float32(0.5)
+    west = v8.splat_as(wide, first_x)
+    east = v8.splat_as(wide, first_x + np.float32(LANES - 1))
+    low = v8.splat_as(wide, np.float32(rows[2 * strip]))
+    high = v8.splat_as(wide, np.float32(rows[2 * strip + 1]))
+    cut = v8.splat_as(wide, log_cut)
+    for k in range(U(0), count, U(WIDE)):
+        mean_x = v8.load_as(wide, staged, U(L.MEAN_X) * n + k)
+        mean_y = v8.load_as(wide, staged, U(L.MEAN_Y) * n + k)
+        lean_x = v8.load_as(wide, staged, U(L.LEAN_X) * n + k)
+        sharp = v8.load_as(wide, staged, U(L.SHARP_X) * n + k)
+        budget = v8.load_as(wide, staged, U(L.LOG_OPACITY) * n + k) - cut
+        top = lean_x * v8.load_as(wide, staged, U(L.RADIUS_Y) * n + k)
+        fall = v8.negate(v8.load_as(wide, staged, U(L.FALL_X) * n + k))
+        lean = v8.load_as(wide, staged, U(L.LEAN_Y) * n + k)
+        blunt = v8.load_as(wide, staged, U(L.BLUNT_Y) * n + k)
+        leftmost, rightmost = west - mean_x, east - mean_x
+        d = v8.minimum(v8.maximum(top, leftmost), rightmost)
+        left_over = v8.fmuladd(fall * d, d, budget)
+        reach = v8.sqrt(v8.maximum(left_over, zero)) * blunt
+        end = v8.fmuladd(lean, d, mean_y) + reach + half
+        end = v8.select(v8.at_least(left_over, zero), end, zero)
+        d = v8.minimum(v8.maximum(v8.negate(top), leftmost), rightmost)
+        left_over = v8.fmuladd(fall * d, d, budget)
+        reach = v8.sqrt(v8.maximum(left_over, zero)) * blunt
+        begin = v8.fmuladd(lean, d, mean_y) - reach + half
+        begin = v8.floor(v8.minimum(v8.maximum(begin, low), high))
+        end = v8.floor(v8.minimum(end, high))
+        v8.store_whole(spans, k, begin)
+        v8.store_whole(spans, n + k, v8.maximum(end, begin))
+        v8.store(starts, k, begin + half - mean_y)
+        v8.store(starts, n + k, sharp * (west - mean_x))
+        v8.store(starts, U(2) * n + k, v8.negate(sharp) * lean_x)
+        found |= v8.mask_bits(v8.greater(end, begin)) << k
+    return found & ((U(1) << count) - U(1))
 
 
 @inner()
-def list_items(staged, count, strip, spans, values, places):
-    """One item for every (row, splat), in the order of the splats; returns how many.
+def list_items(staged, found, strip, spans, starts, columns, values, places):
+    """One item for every (rows, splat), in the order of the splats; returns how many.
 
-    An item says where its row of pixels stands in the state, which splat it is, the log2 of alpha
-    on the splat's ridge in that row, and how many (sharp) pixels the row's first one is off it.
-    A tile's height is always written and the surplus overwritten, which needs no branch.
+    columns: of an item's pixels. An item is its place and splat (see PLACES); for each row there
+    are the log2 of alpha on the splat's ridge, and how many (sharp) pixels the row's first one is
+    off it. All rows of a tile are always written and the surplus overwritten: that takes no branch.
     """
-    n, items = U(BATCH), U(0)
-    half = np.float32(0.5)
-    first_x = np.float32(strip * LANES) + half
-    for k in range(count):
-        row, end = spans[k], spans[n + k]
-        sharp = staged[U(L.SHARP_X) * n + k]
-        fall = v8.splat(-staged[U(L.FALL_Y) * n + k])
-        peak = v8.splat(staged[U(L.LOG_OPACITY) * n + k])
-        start = v8.splat(sharp * (first_x - staged[k]))
-        step = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
-        y = np.float32(row) + half - staged[n + k]
-        place = np.int32(strip * STRIP) + row * np.int32(LANES)
-        for j in range(0, TILE_H, LANES):
-            dy = v8.lane_numbers() + v8.splat(y + np.float32(j))
-            at = items + U(j)
-            v8.store(values, at, v8.fmuladd(fall * dy, dy, peak))
+    n, items, each = U(BATCH), U(0), v8.rows_in(columns)
+    while found != U(0):
+        k = v8.lowest_bit(found)
+        found &= found - U(1)
+        row, end = U(spans[k]), U(spans[n + k])
+        odd = row & (each - U(1))
+        fall = v8.splat_as(columns, -staged[U(L.FALL_Y) * n + k])
+        peak = v8.splat_as(columns, staged[U(L.LOG_OPACITY) * n + k])
+        y, start = v8.splat_as(columns, starts[k]), v8.splat_as(columns, starts[n + k])
+        step = v8.splat_as(columns, starts[U(2) * n + k])
+        first = k * U(PLACES) + (strip * U(TILE_H) + row) // each
+        for j in range(U(0), U(TILE_H), U(LANES) * each):
+            table = odd * U(TILE_H) + j
+            down, half = v8.load_as(columns, _STEPS, table), v8.load_as(columns, _HALVES, table)
+            dy = down + (y + half)
+            rest = v8.fmuladd(fall * dy, dy, peak)
+            if each > U(1):
+                drawn = (odd * U(TILE_H + 1) + end - row) * U(TILE_H)
+                rest = rest + v8.load_as(columns, _UNDRAWN, drawn)
+            at = items * each + j
+            v8.store(values, at, rest)
             v8.store(values, at + U(ITEMS), v8.fmuladd(step, dy, start))
-            v8.store_ramp(places, at, np.int32(k), np.int32(0))
-            v8.store_ramp(places, at + U(ITEMS), np.int32(place + j * LANES), np.int32(LANES))
-        items += U(end - row)
+            v8.store_ramp(places, items + j // each, np.int32(first + j // each))
+        items += (end - row + odd + each - U(1)) // each
     return items
 
 
@@ -338,44 +382,50 @@ def stage_cuts(cuts, tile_splat_ids, at, count, staged, has_surfaces, lines):
 
 
 @inner()
-def list_lines(lines, kind, count, strip, spans, values):
-    """A line's value at the first pixel of every item of list_items, in its order."""
-    n, items = U(BATCH), U(0)
+def list_lines(lines, kind, found, spans, strip, columns, values):
+    """A line's value at the first pixel of every item's rows, in the order of list_items."""
+    n, items, each = U(BATCH), U(0), v8.rows_in(columns)
     half = np.float32(0.5)
-    first_x = np.float32(strip * LANES) + half
-    for k in range(count):
-        row, end = spans[k], spans[n + k]
-        down = lines[U(kind) + U(2) * n + k]
+    first_x = np.float32(strip * U(LANES)) + half
+    while found != U(0):
+        k = v8.lowest_bit(found)
+        found &= found - U(1)
+        row, end = U(spans[k]), U(spans[n + k])
+        odd = row & (each - U(1))
+        slope = lines[U(kind) + U(2) * n + k]
         start = lines[U(kind) + k] + lines[U(kind) + n + k] * first_x
-        start = start + down * (np.float32(row) + half)
-        for j in range(0, TILE_H, LANES):
-            first = v8.splat(start + down * np.float32(j))
-            v8.store(values, items + U(j), v8.fmuladd(v8.splat(down), v8.lane_numbers(), first))
-        items += U(end - row)
+        start = start + slope * (np.float32(row) + half)
+        slopes = v8.splat_as(columns, slope)
+        for j in range(U(0), U(TILE_H), U(LANES) * each):
+            table = odd * U(TILE_H) + j
+            first = v8.splat_as(columns, start) + slopes * v8.load_as(columns, _HALVES, table)
+            down = v8.load_as(columns, _STEPS, table)
+            v8.store(values, items * each + j, v8.fmuladd(slopes, down, first))
+        items += (end - row + odd + each - U(1)) // each
 
 
 @inner()
-def line_at(lines, kind, values, splat, item):
-    """A line's values at the eight pixels of an item."""
-    slope = v8.splat(lines[U(kind) + U(BATCH) + splat])
-    return v8.fmuladd(slope, v8.lane_numbers(), v8.splat(values[item]))
+def line_at(lines, kind, values, splat, item, columns):
+    """A line's values at the pixels of an item."""
+    slope = v8.splat_as(columns, lines[U(kind) + U(BATCH) + splat])
+    return v8.fmuladd(slope, columns, v8.by_row(columns, values, item))
 
 
 @inner()
-def surface_depth(lines, values, splat, item, depth, parallel):
+def surface_depth(lines, values, splat, item, columns, depth, parallel):
     """Depths of a splat's surface at an item's pixels. parallel: 1 where rays are, else 0."""
     one = np.float32(1)
-    reach = v8.splat(lines[U(REACHES) + splat])
-    farther = v8.minimum(line_at(lines, SURFACE, values, splat, item), reach)
+    reach = v8.splat_as(columns, lines[U(REACHES) + splat])
+    farther = v8.minimum(line_at(lines, SURFACE, values, splat, item, columns), reach)
     farther = v8.maximum(farther, v8.negate(reach))
-    depths = v8.fmuladd(v8.splat(parallel), farther, v8.splat(depth))
-    return depths / (v8.splat(one) - v8.splat(one - parallel) * farther)
+    depths = v8.fmuladd(v8.splat_as(columns, parallel), farther, v8.splat_as(columns, depth))
+    return depths / (v8.splat_as(columns, one) - v8.splat_as(columns, one - parallel) * farther)
 
 
 @inner()
-def kept_share(lines, values, splat, item):
-    value = line_at(lines, SHARE, values, splat, item)
-    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+def kept_share(lines, values, splat, item, columns):
+    value = line_at(lines, SHARE, values, splat, item, columns)
+    zero, one = v8.splat_as(columns, np.float32(0)), v8.splat_as(columns, np.float32(1))
     return v8.maximum(v8.minimum(value, one), zero)
 
 
@@ -434,28 +484,33 @@ def is_lit(lit, splat):
 
 
 @inner()
-def light_share(lit, staged, values, splat, item, at, limits):
-    """The share of the light at eight pixels of a splat.
+def light_share(lit, staged, splat, e, place, columns, limits):
+    """The share of the light at an item's pixels.
 
-    staged, values: list_items', of the item. at: its place in the tile's state. limits: of
-    blend; the second is log2(ALPHA_MIN), the last two 1/fx^2 and 1/fy^2.
+    e: log2 of the splat's alpha there. place: of the item (see PLACES). limits: of blend; the
+    second is log2(ALPHA_MIN), the last two 1/fx^2 and 1/fy^2.
     """
-    n, zero, one = U(BATCH), v8.splat(np.float32(0)), v8.splat(np.float32(1))
-    half = np.float32(0.5)
-    left = np.float32(at // U(STRIP) * U(LANES)) + half - staged[U(L.MEAN_X) * n + splat]
-    down = np.float32(at % U(STRIP) // U(LANES)) + half - staged[U(L.MEAN_Y) * n + splat]
-    x, y = v8.lane_numbers() + v8.splat(left), v8.splat(down)
+    n, zero = U(BATCH), v8.splat_as(columns, np.float32(0))
+    one, half = v8.splat_as(columns, np.float32(1)), np.float32(0.5)
+    row = place * v8.rows_in(columns)
+    left = np.float32(row // U(TILE_H) * U(LANES)) + half - staged[U(L.MEAN_X) * n + splat]
+    down = v8.splat_as(columns, np.float32(row % U(TILE_H)) + half) + v8.row_numbers(columns)
+    x = columns + v8.splat_as(columns, left)
+    y = down - v8.splat_as(columns, staged[U(L.MEAN_Y) * n + splat])
     # Squared distance from the mean, of that at which alpha is cut off: from the log of alpha.
     peak = staged[U(L.LOG_OPACITY) * n + splat]
-    off = v8.splat(staged[U(L.SHARP_X) * n + splat])
-    off = v8.fmuladd(off, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
-    e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
-    rim = (v8.splat(peak) - e) / v8.splat(max(peak - limits[1], _TINY))
+    span = v8.splat_as(columns, max(peak - limits[1], _TINY))
+    rim = (v8.splat_as(columns, peak) - e) / span
     rim = v8.maximum(v8.minimum(rim, one), zero)
-    lean = v8.splat(lit[U(L_LEAN_X) * n + splat]) * x + v8.splat(lit[U(L_LEAN_Y) * n + splat]) * y
-    away = v8.fmuladd(lean, lean, v8.splat(limits[6]) * y * y + v8.splat(_TINY))
-    away = v8.fmuladd(v8.splat(limits[5]) * x, x, away)
-    tilt = v8.splat(lit[U(L_X) * n + splat]) * x + v8.splat(lit[U(L_Y) * n + splat]) * y
-    share = v8.fmuladd(v8.sqrt(rim / away), tilt, v8.splat(lit[U(L_WRAP) * n + splat]))
-    share = v8.fmuladd(v8.sqrt(one - rim), v8.splat(lit[U(L_FACING) * n + splat]), share)
+    lean_x = v8.splat_as(columns, lit[U(L_LEAN_X) * n + splat])
+    lean = lean_x * x + v8.splat_as(columns, lit[U(L_LEAN_Y) * n + splat]) * y
+    away = v8.splat_as(columns, limits[6]) * y * y + v8.splat_as(columns, _TINY)
+    away = v8.fmuladd(lean, lean, away)
+    away = v8.fmuladd(v8.splat_as(columns, limits[5]) * x, x, away)
+    tilt_x = v8.splat_as(columns, lit[U(L_X) * n + splat])
+    tilt = tilt_x * x + v8.splat_as(columns, lit[U(L_Y) * n + splat]) * y
+    wrap = v8.splat_as(columns, lit[U(L_WRAP) * n + splat])
+    share = v8.fmuladd(v8.sqrt(rim / away), tilt, wrap)
+    facing = v8.splat_as(columns, lit[U(L_FACING) * n + splat])
+    share = v8.fmuladd(v8.sqrt(one - rim), facing, share)
     return v8.maximum(v8.minimum(share, one), zero)

@@ -25,6 +25,7 @@ from augment.render.cpu.geometry import (
     L_Y,
     SHADING_LINES,
     cut_eight,
+    dot,
     from_eye,
     gather3,
     height_of,
@@ -222,18 +223,22 @@ _FIELDS = COLOR_ROWS + 4
 _CUTS = _FIELDS + L.DEPTH + 1
 _LIGHTS = _CUTS + CUT
 _ROWS = _LIGHTS + SHADING_LINES
+_TIE_RUN = 4096  # places that a thread looks for ties in at a time
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
 class Parts(NamedTuple):
     """What is projected. addresses: uint64 [P, ADDRESSES], see layout. sizes: int64 [P, 2],
-    Gaussians and SH functions. first_ids: int64 [P]. views: float32 [P, VIEW]. blocks: int64
-    [B, 3], part, first and last + 1. modes: int64 [MODES].
+    Gaussians and SH functions. first_ids: int64 [P]. orders: uint64 [P], addresses of int32, the
+    Gaussian at every place of means, quats, scales and opacities; 0 where they stand in the part's
+    own order, as all else does. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and
+    last + 1 place. modes: int64 [MODES].
     """
 
     addresses: Any
     sizes: Any
     first_ids: Any
+    orders: Any
     views: Any
     blocks: Any
     modes: Any
@@ -241,7 +246,7 @@ class Parts(NamedTuple):
 
 class Splats(NamedTuple):
     """Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
-    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
+    places: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
     them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
     cuts: CUT float32 each, where modes ask for a clip; lights: LINES each, where for light.
     """
@@ -311,6 +316,8 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE]) - x + far_x, zero))
     seen = v8.both(seen, v8.at_least(y + far_y, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_SIZE + 1]) - y + far_y, zero))
+    far = v8.splat(view[L.V_FOG_FAR] * view[L.V_FOG_FAR])
+    seen = v8.both(seen, v8.at_least(far, dot(d[0], d[1], d[2], d[0], d[1], d[2])))
     height, size = height_of(d, view), v8.splat(view[L.V_EXTENT]) * longest
     seen = v8.both(seen, v8.at_least(height + size, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[L.V_CLIP_REACH]), height - size))
@@ -374,6 +381,8 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     map_count = np.int64(view[L.V_MAPS])
     maps = floats_at(addresses[part, L.A_MAPS], max(map_count, 1) * MAP)
     map_rows = shorts_at(addresses[part, L.A_ROWS], count if map_count > 1 else 1)
+    is_ordered = inputs.orders[part] != U(0)
+    order = floats_at(inputs.orders[part], count if is_ordered else 1)
     used = min(modes[L.M_FUNCTIONS], functions)
     slot = U(base)
     for at in range(U(0), U(taken), U(LANES)):
@@ -382,6 +391,8 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
             if not _touches_open(rows, lane, open_sums, rects, slot):
                 continue
             splat = picked[at + lane]
+            if is_ordered:
+                splat = np.float32(order[splat]).view(np.int32)
             record = slot * U(RECORD)
             _write_record(rows, lane, inputs.first_ids[part] + splat, records, record)
             records[record + U(L.IS_OVERLAY)] = view[L.V_OVERLAY]
@@ -405,6 +416,47 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
         counts[block, z_bin] = 0
     for i in range(U(base), slot):
         counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
+
+
+@kernel
+def order_ties(keys, slots, rects, records):
+    """Put splats of equal keys in the order of their ids. keys: sorted, slots and rects alike."""
+    runs = (keys.size + _TIE_RUN - 1) // _TIE_RUN
+    for run in prange(runs):
+        end = min((np.int64(run) + 1) * _TIE_RUN, keys.size)
+        first = np.int64(run) * _TIE_RUN
+        while 0 < first < end and keys[first] == keys[first - 1]:  # the run before has these
+            first += 1
+        while first < end:
+            last = first + 1
+            while last < keys.size and keys[last] == keys[first]:
+                last += 1
+            if last - first > 1:
+                _sort_by_id(slots, rects, records, first, last)
+            first = last
+
+
+@inner()
+def _sort_by_id(slots, rects, records, first, last):
+    """Shell's sort: equal depths come in a few rising runs, of any length."""
+    gap = 1
+    while 3 * gap < last - first:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(first + gap, last):
+            slot, rect = slots[i], rects[i]
+            number = _id_of(records, slot)
+            j = i
+            while j - gap >= first and _id_of(records, slots[j - gap]) > number:
+                slots[j], rects[j] = slots[j - gap], rects[j - gap]
+                j -= gap
+            slots[j], rects[j] = slot, rect
+        gap //= 3
+
+
+@inner()
+def _id_of(records, slot):
+    return np.float32(records[U(slot) * U(RECORD) + U(L.SPLAT_ID)]).view(np.int32)
 
 
 @inner()

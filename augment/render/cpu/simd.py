@@ -1,9 +1,13 @@
-"""Eight float32 in one register: a numba type, so that kernels say what the processor does.
+"""Eight or sixteen float32 in one register: numba types, so that kernels say what the processor
+does.
 
 A compiler's own vectoriser gives up on pixel loops for reasons that are hard to see and change with
-every release. `Float8` values are LLVM vectors instead: `+ - * /` work lane by lane, the rest are
-the functions below. No fast-math anywhere, and `fmuladd` is the only fused operation (where the
-processor has it), so the bits of a result do not depend on the code around it.
+every release. `float8` and `float16` values are LLVM vectors instead: `+ - * /` work lane by lane,
+the rest are the functions below. Those that make a vector make `float8`; the ones that are given a
+vector make one of its kind, so a kernel for `WIDE` lanes is the same source on every processor.
+
+No fast-math anywhere, and `fmuladd` is the only fused operation (where the processor has it), so
+the bits of a result depend neither on the code around it nor on how many lanes there are.
 Indices are uint64 into flat contiguous arrays; nothing checks them.
 """
 
@@ -16,56 +20,68 @@ import operator
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import types
+from numba.core import codegen, config, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from augment.render.cpu.jit import inner
 
 LANES = 8
+_AVX512 = {"+avx512f", "+avx512bw", "+avx512dq", "+avx512vl"}
+
+
+def _widest() -> int:
+    """Lanes of the widest register that numba compiles for, of 8 and 16."""
+    features = config.CPU_FEATURES
+    features = codegen.get_host_cpu_features() if features is None else features
+    return 16 if set(features.split(",")) >= _AVX512 else LANES
+
+
+WIDE = _widest()
 
 _INT = ir.IntType(32)
-_F8 = ir.VectorType(ir.FloatType(), LANES)
-_I8 = ir.VectorType(_INT, LANES)
-_B8 = ir.VectorType(ir.IntType(1), LANES)
 _SQRT_HALF = 0x3F3504F3  # bits of the float32 nearest sqrt(1/2)
 
 
-class _Float8(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="float32x8")
+class _Floats(types.Type):
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        super().__init__(name=f"float32x{lanes}")
 
 
-class _Mask8(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="boolx8")
+class _Masks(types.Type):
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        super().__init__(name=f"boolx{lanes}")
 
 
-float8, mask8 = _Float8(), _Mask8()
+float8, float16 = _Floats(8), _Floats(16)
 
 
-@register_model(_Float8)
-class _Float8Model(models.PrimitiveModel):
+@register_model(_Floats)
+class _FloatsModel(models.PrimitiveModel):
     def __init__(self, manager, kind) -> None:
-        super().__init__(manager, kind, _F8)
+        super().__init__(manager, kind, ir.VectorType(ir.FloatType(), kind.lanes))
 
 
-@register_model(_Mask8)
-class _Mask8Model(models.PrimitiveModel):
+@register_model(_Masks)
+class _MasksModel(models.PrimitiveModel):
     def __init__(self, manager, kind) -> None:
-        super().__init__(manager, kind, _B8)
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.lanes))
 
 
 def _add_operator(op, method: str) -> None:
-    """Let kernels write `float8 op float8` for one instruction of the LLVM builder."""
+    """Let kernels write `vector op vector` for one instruction of the LLVM builder."""
 
     @infer_global(op)
     class _Typing(ConcreteTemplate):
-        cases = [signature(float8, float8, float8)]  # noqa: RUF012 - numba's way
+        cases = [signature(kind, kind, kind) for kind in (float8, float16)]  # noqa: RUF012 - numba's way
 
-    @lower_builtin(op, float8, float8)
-    def _lower(context, builder, sig, args):
-        return getattr(builder, method)(*args)
+    for kind in (float8, float16):
+
+        @lower_builtin(op, kind, kind)
+        def _lower(context, builder, sig, args):
+            return getattr(builder, method)(*args)
 
 
 for _op, _method in (
@@ -82,57 +98,171 @@ def _pointer(context, builder, array_type, array, index):
     return builder.gep(data, [index])
 
 
-def _all(value):
-    return ir.Constant(_I8, [value] * LANES)
+def _floats(lanes: int) -> ir.VectorType:
+    return ir.VectorType(ir.FloatType(), lanes)
 
 
-def _broadcast(builder, value, kind):
+def _like(value, numbers):
+    """A constant for each lane of a vector: the same number, or numbers lane by lane. Floats for
+    float numbers, else int32.
+    """
+    lanes = value.type.count
+    numbers = list(numbers) if hasattr(numbers, "__iter__") else [numbers] * lanes
+    kind = ir.FloatType() if isinstance(numbers[0], float) else _INT
+    return ir.Constant(ir.VectorType(kind, lanes), numbers)
+
+
+def _bits(builder, value):
+    return builder.bitcast(value, ir.VectorType(_INT, value.type.count))
+
+
+def _numbers(builder, value):
+    return builder.bitcast(value, _floats(value.type.count))
+
+
+def _broadcast(builder, value, lanes):
+    kind = ir.VectorType(value.type, lanes)
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, _INT(0))
-    return builder.shuffle_vector(first, undefined, _all(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, lanes), None))
 
 
 def _call(builder, name: str, args):
-    kind = ir.FunctionType(_F8, [_F8] * len(args))
-    function = builder.module.declare_intrinsic(f"llvm.{name}.v8f32", (), kind)
+    kind = args[0].type
+    function = builder.module.declare_intrinsic(
+        f"llvm.{name}.v{kind.count}f32", (), ir.FunctionType(kind, [kind] * len(args))
+    )
     return builder.call(function, args)
+
+
+def _load(lanes: int):
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[-2], *args[-2:])
+        return builder.load(builder.bitcast(at, _floats(lanes).as_pointer()), align=4)
+
+    return codegen
 
 
 @intrinsic
 def load(typingctx, array, index):
     """array[index : index + 8]."""
+    return float8(array, types.uint64), _load(LANES)
 
-    def codegen(context, builder, sig, args):
-        at = _pointer(context, builder, sig.args[0], *args)
-        return builder.load(builder.bitcast(at, _F8.as_pointer()), align=4)
 
-    return float8(array, types.uint64), codegen
+@intrinsic
+def load_as(typingctx, vector, array, index):
+    """array[index : index + lanes], as many as the vector has."""
+    return vector(vector, array, types.uint64), _load(vector.lanes)
 
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """array[index : index + 8] = value."""
+    """array[index : index + lanes] = value."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
-        builder.store(args[2], builder.bitcast(at, _F8.as_pointer()), align=4)
+        builder.store(args[2], builder.bitcast(at, args[2].type.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.uint64, float8), codegen
+    return types.void(array, types.uint64, value), codegen
 
 
 @intrinsic
-def store_ramp(typingctx, array, index, start, step):
-    """array[index : index + 8] = start + step * (0 ... 7), for an int32 array."""
+def store_whole(typingctx, array, index, value):
+    """array[index : index + lanes] = value without its fraction, for an int32 array."""
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
-        start, step = (_broadcast(builder, value, _I8) for value in args[2:])
-        ramp = builder.mul(step, ir.Constant(_I8, list(range(LANES))))
-        builder.store(builder.add(start, ramp), builder.bitcast(at, _I8.as_pointer()), align=4)
+        whole = builder.fptosi(args[2], ir.VectorType(_INT, args[2].type.count))
+        builder.store(whole, builder.bitcast(at, whole.type.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.uint64, types.int32, types.int32), codegen
+    return types.void(array, types.uint64, value), codegen
+
+
+@intrinsic
+def store_ramp(typingctx, array, index, start):
+    """array[index : index + 8] = start + (0 ... 7), for an int32 array."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args[:2])
+        start = _broadcast(builder, args[2], LANES)
+        ramp = builder.add(start, _like(start, range(LANES)))
+        builder.store(ramp, builder.bitcast(at, ramp.type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, types.int32), codegen
+
+
+@intrinsic
+def turn(typingctx, vector, array, rows, first, last, turned, at):
+    """turned[field, at + lane] = array[rows[first + lane], field] for 16 fields and all lanes.
+
+    array: flat, rows of 16. rows: int32; the last one is taken where there are no more. turned:
+    flat, rows of 32.
+    """
+    lanes = vector.lanes
+
+    def codegen(context, builder, sig, args):
+        wide, kind = ir.IntType(64), _floats(lanes).as_pointer()
+        starts = []
+        for lane in range(lanes):
+            number = builder.add(args[3], wide(lane))
+            is_last = builder.icmp_unsigned(">", number, args[4])
+            number = builder.select(is_last, args[4], number)
+            row = builder.load(_pointer(context, builder, sig.args[2], args[2], number))
+            starts.append(builder.shl(builder.zext(row, wide), wide(4)))
+        for field in range(0, 16, lanes):
+            values = []
+            for start in starts:
+                index = builder.add(start, wide(field))
+                pointer = _pointer(context, builder, sig.args[1], args[1], index)
+                values.append(builder.load(builder.bitcast(pointer, kind), align=4))
+            for k, value in enumerate(_transposed(builder, values)):
+                index = builder.add(args[6], wide(32 * (field + k)))
+                pointer = _pointer(context, builder, sig.args[5], args[5], index)
+                builder.store(value, builder.bitcast(pointer, kind), align=4)
+        return context.get_dummy_value()
+
+    number = types.uint64
+    return types.void(vector, array, rows, number, number, turned, number), codegen
+
+
+def _transposed(builder, rows):
+    """A square of as many vectors as they have lanes. Every step is one instruction of AVX."""
+    lanes = len(rows)
+
+    def pick(left, right, numbers):
+        return builder.shuffle_vector(left, right, _like(left, numbers))
+
+    def weave(left, right, width, half):
+        """Of every four lanes a half of both, in turns of so many lanes."""
+        numbers = [
+            block + 2 * half + turn * width + k + side * lanes
+            for block in range(0, lanes, 4)
+            for turn in range(2 // width)
+            for side in range(2)
+            for k in range(width)
+        ]
+        return pick(left, right, numbers)
+
+    groups = []  # for each four rows, their columns k, k + 4, ... as fours of lanes in vector k
+    for i in range(0, lanes, 4):
+        pairs = [weave(*rows[j : j + 2], 1, half) for j in (i, i + 2) for half in range(2)]
+        groups.append(
+            [weave(pairs[k], pairs[k + 2], 2, half) for k in range(2) for half in range(2)]
+        )
+    while len(groups) > 1:  # the even, then the odd fours of two
+        fours = [[n for n in range(2 * lanes) if n // 4 % 2 == odd] for odd in range(2)]
+        groups = [
+            [
+                pick(left, right, numbers)
+                for numbers in fours
+                for left, right in zip(*pair, strict=True)
+            ]
+            for pair in zip(groups[::2], groups[1::2], strict=True)
+        ]
+    return groups[0]
 
 
 @intrinsic
@@ -141,7 +271,7 @@ def gather(typingctx, array, rows, first, stride, column):
 
     def codegen(context, builder, sig, args):
         wide = ir.IntType(64)
-        value = ir.Constant(_F8, ir.Undefined)
+        value = ir.Constant(_floats(LANES), ir.Undefined)
         for lane in range(LANES):
             at = builder.add(args[2], wide(lane))
             row = builder.load(_pointer(context, builder, sig.args[1], args[1], at))
@@ -154,14 +284,19 @@ def gather(typingctx, array, rows, first, stride, column):
 
 
 def _operation(result, *kinds):
-    """Makes a function for kernels of emit(builder, *values), which writes its instructions."""
+    """Makes a function for kernels of emit(builder, *values), which writes its instructions.
+
+    _Floats and _Masks among the kinds are of as many lanes as the vectors that it is given.
+    """
 
     def wrap(emit):
         def codegen(context, builder, sig, args):
             return emit(builder, *args)
 
         def define(typingctx, *values):
-            return result(*kinds), codegen
+            lanes = next((value.lanes for value in values if hasattr(value, "lanes")), None)
+            found = [kind(lanes) if isinstance(kind, type) else kind for kind in (result, *kinds)]
+            return found[0](*found[1:]), codegen
 
         names = ("typingctx", *"abcdefgh"[: len(kinds)])
         define.__name__ = emit.__name__
@@ -173,12 +308,17 @@ def _operation(result, *kinds):
     return wrap
 
 
-_unary, _binary = _operation(float8, float8), _operation(float8, float8, float8)
-_ternary, _comparison = _operation(float8, *[float8] * 3), _operation(mask8, float8, float8)
+_unary, _binary = _operation(_Floats, _Floats), _operation(_Floats, _Floats, _Floats)
+_ternary, _comparison = _operation(_Floats, *[_Floats] * 3), _operation(_Masks, _Floats, _Floats)
 
-# The same number in all lanes; 0, 1, ... 7; a b + c, rounded once.
-splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, _F8))
-lane_numbers = _operation(float8)(lambda b: ir.Constant(_F8, [float(i) for i in range(LANES)]))
+# The same number in all lanes, of eight or of the vector's; 0, 1, ... 7; a b + c, rounded once.
+splat = _operation(float8, types.float32)(lambda b, value: _broadcast(b, value, LANES))
+splat_as = _operation(_Floats, _Floats, types.float32)(
+    lambda b, vector, value: _broadcast(b, value, vector.type.count)
+)
+lane_numbers = _operation(float8)(
+    lambda b: ir.Constant(_floats(LANES), [*map(float, range(LANES))])
+)
 fmuladd = _ternary(lambda b, *args: _call(b, "fmuladd", args))
 sqrt = _unary(lambda b, value: _call(b, "sqrt", [value]))
 floor = _unary(lambda b, value: _call(b, "floor", [value]))
@@ -189,21 +329,72 @@ maximum = _binary(lambda b, *args: b.select(b.fcmp_ordered(">", *args), *args))
 # Lanes where a > b, or a >= b; never where either is NaN. Lanes that are in both masks.
 greater = _comparison(lambda b, *args: b.fcmp_ordered(">", *args))
 at_least = _comparison(lambda b, *args: b.fcmp_ordered(">=", *args))
-both = _operation(mask8, mask8, mask8)(lambda b, *masks: b.and_(*masks))
+both = _operation(_Masks, _Masks, _Masks)(lambda b, *masks: b.and_(*masks))
 # a in the lanes of the mask, b in the others: select(mask, a, b).
-select = _operation(float8, mask8, float8, float8)(lambda b, *args: b.select(*args))
+select = _operation(_Floats, _Masks, _Floats, _Floats)(lambda b, *args: b.select(*args))
+# One bit for each lane of a mask.
+mask_bits = _operation(types.uint64, _Masks)(
+    lambda b, mask: b.zext(b.bitcast(mask, ir.IntType(mask.type.count)), ir.IntType(64))
+)
+# The number of the lowest bit that is set; there must be one.
+lowest_bit = _operation(types.uint64, types.uint64)(lambda b, bits: b.cttz(bits, ir.IntType(1)(1)))
+
+# ---- Pixels of a register: eight columns, of one row or, sixteen of them, of two rows in turn ----
+
+ROWS = WIDE // LANES
+wide_columns = _operation(_Floats(WIDE))(
+    lambda b: ir.Constant(_floats(WIDE), [float(i // ROWS) for i in range(WIDE)])
+)
+# Of a vector's lanes: their column; how many rows there are, and which is a lane's.
+rows_in = _operation(types.uint64, _Floats)(
+    lambda b, vector: ir.IntType(64)(vector.type.count // LANES)
+)
+row_numbers = _unary(
+    lambda b, vector: _like(
+        vector, [float(i % (vector.type.count // LANES)) for i in range(vector.type.count)]
+    )
+)
+
+
+@intrinsic
+def load_row(typingctx, vector, array, index):
+    """One row of a vector that begins at array[index]: index is its place plus the row."""
+    lanes, load_lanes = vector.lanes, _load(vector.lanes)
+
+    def codegen(context, builder, sig, args):
+        value = load_lanes(context, builder, sig, args)
+        mask = ir.Constant(ir.VectorType(_INT, LANES), [*range(0, lanes, lanes // LANES)])
+        return builder.shuffle_vector(value, value, mask)
+
+    return float8(vector, array, types.uint64), codegen
+
+
+@intrinsic
+def by_row(typingctx, vector, array, index):
+    """array[index] in every lane, or, of two rows, array[2 index] and array[2 index + 1]."""
+    lanes = vector.lanes
+
+    def codegen(context, builder, sig, args):
+        rows = lanes // LANES
+        index = builder.mul(args[2], ir.IntType(64)(rows))
+        at = _pointer(context, builder, sig.args[1], args[1], index)
+        kind = ir.FloatType() if rows == 1 else ir.DoubleType()
+        value = builder.load(builder.bitcast(at, kind.as_pointer()), align=4)
+        return builder.bitcast(_broadcast(builder, value, lanes // rows), _floats(lanes))
+
+    return vector(vector, array, types.uint64), codegen
 
 
 @_unary
 def minus_abs(builder, value):
     """-|a|: a with its sign bit set."""
-    return builder.bitcast(builder.or_(builder.bitcast(value, _I8), _all(-(2**31))), _F8)
+    return _numbers(builder, builder.or_(_bits(builder, value), _like(value, -(2**31))))
 
 
 @_unary
 def absolute(builder, value):
     """|a|: a with its sign bit clear."""
-    return builder.bitcast(builder.and_(builder.bitcast(value, _I8), _all(2**31 - 1)), _F8)
+    return _numbers(builder, builder.and_(_bits(builder, value), _like(value, 2**31 - 1)))
 
 
 @_operation(float8, *[float8] * LANES)
@@ -211,9 +402,7 @@ def totals(builder, *rows):
     """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
 
     def fold(left, right, low, high):
-        halves = [
-            builder.shuffle_vector(left, right, ir.Constant(_I8, lanes)) for lanes in (low, high)
-        ]
+        halves = [builder.shuffle_vector(left, right, _like(left, lanes)) for lanes in (low, high)]
         return builder.fadd(*halves)
 
     pairs = [
@@ -225,6 +414,11 @@ def totals(builder, *rows):
         for i in (0, 2)
     ]
     return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
+
+
+@_operation(types.float32, float8, types.uint64)
+def lane(builder, value, number):
+    return builder.extract_element(value, number)
 
 
 # ---- Pixels of three colours, which lie one after the other --------------------------------------
@@ -243,9 +437,9 @@ def _blend(builder, values, choose):
     """Lane by lane the value that `choose` names."""
     pairs = [choose(lane) for lane in range(LANES)]
     two = [lane + LANES * (pick == 1) for lane, pick in enumerate(pairs)]
-    mixed = builder.shuffle_vector(*values[:2], ir.Constant(_I8, two))
+    mixed = builder.shuffle_vector(*values[:2], _like(values[0], two))
     three = [lane + LANES * (pick == 2) for lane, pick in enumerate(pairs)]
-    return builder.shuffle_vector(mixed, values[2], ir.Constant(_I8, three))
+    return builder.shuffle_vector(mixed, values[2], _like(mixed, three))
 
 
 @intrinsic
@@ -254,12 +448,14 @@ def load_colours(typingctx, array, index):
     kind = types.UniTuple(float8, 3)
 
     def codegen(context, builder, sig, args):
-        at = builder.bitcast(_pointer(context, builder, sig.args[0], *args), _F8.as_pointer())
+        at = builder.bitcast(
+            _pointer(context, builder, sig.args[0], *args), _floats(LANES).as_pointer()
+        )
         rows = [builder.load(builder.gep(at, [_INT(k)]), align=4) for k in range(3)]
         sorted_rows = []
         for colour in range(3):
             mixed = _blend(builder, rows, lambda lane, c=colour: _owner(c, lane))
-            lanes = ir.Constant(_I8, _MIXED[colour])
+            lanes = _like(mixed, _MIXED[colour])
             sorted_rows.append(builder.shuffle_vector(mixed, mixed, lanes))
         return context.make_tuple(builder, kind, sorted_rows)
 
@@ -272,11 +468,11 @@ def store_colours(typingctx, array, index, red, green, blue):
 
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args[:2])
-        at = builder.bitcast(at, _F8.as_pointer())
+        at = builder.bitcast(at, _floats(LANES).as_pointer())
         mixed = []
         for colour, value in enumerate(args[2:]):
             lanes = [_MIXED[colour].index(lane) for lane in range(LANES)]
-            mixed.append(builder.shuffle_vector(value, value, ir.Constant(_I8, lanes)))
+            mixed.append(builder.shuffle_vector(value, value, _like(value, lanes)))
         for k in range(3):
             own = [next(c for c in range(3) if _owner(c, lane) == k) for lane in range(LANES)]
             row = _blend(builder, mixed, lambda lane, own=own: own[lane])
@@ -286,56 +482,59 @@ def store_colours(typingctx, array, index, red, green, blue):
     return types.void(array, types.uint64, float8, float8, float8), codegen
 
 
-@_operation(types.boolean, float8)
+@_operation(types.boolean, _Floats)
 def any_not_negative(builder, value):
     """Whether the sign bit of any lane is clear."""
-    clear = builder.icmp_signed(">=", builder.bitcast(value, _I8), _all(0))
-    return builder.icmp_unsigned("!=", builder.bitcast(clear, ir.IntType(8)), ir.IntType(8)(0))
-
-
-@_binary
-def add_exponent(builder, *args):
-    """a 2**k, where k stands in the low bits of b's bit pattern; overflow is not looked for."""
-    bits, power = (builder.bitcast(arg, _I8) for arg in args)
-    return builder.bitcast(builder.add(bits, builder.shl(power, _all(23))), _F8)
+    whole = ir.IntType(value.type.count)
+    clear = builder.icmp_signed(">=", _bits(builder, value), _like(value, 0))
+    return builder.icmp_unsigned("!=", builder.bitcast(clear, whole), whole(0))
 
 
 def _exponent_bits(builder, value):
-    above = builder.sub(builder.bitcast(value, _I8), _all(_SQRT_HALF))
-    return builder.ashr(above, _all(23))
+    above = builder.sub(_bits(builder, value), _like(value, _SQRT_HALF))
+    return builder.ashr(above, _like(value, 23))
 
 
 @_unary
 def exponent(builder, value):
     """The k for which a / 2**k lies in [sqrt(1/2), sqrt(2)); a > 0 and normal."""
-    return builder.sitofp(_exponent_bits(builder, value), _F8)
+    return builder.sitofp(_exponent_bits(builder, value), value.type)
 
 
 @_unary
 def mantissa(builder, value):
     """a / 2**exponent(a)."""
-    power = builder.shl(_exponent_bits(builder, value), _all(23))
-    return builder.bitcast(builder.sub(builder.bitcast(value, _I8), power), _F8)
+    power = builder.shl(_exponent_bits(builder, value), _like(value, 23))
+    return _numbers(builder, builder.sub(_bits(builder, value), power))
+
+
+def _prefetch(to_write: int):
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args)
+        kind = ir.FunctionType(ir.VoidType(), [at.type, _INT, _INT, _INT])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [at.type], kind)
+        builder.call(function, [at, _INT(to_write), _INT(3), _INT(1)])  # to keep, data
+        return context.get_dummy_value()
+
+    return codegen
 
 
 @intrinsic
 def prefetch(typingctx, array, index):
     """Ask for the cache line of array[index] before it is needed."""
+    return types.void(array, types.uint64), _prefetch(0)
 
-    def codegen(context, builder, sig, args):
-        at = _pointer(context, builder, sig.args[0], *args)
-        kind = ir.FunctionType(ir.VoidType(), [at.type, _INT, _INT, _INT])
-        function = builder.module.declare_intrinsic("llvm.prefetch", [at.type], kind)
-        builder.call(function, [at, _INT(0), _INT(3), _INT(1)])  # to read, to keep, data
-        return context.get_dummy_value()
 
-    return types.void(array, types.uint64), codegen
+@intrinsic
+def prefetch_to_write(typingctx, array, index):
+    """Likewise, before it is written."""
+    return types.void(array, types.uint64), _prefetch(1)
 
 
 # ---- What the CPU kernels need beyond arithmetic: exponentials, logarithms, arrays by address ----
 
 LOG2_E = np.float32(math.log2(math.e))
-_ROUND = np.float32(1.5 * 2**23)  # adding it leaves the nearest integer in the low bits
+_ROUND = 1.5 * 2**23  # adding it leaves the nearest integer in the low bits
 # 2**x on [-0.5, 0.5], least maximal relative error (2.6e-6), lowest power first.
 _COARSE = tuple(
     np.float32(c) for c in (0.999999261, 0.693121815, 0.240247448, 0.0559178609, 0.00957010198)
@@ -348,32 +547,54 @@ _FINE = tuple(
 _LOG1, _LOG3, _LOG5, _LOG7 = (np.float32(2 / math.log(2) / n) for n in (1, 3, 5, 7))
 
 
-@inner()
-def exp2(x):
-    """2**x, eight at once, for |x| <= 126; any bits at all elsewhere. Relative error 3e-6."""
-    shifted = x + splat(_ROUND)
-    f = x - (shifted - splat(_ROUND))
-    p = fmuladd(splat(_COARSE[4]), f, splat(_COARSE[3]))
-    p = fmuladd(p, f, splat(_COARSE[2]))
-    p = fmuladd(p, f, splat(_COARSE[1]))
-    return add_exponent(fmuladd(p, f, splat(_COARSE[0])), shifted)
+def _emit_exp2(builder, coefficients, x, mask=None):
+    """coefficients: of 2**x on [-0.5, 0.5]. Zero where a mask is given and a lane is not in it.
+
+    With AVX-512, what lies between x and the nearest integer, and a scaling by 2**k, are one
+    instruction each, with the same bits. Lanes outside the mask must not be scaled: numbers below
+    2**-126 would cost a hundred times as much.
+    """
+    lanes = x.type.count
+    fused = lanes == 16
+    if fused:
+        f = _avx512(builder, "reduce", [x, _INT(8)])  # 8: from the nearest, no exceptions
+        power = builder.fsub(x, f)
+    else:
+        power = builder.fadd(x, _like(x, _ROUND))
+        f = builder.fsub(x, builder.fsub(power, _like(x, _ROUND)))
+    p = _like(x, float(coefficients[-1]))
+    for coefficient in coefficients[-2::-1]:
+        p = _call(builder, "fmuladd", [p, f, _like(x, float(coefficient))])
+    if fused:
+        return _avx512(builder, "scalef", [p, power], mask)
+    power = builder.shl(_bits(builder, power), _like(x, 23))
+    scaled = _numbers(builder, builder.add(_bits(builder, p), power))
+    return scaled if mask is None else builder.select(mask, scaled, _like(x, 0.0))
 
 
-@inner()
-def exp2_fine(x):
-    """2**x as `exp2`, to float32's precision and exact at 0."""
-    shifted = x + splat(_ROUND)
-    f = x - (shifted - splat(_ROUND))
-    p = fmuladd(splat(_FINE[5]), f, splat(_FINE[4]))
-    p = fmuladd(p, f, splat(_FINE[3]))
-    p = fmuladd(p, f, splat(_FINE[2]))
-    p = fmuladd(p, f, splat(_FINE[1]))
-    return add_exponent(fmuladd(p, f, splat(_FINE[0])), shifted)
+def _avx512(builder, name: str, args, mask=None):
+    """An instruction of AVX-512 on sixteen floats; 0 in lanes outside the mask."""
+    kind, short = args[0].type, ir.IntType(16)
+    mask = short(-1) if mask is None else builder.bitcast(mask, short)
+    args = [*args, _like(args[0], 0.0), mask, _INT(4)]  # 4: round as always
+    function = builder.module.declare_intrinsic(
+        f"llvm.x86.avx512.mask.{name}.ps.512", (), ir.FunctionType(kind, [a.type for a in args])
+    )
+    return builder.call(function, args)
+
+
+# 2**x for |x| <= 126; any bits at all elsewhere. Relative error 3e-6; the second, 0 outside a mask.
+exp2 = _unary(lambda b, x: _emit_exp2(b, _COARSE, x))
+exp2_where = _operation(_Floats, _Masks, _Floats)(
+    lambda b, mask, x: _emit_exp2(b, _COARSE, x, mask)
+)
+# Likewise to float32's precision and exact at 0.
+exp2_fine = _unary(lambda b, x: _emit_exp2(b, _FINE, x))
 
 
 @inner()
 def log2(x):
-    """Base-2 logarithm, eight at once, for normal x > 0; error below 2e-7 (1 + |result|)."""
+    """Base-2 logarithm, of eight, for normal x > 0; error below 2e-7 (1 + |result|)."""
     one = splat(np.float32(1))
     m = mantissa(x)
     s = (m - one) / (m + one)

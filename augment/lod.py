@@ -1,0 +1,502 @@
+"""Levels of detail: far splats merged once a scene, and which of them a camera takes.
+
+The ground is cut into squares. Level 0 of a square holds its own splats; level k holds, for a
+square of twice the side, what is left when the splats of level k - 1 that share a cell of
+c_k = c_1 2^(k-1) are merged. So a square of any level holds about as many splats, and squares are
+the nodes of a quadtree. Of a camera of focal length f, level k serves what lies at least
+
+    d_k = f c_k / lod_px
+
+away: a cell is no larger than lod_px pixels there. From d_k to (1 + BAND) d_k a square fades into
+the one that holds it: of shares w and 1 - w, a splat of opacity o has 1 - (1 - o)^w, so that
+transmittances, which multiply, stay those of one level. Distances are Euclidean, and a square's is
+never below that of the square that holds it: shares add up to 1, follow the camera's place without
+a step, and stay as they are when it turns.
+
+Merging keeps the moments of the mixture (weights: opacity times surface; splats that are larger
+than the cell stay as they are), its mean colour,
+
+    mu = sum w_i mu_i,    Sigma = sum w_i (Sigma_i + (mu_i - mu)(mu_i - mu)^T),
+
+and what its splats cover together of the plane that they lie in, as wide as the rasteriser's blur
+makes them where the level serves. Where this takes a flat top, the opacity is above 1: alpha is
+min(alpha_max, o exp(-sigma)). (Kerbl et al. 2024, "A Hierarchical 3D Gaussian Representation for
+Real-Time Rendering of Very Large Datasets", section 4.1, weighs so, and has such opacities.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from augment import kernels
+from augment.bounds import Bounds, may_show
+from augment.cameras import Camera
+from augment.errors import SceneError
+from augment.geometry import quat_from_rotmat, rotmat_from_quat
+from augment.memo import memo_of
+from augment.render.buffers import SPLAT_IDS, RenderOutput
+from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, PosedGaussians, is_drawable
+from augment.semantics import SemanticClass
+
+MIN_SPLATS = 20_000  # a part with fewer is drawn as it is
+CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # c_1: the first whose cells are a third of the splats
+CELLS_ACROSS = 64  # of c_1 along a square of level 0
+MAX_LEVELS, FEW_SQUARES = 12, 4  # no further level where so few are left
+BAND = 0.25
+# A pixel is 1 to 2 cells where a level serves with lod_px = 1. The blur's deviation, in cells:
+BLUR_CELLS = math.sqrt(2 * COV2D_BLUR)
+FLAT_TOP = 2.0  # a flat top covers this many times what the deviations say; beyond it they grow
+MAX_OPACITY = math.exp(FLAT_TOP - 1)
+THINNEST_M = 1e-4
+BATCH = 1 << 18  # splats merged at once
+_ODD = np.uint64(0x9E3779B97F4A7C15)
+_BIAS = 1 << 21  # half the squares that keys can tell apart along an axis
+_SPREAD = ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
+           (2, 0x3333333333333333), (1, 0x5555555555555555))  # fmt: skip
+_LEVELS = ("levels of detail",)  # where a memo has them
+_STORED = (*_LEVELS, False)
+_COLUMNS = ("means", "quats", "scales", "opacities", "sh")
+
+
+# ---- What levels are -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """S squares of a level, along a Z-curve.
+
+    keys [S]: increasing; those of the next level are these without their last two bits. starts
+    [S + 1]: the splats of each. lows, highs [S, 3]: around the means of level 0 in it, metres.
+    longest [S]: the largest standard deviation of its splats.
+    """
+
+    keys: Int64[np.ndarray, "S"]
+    starts: Int64[np.ndarray, "_"]
+    lows: Float[np.ndarray, "S 3"]
+    highs: Float[np.ndarray, "S 3"]
+    longest: Float[np.ndarray, "S"]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Splats, square after square. stands_for [N]: the part's own splat whose number and class each
+    has. unchecked: the file that they come from, whose numbers are looked at when they are taken.
+    splats: of the part, where it is unchecked.
+    """
+
+    gaussians: Gaussians
+    stands_for: Int32[np.ndarray, "N"]
+    squares: Squares
+    unchecked: str | None = None
+    splats: int = 0
+    _taken: dict[int, Gaussians] = field(default_factory=dict)
+
+    def take(self, square: int) -> Gaussians:
+        """The splats of a square: one object as long as there is the level."""
+        if square not in self._taken:
+            rows = self.rows(square)
+            found = rows_of(self.gaussians, rows)
+            if self.unchecked is not None and len(found):
+                numbers = self.stands_for[rows]
+                is_own = numbers.min() >= 0 and numbers.max() < self.splats
+                _check(found, bool(is_own), f"{self.unchecked}: square {square}")
+            self._taken[square] = found
+        return self._taken[square]
+
+    def rows(self, square: int) -> slice:
+        first, end = self.squares.starts[square : square + 2].tolist()
+        return slice(first, end)
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Of a part, the finest first. finest_m: c_1."""
+
+    finest_m: float
+    levels: tuple[Level, ...]
+
+    def cell_m(self, number: int) -> float:
+        return self.finest_m * 2.0 ** (number - 1)
+
+
+def rows_of(g: Gaussians, rows: slice) -> Gaussians:
+    """A piece of the Gaussians that copies nothing."""
+    means, quats, scales, opacities, sh = (getattr(g, name).detach()[rows] for name in _COLUMNS)
+    semantic = None if g.semantic is None else g.semantic[rows]
+    return Gaussians(means, quats, scales, opacities, sh, semantic)
+
+
+def _check(g: Gaussians, is_numbered: bool, where: str) -> None:
+    usual = replace(g, opacities=g.opacities.clamp(max=1))
+    classes = [0] if g.semantic is None else [int(g.semantic.min()), int(g.semantic.max())]
+    is_classed = min(SemanticClass) <= min(classes) and max(classes) <= max(SemanticClass)
+    is_clear = float(g.opacities.max()) <= MAX_OPACITY * (1 + 1e-6)
+    if not (is_numbered and is_classed and is_clear and is_drawable(usual)):
+        raise SceneError(
+            f"{where} holds Gaussians that cannot be drawn: NaN or infinite values, quaternions "
+            f"that are not of length 1, scales <= 0, opacities outside [0, {MAX_OPACITY:.4g}], "
+            f"coordinates that are too large, or classes or splats that there are not; write the "
+            f"scene again"
+        )
+
+
+def check_background(gaussians: Gaussians) -> None:
+    """Look at all numbers of a background that lies in a file with its levels, once.
+
+    Raises:
+        SceneError: some cannot be drawn.
+    """
+    memo = memo_of(gaussians)
+    if memo.known(_STORED):
+
+        def look() -> bool:
+            level = levels_of(gaussians).levels[0]
+            return all(len(level.take(square)) >= 0 for square in range(len(level.squares)))
+
+        memo.get(("looked at",), look)
+
+
+# ---- Merging -------------------------------------------------------------------------------------
+
+
+class Piece(NamedTuple):
+    """Splats of some squares, what each stands for, and the key of its square."""
+
+    gaussians: Gaussians
+    stands_for: Int32[np.ndarray, "N"]
+    keys: Int64[np.ndarray, "N"]
+
+
+def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
+    """The levels of a part, made once for these Gaussians."""
+    return memo_of(gaussians).get(
+        (*_LEVELS, antialiased), lambda: build_levels(gaussians, antialiased=antialiased)
+    )
+
+
+def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
+    """Let `levels_of` know levels that lie in a file. levels: must not hold this object."""
+    memo_of(gaussians).put(_STORED, levels, shared=True)
+
+
+def join_pieces(pieces: Iterable[Piece]) -> Piece:
+    """All pieces in memory."""
+    gaussians, stands_for, keys = zip(*pieces, strict=True)
+    own = {name: torch.cat([getattr(g, name) for g in gaussians]) for name in _COLUMNS}
+    classes = [g.semantic for g in gaussians if g.semantic is not None]
+    joined = Gaussians(**own, semantic=torch.cat(classes) if classes else None)
+    return Piece(joined, np.concatenate(stands_for), np.concatenate(keys))
+
+
+def build_levels(
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    keep: Callable[[Iterable[Piece]], Piece] = join_pieces,
+) -> Levels:
+    """The levels of one Gaussian or more. Level 0 is a copy, unless they lie square after square
+    already.
+
+    antialiased: for a rasteriser whose blur takes no more of the image. keep: where a level lies.
+    """
+    own = rows_of(gaussians, slice(None))
+    finest_m, order, keys = square_order(own)
+    found = Piece(own, order.astype(np.int32), keys)
+    if not (np.diff(found.stands_for) == 1).all():
+        found = keep(
+            Piece(own.select(torch.from_numpy(order[rows])), *(v[rows] for v in found[1:]))
+            for rows in batches(len(order))
+        )
+    levels = [Level(found.gaussians, found.stands_for, squares_of(found.gaussians, found.keys))]
+    while len(levels[-1].squares) > FEW_SQUARES and len(levels) <= MAX_LEVELS:
+        cell_m = finest_m * 2.0 ** (len(levels) - 1)
+        found = keep(coarser(levels[-1], cell_m, antialiased=antialiased))
+        squares = squares_of(found.gaussians, found.keys, levels[-1].squares)
+        levels.append(Level(found.gaussians, found.stands_for, squares))
+    return Levels(finest_m, tuple(levels))
+
+
+def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.ndarray, "N"]]:
+    """c_1; the splats square after square of level 0, each one's in their order; their squares."""
+    finest_m = finest_cell_m(g.means)
+    keys = square_keys(g.means, finest_m * CELLS_ACROSS)
+    order = np.argsort(keys, kind="stable")
+    return finest_m, order, keys[order]
+
+
+def batches(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + BATCH, count)) for first in range(0, count, BATCH))
+
+
+def finest_cell_m(means: Float[Tensor, "N 3"]) -> float:
+    """c_1: by a sixteenth of the cells and all splats in them."""
+    for cell_m in CELLS_M:
+        sampled = []
+        for rows in batches(len(means)):
+            cells = np.floor(means[rows].double().numpy() / cell_m).astype(np.int64) & (_BIAS - 1)
+            numbers = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]  # 63 bits
+            sampled.append(numbers[(numbers.astype(np.uint64) * _ODD) >> np.uint64(60) == 0])
+        numbers = np.concatenate(sampled)
+        if 3 * len(np.unique(numbers)) <= len(numbers):
+            return cell_m
+    return CELLS_M[-1]
+
+
+def square_keys(means: Float[Tensor, "N 3"], side_m: float) -> Int64[np.ndarray, "N"]:
+    """The square of each mean, along a Z-curve."""
+    keys = np.empty(len(means), np.int64)
+    for rows in batches(len(means)):
+        xy = np.floor(means[rows, :2].double().numpy() / side_m)
+        bits = (np.clip(xy, -_BIAS, _BIAS - 1).astype(np.int64) + _BIAS).astype(np.uint64)
+        for shift, mask in _SPREAD:
+            bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+        keys[rows] = (bits[:, 0] | (bits[:, 1] << np.uint64(1))).astype(np.int64)
+    return keys
+
+
+def squares_of(g: Gaussians, keys: np.ndarray, finer: Squares | None = None) -> Squares:
+    """keys [N]: each splat's square, increasing. finer: of the level before; None for level 0."""
+    firsts = np.flatnonzero(np.diff(keys, prepend=-1))
+    own, starts = keys[firsts], np.append(firsts, len(keys))
+    longest = np.maximum.reduceat(g.scales.numpy().max(1), firsts)
+    lows = highs = g.means.numpy()
+    if finer is not None:
+        lows, highs, firsts = finer.lows, finer.highs, np.searchsorted(finer.keys >> 2, own)
+    lows, highs = np.minimum.reduceat(lows, firsts), np.maximum.reduceat(highs, firsts)
+    return Squares(own, starts, lows, highs, longest)
+
+
+def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
+    """The next level, a few squares at a time. cell_m: its cells."""
+    keys = finer.squares.keys >> 2
+    firsts = np.append(np.flatnonzero(np.diff(keys, prepend=-1)), len(keys))
+    starts = finer.squares.starts[firsts]
+    blur_m = 0.0 if antialiased else BLUR_CELLS * cell_m
+    first = 0
+    while first < len(starts) - 1:
+        end = max(int(np.searchsorted(starts, starts[first] + BATCH, "right")) - 1, first + 1)
+        rows = slice(int(starts[first]), int(starts[end]))
+        squares = np.repeat(keys[firsts[first:end]], np.diff(starts[first : end + 1]))
+        merged, leads = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
+        yield Piece(merged, finer.stands_for[rows][leads], squares[leads])
+        first = end
+
+
+def merge_cells(
+    g: Gaussians, squares: Int64[np.ndarray, "N"], cell_m: float, blur_m: float
+) -> tuple[Gaussians, Int64[np.ndarray, "M"]]:
+    """The splats of each cell merged into one, square after square.
+
+    squares [N]: the number of each splat's square, increasing. blur_m: standard deviation of the
+    rasteriser's blur. Splats that are too clear to be drawn are left out. Returns also the splat
+    that stands for each merged one: the heaviest of the class that weighs most.
+    """
+    kept = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
+    cells = np.floor(g.means.double().numpy()[kept] / cell_m)
+    is_large = g.scales.numpy().max(1)[kept] > cell_m
+    columns = (is_large, *cells.T, squares[kept])
+    order = np.lexsort(columns)
+    begins = is_large[order]
+    begins |= np.append(True, is_large[order][:-1])[: len(order)]
+    for column in columns[1:]:
+        begins[1:] |= np.diff(column[order]) != 0
+    order, starts = kept[order], np.flatnonzero(begins)
+    counts = np.diff(starts, append=len(order))
+    leads, several = order[starts], counts > 1
+    at = np.flatnonzero(several)
+    if not len(at):
+        return g.select(torch.from_numpy(leads)), leads
+    rows = order[np.repeat(several, counts)]
+    firsts = np.cumsum(counts[at]) - counts[at]
+    merged, heaviest = merge_groups(g.select(torch.from_numpy(rows)), firsts, blur_m)
+    leads[at] = rows[heaviest]
+    out = g.select(torch.from_numpy(leads))
+    for name in _COLUMNS:
+        getattr(out, name)[torch.from_numpy(at)] = getattr(merged, name).to(g.means.dtype)
+    return out, leads
+
+
+def merge_groups(
+    g: Gaussians, firsts: Int64[np.ndarray, "M"], blur_m: float
+) -> tuple[Gaussians, Int64[np.ndarray, "M"]]:
+    """One Gaussian for each group of rows, float64, and the row that stands for it. firsts: the
+    first row of each group.
+    """
+    groups = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=len(g)))
+    a, b, c = (scales := g.scales.double().numpy()).T
+    opacities = g.opacities.double().numpy()
+    weights = opacities * (a * b + b * c + c * a)
+    shares = weights / np.add.reduceat(weights, firsts)[groups]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(shares.reshape(-1, *[1] * (values.ndim - 1)) * values, firsts)
+
+    means = g.means.double().numpy()
+    centres = mean(means)
+    off = means - centres[groups]
+    halves = rotmat_from_quat(g.quats.double()).numpy() * scales[:, None]
+    own = halves @ halves.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(mean(own + off[:, :, None] * off[:, None]))
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1
+    # The plane that the group lies in, its deviations as units.
+    units = np.sqrt(np.maximum(variances[:, 1:], THINNEST_M**2) + blur_m**2)
+    plane = (axes[:, :, 1:] / units[:, None])[groups]
+    flat = plane.transpose(0, 2, 1) @ own @ plane
+    flat[:, [0, 1], [0, 1]] += (blur_m / units[groups]) ** 2
+    covered = np.empty(len(firsts))
+    with kernel_threads():
+        kernels.covered_plane(
+            *(np.append(firsts, len(g)), opacities, (off[:, None] @ plane)[:, 0], flat, covered)
+        )
+    ratio = covered / (2 * math.pi)  # of what a Gaussian of opacity 1 covers
+    flat_top = np.exp(np.minimum(ratio, FLAT_TOP) - 1)
+    variances[:, 1:] += (np.maximum(ratio / FLAT_TOP, 1) - 1)[:, None] * units**2
+    merged = (
+        centres,
+        quat_from_rotmat(torch.from_numpy(axes)).numpy(),
+        np.sqrt(np.maximum(variances, THINNEST_M**2)),
+        np.where(ratio <= 1, ratio, flat_top),
+        mean(g.sh.double().numpy()),
+    )
+    return Gaussians(*map(torch.from_numpy, merged)), _heaviest(g, weights, groups)
+
+
+def _heaviest(g: Gaussians, weights: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """The heaviest row of the heaviest class of each group."""
+    classes = np.zeros(len(g), np.int16) if g.semantic is None else g.semantic.numpy()
+    order = np.lexsort((-weights, classes, groups))
+    group, kind = groups[order], classes[order]
+    runs = np.flatnonzero(
+        (np.diff(group, prepend=-1) != 0) | (np.diff(kind, prepend=kind[:1]) != 0)
+    )
+    sums = np.add.reduceat(weights[order], runs)
+    best = np.lexsort((-sums, group[runs]))
+    return order[runs[best[np.flatnonzero(np.diff(group[runs][best], prepend=-1))]]]
+
+
+# ---- Which of them a camera takes ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """Parts to draw in place of `parts`. pieces: of each, what its splats stand for among those of
+    all parts: a first number, and numbers that are added to it (None: 0, 1, ...).
+    """
+
+    parts: tuple[PosedGaussians, ...]
+    pieces: tuple[tuple[int, Int32[np.ndarray, "_"] | None], ...]
+
+    def restore_ids(self, drawn: RenderOutput) -> RenderOutput:
+        """The buffers with splat_ids that count through the parts which these stand for."""
+        ids = drawn.splat_ids
+        if ids is None:
+            return drawn
+        counts = [len(part.gaussians) for part in self.parts]
+        table = np.concatenate([
+            first + (np.arange(count, dtype=np.int32) if own is None else own)
+            for (first, own), count in zip(self.pieces, counts, strict=True)
+        ])  # fmt: skip
+        found = torch.from_numpy(np.append(table, 0)).to(ids)[ids]  # -1, for none, is the last
+        return replace(drawn, **{SPLAT_IDS: torch.where(ids < 0, ids, found)})
+
+
+def choose_parts(
+    parts: Sequence[PosedGaussians], camera: Camera, settings: RasterSettings
+) -> Chosen:
+    """What the camera takes of large backgrounds at settings.lod_px, and all other parts."""
+    chosen, pieces, first = list[PosedGaussians](), list[tuple[int, np.ndarray | None]](), 0
+    for part in parts:
+        own = [(part, None)] if not has_levels(part) else _pieces(part, camera, settings)
+        for piece, stands_for in own:
+            chosen.append(piece)
+            pieces.append((first, stands_for))
+        first += len(part.gaussians)
+    if not chosen:  # a rasteriser wants to know at least the parts' type
+        nothing = rows_of(parts[0].gaussians, slice(0))
+        chosen.append(replace(parts[0], gaussians=nothing, color_maps=None, color_rows=None))
+        pieces.append((0, None))
+    return Chosen(tuple(chosen), tuple(pieces))
+
+
+def has_levels(part: PosedGaussians) -> bool:
+    """Whether a part is drawn in levels: actors and what lies on the scene are not."""
+    is_plain = part.instance_id == 0 and not part.is_overlay and part.shading is None
+    g = part.gaussians
+    return is_plain and len(g) >= MIN_SPLATS and g.means.device.type == "cpu"
+
+
+def _pieces(
+    part: PosedGaussians, camera: Camera, settings: RasterSettings
+) -> Iterator[tuple[PosedGaussians, np.ndarray]]:
+    levels = levels_of(part.gaussians, antialiased=settings.antialiased)
+    for number, squares, shares in _squares_taken(levels, part, camera, settings):
+        level = levels.levels[number]
+        for square, share in zip(squares.tolist(), shares.tolist(), strict=True):
+            g, stands_for = level.take(square), level.stands_for[level.rows(square)]
+            if share < 1:
+                g = replace(g, opacities=faded(g.opacities, share))
+            rows = part.color_rows
+            if rows is not None:
+                rows = rows[torch.from_numpy(stands_for).to(rows.device).long()]
+            yield replace(part, gaussians=g, color_rows=rows), stands_for
+
+
+def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
+    """Of splats that are drawn for a share of what they hide."""
+    low = opacities.clamp(1e-6, 0.99)  # flat tops, which have more, fade in proportion
+    return opacities * ((1 - (1 - low) ** share) / low)
+
+
+def _squares_taken(
+    levels: Levels, part: PosedGaussians, camera: Camera, settings: RasterSettings
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Of each level, the squares that the camera sees and takes, and their shares."""
+    pose = None if part.world_from_part is None else part.world_from_part.numpy()
+    eye_m = camera.centre.numpy()
+    if pose is not None:
+        eye_m = np.linalg.solve(pose, np.append(eye_m, 1.0))[:3]
+    focal = max(camera.fx, camera.fy)
+    number = len(levels.levels) - 1
+    rows = np.arange(len(levels.levels[number].squares))
+    left = np.ones(len(rows))  # of each, what the squares that hold it leave to it
+    while True:
+        squares = levels.levels[number].squares
+        lows, highs = squares.lows[rows], squares.highs[rows]
+        box = Bounds((lows + highs) / 2.0, (highs - lows) / 2.0, squares.longest[rows], rows)
+        seen = may_show(box, pose, camera, settings.near_m)
+        rows, left, lows, highs = rows[seen], left[seen], lows[seen], highs[seen]
+        refined = np.zeros(len(rows))
+        if number > 0:
+            cell_px = focal * levels.cell_m(number) / settings.lod_px
+            if camera.is_orthographic:
+                refined[:] = cell_px > 1
+            else:
+                away_m = np.linalg.norm(
+                    np.maximum(np.maximum(lows - eye_m, eye_m - highs), 0), axis=1
+                )
+                refined = np.clip((1 + BAND - away_m / cell_px) / BAND, 0, 1)
+        taken = left * (1 - refined)
+        yield number, rows[taken > 0], taken[taken > 0]
+        if number == 0:
+            return
+        number -= 1
+        finer = levels.levels[number].squares.keys >> 2
+        opened = refined > 0
+        keys = squares.keys[rows[opened]]
+        firsts = np.searchsorted(finer, keys)
+        counts = np.searchsorted(finer, keys, "right") - firsts
+        left = np.repeat((left * refined)[opened], counts)
+        rows = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(len(left))
