@@ -133,12 +133,6 @@ def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray,
     return sides, offsets, np.array([0.0, *reach, *reach])
 
 
-def actor_poses(scene: Scene, camera: Camera) -> dict[int, np.ndarray]:
-    """world_from_actor of the actors that exist when the image was taken, by instance id."""
-    found = ((n, a.track.pose_at(camera.timestamp_ns)) for n, a in enumerate(scene.actors, start=1))
-    return {number: pose.numpy() for number, pose in found if pose is not None}
-
-
 def owners_seen(
     bounds: Bounds, poses: Mapping[int, np.ndarray], cameras: Iterable[Camera], near_m: float
 ) -> set[int]:

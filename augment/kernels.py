@@ -1,6 +1,10 @@
-"""Kernels of the records themselves: boxes against depth images, colours over time, hashes."""
+"""Kernels of the records themselves: boxes against depth images, poses and colours over time,
+hashes.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import prange
@@ -19,6 +23,72 @@ def mix(bits):
     bits = (bits ^ (bits >> _S30)) * _A
     bits = (bits ^ (bits >> _S27)) * _B
     return bits ^ (bits >> _S31)
+
+
+@serial_kernel
+def poses_at(timestamp_ns, straight_rad, tracks, found, out):
+    """scene.Track.pose_at of A tracks, to the same bits: out [A, 4, 4] where found [A] is not 0.
+
+    tracks: scene.PackedTracks. straight_rad: sines of smaller angles have lost their digits.
+    """
+    for actor in range(found.size):
+        first, last = tracks.starts[actor], tracks.starts[actor + 1] - 1
+        times, hold = tracks.times_ns, tracks.holds_ns[actor]
+        found[actor] = 0
+        if timestamp_ns < times[first] - hold or timestamp_ns > times[last] + hold:
+            continue
+        low, high = first, last  # samples beside the moment
+        while high - low > 1:
+            middle = (low + high) // 2
+            if times[middle] <= timestamp_ns:
+                low = middle
+            else:
+                high = middle
+        at = low if timestamp_ns <= times[first] else high
+        is_between = times[first] < timestamp_ns < times[last]
+        gap = tracks.gaps_ns[actor]
+        if is_between and 0 <= gap < times[high] - times[low]:
+            is_between = False
+            at = low if timestamp_ns - times[low] <= hold else high
+            if at == high and times[high] - timestamp_ns > hold:
+                continue
+        found[actor] = 1
+        if is_between:
+            share = np.float64(timestamp_ns - times[low]) / np.float64(times[high] - times[low])
+            _interpolate(tracks, low, high, share, straight_rad, out[actor])
+        else:
+            for k in range(16):
+                out[actor, k // 4, k % 4] = tracks.poses[at, k // 4, k % 4]
+
+
+@inner()
+def _interpolate(tracks, low, high, share, straight_rad, out):
+    a, b = tracks.quats[low], tracks.quats[high]
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    angle = math.acos(min(abs(dot), 1.0))
+    of_a, of_b = 1 - share, share
+    if angle >= straight_rad:
+        sine = math.sin(angle)
+        of_a, of_b = math.sin(of_a * angle) / sine, math.sin(of_b * angle) / sine
+    if dot < 0:  # the shorter way round
+        of_b = -of_b
+    w, x, y, z = (
+        of_a * a[0] + of_b * b[0],
+        of_a * a[1] + of_b * b[1],
+        of_a * a[2] + of_b * b[2],
+        of_a * a[3] + of_b * b[3],
+    )
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    out[0, 0], out[0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
+    out[1, 0], out[1, 1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z)
+    out[2, 0], out[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    out[0, 2], out[1, 2] = 2 * (x * z + w * y), 2 * (y * z - w * x)
+    out[2, 2], out[3, 3] = 1 - 2 * (x * x + y * y), 1.0
+    for k in range(3):
+        p, q = tracks.centres[low, k], tracks.centres[high, k]
+        out[k, 3] = p + share * (q - p) if share < 0.5 else q - (q - p) * (1 - share)
+        out[3, k] = 0.0
 
 
 @kernel

@@ -122,6 +122,17 @@ class KnowsLidarOrigins(Protocol):
 
 
 @runtime_checkable
+class KnowsLidarTop(Protocol):
+    """A LabelSource with lasers of several reaches, of which the near ones see higher. Else the
+    returns tell."""
+
+    @property
+    def lidar_top_rad(self) -> float:
+        """The highest elevation that the laser of the longest reach looks at."""
+        ...
+
+
+@runtime_checkable
 class StoresLidar(Protocol):
     """A LabelSource whose sweeps lie in files of their own, which can be written anew."""
 

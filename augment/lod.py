@@ -46,6 +46,7 @@ from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians, is_drawable
+from augment.semantics import SemanticClass
 
 MIN_SPLATS = 20_000  # a part with fewer is drawn as it is
 CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # c_1: the first whose cells are a third of the splats
@@ -62,6 +63,8 @@ _ODD = np.uint64(0x9E3779B97F4A7C15)
 _BIAS = 1 << 21  # half the squares that keys can tell apart along an axis
 _SPREAD = ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
            (2, 0x3333333333333333), (1, 0x5555555555555555))  # fmt: skip
+_LEVELS = ("levels of detail",)  # where a memo has them
+_STORED = (*_LEVELS, False)
 _COLUMNS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -91,20 +94,25 @@ class Squares:
 class Level:
     """Splats, square after square. stands_for [N]: the part's own splat whose number and class each
     has. unchecked: the file that they come from, whose numbers are looked at when they are taken.
+    splats: of the part, where it is unchecked.
     """
 
     gaussians: Gaussians
     stands_for: Int32[np.ndarray, "N"]
     squares: Squares
     unchecked: str | None = None
+    splats: int = 0
     _taken: dict[int, Gaussians] = field(default_factory=dict)
 
     def take(self, square: int) -> Gaussians:
         """The splats of a square: one object as long as there is the level."""
         if square not in self._taken:
-            found = rows_of(self.gaussians, self.rows(square))
+            rows = self.rows(square)
+            found = rows_of(self.gaussians, rows)
             if self.unchecked is not None and len(found):
-                _check(found, f"{self.unchecked}: square {square}")
+                numbers = self.stands_for[rows]
+                is_own = numbers.min() >= 0 and numbers.max() < self.splats
+                _check(found, bool(is_own), f"{self.unchecked}: square {square}")
             self._taken[square] = found
         return self._taken[square]
 
@@ -131,14 +139,34 @@ def rows_of(g: Gaussians, rows: slice) -> Gaussians:
     return Gaussians(means, quats, scales, opacities, sh, semantic)
 
 
-def _check(g: Gaussians, where: str) -> None:
+def _check(g: Gaussians, is_numbered: bool, where: str) -> None:
     usual = replace(g, opacities=g.opacities.clamp(max=1))
-    if not (is_drawable(usual) and float(g.opacities.max()) <= MAX_OPACITY * (1 + 1e-6)):
+    classes = [0] if g.semantic is None else [int(g.semantic.min()), int(g.semantic.max())]
+    is_classed = min(SemanticClass) <= min(classes) and max(classes) <= max(SemanticClass)
+    is_clear = float(g.opacities.max()) <= MAX_OPACITY * (1 + 1e-6)
+    if not (is_numbered and is_classed and is_clear and is_drawable(usual)):
         raise SceneError(
             f"{where} holds Gaussians that cannot be drawn: NaN or infinite values, quaternions "
-            f"that are not of length 1, scales <= 0, opacities outside [0, {MAX_OPACITY:.4g}] or "
-            f"coordinates that are too large; write the scene again"
+            f"that are not of length 1, scales <= 0, opacities outside [0, {MAX_OPACITY:.4g}], "
+            f"coordinates that are too large, or classes or splats that there are not; write the "
+            f"scene again"
         )
+
+
+def check_background(gaussians: Gaussians) -> None:
+    """Look at all numbers of a background that lies in a file with its levels, once.
+
+    Raises:
+        SceneError: some cannot be drawn.
+    """
+    memo = memo_of(gaussians)
+    if memo.known(_STORED):
+
+        def look() -> bool:
+            level = levels_of(gaussians).levels[0]
+            return all(len(level.take(square)) >= 0 for square in range(len(level.squares)))
+
+        memo.get(("looked at",), look)
 
 
 # ---- Merging -------------------------------------------------------------------------------------
@@ -155,13 +183,13 @@ class Piece(NamedTuple):
 def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
     """The levels of a part, made once for these Gaussians."""
     return memo_of(gaussians).get(
-        ("levels of detail", antialiased), lambda: build_levels(gaussians, antialiased=antialiased)
+        (*_LEVELS, antialiased), lambda: build_levels(gaussians, antialiased=antialiased)
     )
 
 
 def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
     """Let `levels_of` know levels that lie in a file. levels: must not hold this object."""
-    memo_of(gaussians).put(("levels of detail", False), levels)
+    memo_of(gaussians).put(_STORED, levels, shared=True)
 
 
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
@@ -185,10 +213,8 @@ def build_levels(
     antialiased: for a rasteriser whose blur takes no more of the image. keep: where a level lies.
     """
     own = rows_of(gaussians, slice(None))
-    finest_m = finest_cell_m(own.means)
-    keys = square_keys(own.means, finest_m * CELLS_ACROSS)
-    order = np.argsort(keys, kind="stable")
-    found = Piece(own, order.astype(np.int32), keys[order])
+    finest_m, order, keys = square_order(own)
+    found = Piece(own, order.astype(np.int32), keys)
     if not (np.diff(found.stands_for) == 1).all():
         found = keep(
             Piece(own.select(torch.from_numpy(order[rows])), *(v[rows] for v in found[1:]))
@@ -201,6 +227,14 @@ def build_levels(
         squares = squares_of(found.gaussians, found.keys, levels[-1].squares)
         levels.append(Level(found.gaussians, found.stands_for, squares))
     return Levels(finest_m, tuple(levels))
+
+
+def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.ndarray, "N"]]:
+    """c_1; the splats square after square of level 0, each one's in their order; their squares."""
+    finest_m = finest_cell_m(g.means)
+    keys = square_keys(g.means, finest_m * CELLS_ACROSS)
+    order = np.argsort(keys, kind="stable")
+    return finest_m, order, keys[order]
 
 
 def batches(count: int) -> Iterator[slice]:

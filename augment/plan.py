@@ -13,9 +13,10 @@ import numpy as np
 
 from augment import effects
 from augment.base_photo import RECORDED, check_base
-from augment.bounds import actor_boxes, actor_poses, owners_seen
+from augment.bounds import actor_boxes, owners_seen
 from augment.cameras import Camera
 from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
+from augment.lod import check_background
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
@@ -99,6 +100,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"(augment.jobs.quality)"
         )
     check_base(recipe, scene)
+    if any(effect.of(recipe) is not None for effect in effects.EFFECTS):
+        check_background(scene.background)  # whose numbers effects work with
     placed = dict[str, Placed]()
     for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
         placed[effect.name] = effect.place(recipe, scene, placed)
@@ -252,7 +255,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     active = plan.active(scene, backend=backend)
     looking = [c for own in active for c in own.effect.cameras(own, camera) or ()]
     cameras = tuple(looking) or (camera,)
-    poses = actor_poses(scene, camera)
+    poses = scene.poses_at(camera.timestamp_ns)
     sight = Sight(camera, cameras, {0: np.eye(4), **poses}, plan.settings.near_m)
     drawn = owners_seen(actor_boxes(scene), poses, cameras, plan.settings.near_m)
     seen, skipped = list[Active](), dict[str, str]()

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from augment.cameras import Camera, Frame
 from augment.files.recorded_images import decode_image
+from augment.labels import KnowsLidarTop
 from augment.memo import memo_of
 from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
@@ -195,7 +196,10 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
     points = memo_of(scene).get(("sweep", frame.index), lambda: (_sweep(scene, frame),))[0]
     if points is None:
         return find_sky(rgb, elevation_rad(camera))
-    top_rad = _top_rad(points, camera.centre.numpy().astype(np.float32))
+    if isinstance(scene.labels, KnowsLidarTop):
+        top_rad = scene.labels.lidar_top_rad
+    else:
+        top_rad = _top_rad(points, camera.centre.numpy().astype(np.float32))
     return find_sky(
         rgb, elevation_rad(camera), _hits(points, camera), math.inf if top_rad is None else top_rad
     )
@@ -237,9 +241,11 @@ def _hits(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
-    """Highest elevation that the LiDAR looks at, as cameras see it, from the frames' returns (too
-    low where nothing tall stood near); None without enough of them.
+    """Highest elevation that the LiDAR looks at, as cameras see it: what the labels know, or from
+    the frames' returns (too low where nothing tall stood near); None without enough of them.
     """
+    if isinstance(scene.labels, KnowsLidarTop):
+        return scene.labels.lidar_top_rad
     tops = []
     for index in frames:
         cameras = scene.frame(index).cameras.values()

@@ -20,6 +20,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.memo import memo_of
 from augment.render.sh import rotate_sh, sh_turn
 from augment.render.threads import kernel_threads
 from augment.sky import Sky
@@ -99,6 +100,37 @@ class _Knots(NamedTuple):
     times_ns: list[int]
     quats: list[list[float]]
     centres: list[list[float]]
+
+
+class PackedTracks(NamedTuple):
+    """All tracks of a scene for kernels.poses_at. starts int64 [A + 1]: the samples of each.
+    times_ns, quats [K, 4], centres [K, 3], poses [K, 4, 4]: of all samples. holds_ns, gaps_ns
+    int64 [A]: -1 where a track has no max_gap_ns.
+    """
+
+    starts: np.ndarray
+    times_ns: np.ndarray
+    quats: np.ndarray
+    centres: np.ndarray
+    poses: np.ndarray
+    holds_ns: np.ndarray
+    gaps_ns: np.ndarray
+
+    @staticmethod
+    def of(tracks: Sequence[Track]) -> PackedTracks:
+        knots = [track._knots for track in tracks]
+        starts = np.cumsum([0, *(len(own.times_ns) for own in knots)])
+        poses = [track.world_from_actor.detach().double().numpy() for track in tracks]
+        gaps = [-1 if track.max_gap_ns is None else track.max_gap_ns for track in tracks]
+        return PackedTracks(
+            starts.astype(np.int64),
+            np.concatenate([np.array(own.times_ns, np.int64) for own in knots]),
+            np.concatenate([np.array(own.quats, np.float64) for own in knots]),
+            np.concatenate([np.array(own.centres, np.float64) for own in knots]),
+            np.ascontiguousarray(np.concatenate(poses)),
+            np.array([track.hold_ns for track in tracks], np.int64),
+            np.array(gaps, np.int64),
+        )
 
 
 def _slerp(a: Sequence[float], b: Sequence[float], fraction: float) -> list[float]:
@@ -510,6 +542,18 @@ class Scene:
             if pose is not None:
                 posed = actor.gaussians_at(timestamp_ns)
                 yield PosedGaussians(posed, pose, instance_id=number)
+
+    def poses_at(self, timestamp_ns: int) -> dict[int, np.ndarray]:
+        """world_from_actor, float64 [4, 4], of the actors that exist at a time, by instance id."""
+        if not self.actors:
+            return {}
+        tracks = memo_of(self).get(
+            ("tracks",), lambda: PackedTracks.of([actor.track for actor in self.actors])
+        )
+        found = np.empty(len(self.actors), np.uint8)
+        poses = np.empty((len(found), 4, 4))
+        kernels.poses_at(timestamp_ns, _STRAIGHT_RAD, tracks, found, poses)
+        return {int(n) + 1: poses[n] for n in np.flatnonzero(found)}
 
     def parts_for(
         self, camera: Camera, only: Collection[int] | None = None

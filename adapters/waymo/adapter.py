@@ -10,12 +10,14 @@ what the car drove meanwhile.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
@@ -36,6 +38,7 @@ from adapters.raw_drive import (
 )
 from adapters.uri import format_uri
 from adapters.waymo.tables import (
+    CAMERAS,
     COMPONENTS,
     LASERS,
     MAX_SIDE,
@@ -46,11 +49,13 @@ from adapters.waymo.tables import (
     Segment,
     extract_images,
     find_segment,
+    is_number,
     read_segment,
 )
 from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
+from augment.files.image_size import image_header
 from augment.geometry import invert_rigid
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
@@ -67,9 +72,6 @@ _MAX_RETURNS = 12_000_000  # that a scene is built from; each takes 50 bytes on 
 # A laser's range image holds range (metres, none where it is not > 0), intensity, elongation, and
 # 1 where a return is in a zone without labels. A second image has the second return of each beam.
 
-_IMAGES = tuple(f"[{COMPONENTS['lidar']}].range_image_return{n}" for n in (1, 2))
-_POSE_IMAGE = f"[{COMPONENTS['lidar_pose']}].range_image_return1"
-_CLASS_IMAGES = tuple(f"[{COMPONENTS['lidar_segmentation']}].range_image_return{n}" for n in (1, 2))
 _ROWS_AT_ONCE = 5  # a frame's five lasers: 21 MB
 
 
@@ -79,7 +81,9 @@ class Returns(NamedTuple):
     float32 [N], as recorded. sensor: uint8 [N], 1 TOP, 2 FRONT, 3 SIDE_LEFT, 4 SIDE_RIGHT, 5 REAR.
     number: uint8 [N], 1 or 2, which of its beam's returns. in_no_label_zone: bool [N]. classes,
     objects: int32 [N], the dataset's numbers, 0 of lasers but TOP; None where the frame has no
-    LiDAR segmentation."""
+    LiDAR segmentation. camera_classes: uint8 [N], what the camera segmentation has at the pixel
+    that the dataset projects a return to, its numbers, 0 where no camera sees it; None where the
+    frame has none."""
 
     points_m: np.ndarray
     origins_m: np.ndarray
@@ -91,32 +95,33 @@ class Returns(NamedTuple):
     in_no_label_zone: np.ndarray
     classes: np.ndarray | None
     objects: np.ndarray | None
+    camera_classes: np.ndarray | None
 
 
-def frame_returns(segment: Segment, frame: int) -> Returns | None:
+def frame_returns(segment: Segment, frame: int, every: int = 1) -> Returns | None:
     """The returns of a frame, lasers in their order, each laser's first returns first; None where
-    the table has no row of it."""
-    index = _index(segment, "lidar")
-    own = index.get(frame)
-    if own is None:
+    the table has no row of it. every: take one return in so many, other ones in the next frame."""
+    scans = _range_images(segment, "lidar", frame, 4)
+    if not scans:
         return None
-    path = segment.files.path("lidar")
-    cells = _reader(segment, "lidar", _IMAGES).read(list(own.values()))
-    poses = _pixel_poses(segment, frame)
-    labels = _pixel_classes(segment, frame)
+    (poses,) = _range_images(segment, "lidar_pose", frame, 6, returns=(1,)).get(TOP, (None,))
+    labels = _range_images(segment, "lidar_segmentation", frame, 2)
+    pictures = _label_images(segment, frame)
+    seen = _range_images(segment, "lidar_camera_projection", frame, 6) if pictures else {}
+    nothing = (None, None)
     parts = []
-    for laser, row in sorted(own.items()):
-        where = f"{path}: frame {segment.stamps_us[frame]}, laser {LASERS[laser - 1]}"
-        for number, name in enumerate(_IMAGES, start=1):
-            image = _image(cells[row], name, 4, where)
+    for laser, images in sorted(scans.items()):
+        beams = _Beams(segment, frame, laser, poses if laser == TOP else None)
+        own = zip(images, labels.get(laser, nothing), seen.get(laser, nothing), strict=True)
+        for number, (image, classes, pixels) in enumerate(own, start=1):
             if image is not None:
-                beams = _Beams(segment, frame, laser, poses if laser == TOP else None, where)
-                classes = labels.get(number) if laser == TOP else None
-                parts.append(beams.returns(image, number, classes))
+                parts.append(beams.returns(image, number, classes, pixels, pictures, every))
     if not parts:
         return None
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return Returns(*columns) if labels else Returns(*columns[:-2], None, None)
+    found = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if not labels:
+        found = found._replace(classes=None, objects=None)
+    return found if seen else found._replace(camera_classes=None)
 
 
 class _Beams(NamedTuple):
@@ -126,20 +131,42 @@ class _Beams(NamedTuple):
     frame: int
     laser: int
     poses: np.ndarray | None
-    where: str
 
-    def returns(self, image: np.ndarray, number: int, labels: np.ndarray | None) -> Returns:
-        """Those of a range image [H, W, 4]. labels: objects and classes [H, W, 2]."""
+    def returns(
+        self,
+        image: np.ndarray,
+        number: int,
+        labels: np.ndarray | None,
+        pixels: np.ndarray | None,
+        pictures: Mapping[int, np.ndarray],
+        every: int,
+    ) -> Returns:
+        """Those of a range image [H, W, 4]. labels: objects and classes [H, W, 2]. pixels: camera,
+        x, y of two cameras that see a return [H, W, 6]. pictures: classes [h, w] by camera."""
         segment, rows, columns = self.segment, *image.shape[:2]
-        laser = segment.lasers.get(LASERS[self.laser - 1])
+        name = LASERS[self.laser - 1]
+        where = f"{segment.files.path('lidar')}: frame {segment.stamps_us[self.frame]}, {name}"
+        laser = segment.lasers.get(name)
         if laser is None:
-            raise AdapterError(f"{self.where}: lidar_calibration has no such laser")
-        try:
-            directions = _directions(laser, rows, columns)
-        except AdapterError as error:
-            raise AdapterError(f"{self.where}: {error}; copy lidar_calibration again") from None
+            raise AdapterError(f"{where}: lidar_calibration has no such laser")
+        if laser.inclinations_rad is not None and len(laser.inclinations_rad) != rows:
+            raise AdapterError(
+                f"{where}: its range image has {rows} rows, its calibration "
+                f"{len(laser.inclinations_rad)} inclinations. Copy both again"
+            )
+        for component, other in (
+            ("lidar_segmentation", labels),
+            ("lidar_camera_projection", pixels),
+        ):
+            if other is not None and other.shape[:2] != (rows, columns):
+                raise AdapterError(
+                    f"{where}: {component} must be of {rows} x {columns} pixels; it is of "
+                    f"{list(other.shape[:2])}. Copy it again"
+                )
+        directions = _directions(laser, rows, columns)
         with np.errstate(invalid="ignore"):
             hit = np.flatnonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+        hit = hit[self.frame % every :: every]
         values = image.reshape(-1, 4)[hit]
         mount = laser.vehicle_from_laser[:3, 3]
         offsets = values[:, :1].astype(np.float64) * directions.reshape(-1, 3)[hit]
@@ -153,7 +180,7 @@ class _Beams(NamedTuple):
             if self.poses is None or self.poses.shape[:2] != (rows, columns):
                 size = "none" if self.poses is None else list(self.poses.shape[:2])
                 raise AdapterError(
-                    f"{self.where}: lidar_pose must have a pose for each of {rows} x {columns} "
+                    f"{where}: lidar_pose must have a pose for each of {rows} x {columns} "
                     f"pixels; it has {size}. Copy it again"
                 )
             turns, places = _car_at(self.poses.reshape(-1, 6)[hit])
@@ -161,11 +188,6 @@ class _Beams(NamedTuple):
             origins = turns @ mount + places
             share = (hit % columns + 0.5) / columns
             times = segment.stamps_us[self.frame] * 1000 + np.round(share * _SPIN_NS).astype(int)
-        if labels is not None and labels.shape[:2] != (rows, columns):
-            raise AdapterError(
-                f"{self.where}: lidar_segmentation must be of {rows} x {columns} pixels; it is of "
-                f"{list(labels.shape[:2])}. Copy it again"
-            )
         none = np.zeros((len(hit), 2), np.int32)
         objects, classes = (none if labels is None else labels.reshape(-1, 2)[hit]).T
         return Returns(
@@ -179,7 +201,23 @@ class _Beams(NamedTuple):
             values[:, 3] > 0,
             classes,
             objects,
+            _seen_classes(pixels.reshape(-1, 6)[hit], pictures)
+            if pixels is not None
+            else np.zeros(len(hit), np.uint8),
         )
+
+
+def _seen_classes(pixels: np.ndarray, pictures: Mapping[int, np.ndarray]) -> np.ndarray:
+    """The classes, uint8 [N], at camera, x, y, camera, x, y [N, 6]: the first camera's that has
+    one."""
+    found = np.zeros(len(pixels), np.uint8)
+    places = np.nan_to_num(pixels).clip(0, MAX_SIDE).astype(np.int64)
+    for camera, x, y in (places[:, :3].T, places[:, 3:].T):
+        for number, picture in pictures.items():
+            own = (camera == number) & (found == 0)
+            own &= (x < picture.shape[1]) & (y < picture.shape[0])
+            found[own] = picture[y[own], x[own]]
+    return found
 
 
 @lru_cache(maxsize=8)
@@ -199,59 +237,91 @@ def _car_at(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turns, values[:, 3:]
 
 
-def _pixel_poses(segment: Segment, frame: int) -> np.ndarray | None:
-    row = _index(segment, "lidar_pose").get(frame, {}).get(TOP)
-    if row is None:
-        return None
-    cells = _reader(segment, "lidar_pose", (_POSE_IMAGE,)).read([row])[row]
-    where = f"{segment.files.path('lidar_pose')}: frame {segment.stamps_us[frame]}"
-    return _image(cells, _POSE_IMAGE, 6, where)
-
-
-def _pixel_classes(segment: Segment, frame: int) -> dict[int, np.ndarray]:
-    """Objects and classes [H, W, 2] of the TOP laser's pixels by number of the return."""
-    if not segment.files.has("lidar_segmentation"):
+def _range_images(
+    segment: Segment, component: str, frame: int, channels: int, returns: tuple[int, ...] = (1, 2)
+) -> dict[int, tuple[np.ndarray | None, ...]]:
+    """The images [H, W, channels] of a frame by laser, one a return, None for null; their memory
+    is the table's. Empty without the component or a row of the frame."""
+    if not segment.files.has(component):
         return {}
-    row = _index(segment, "lidar_segmentation").get(frame, {}).get(TOP)
-    if row is None:
-        return {}
-    cells = _reader(segment, "lidar_segmentation", _CLASS_IMAGES).read([row])[row]
-    where = f"{segment.files.path('lidar_segmentation')}: frame {segment.stamps_us[frame]}"
-    images = {n: _image(cells, name, 2, where) for n, name in enumerate(_CLASS_IMAGES, start=1)}
-    return {n: image for n, image in images.items() if image is not None}
+    own = _index(segment, component, "key.laser_name", LASERS).get(frame, {})
+    names = [f"[{COMPONENTS[component]}].range_image_return{n}" for n in returns]
+    columns = tuple(f"{name}.{part}" for name in names for part in ("values", "shape"))
+    cells = _reader(segment, component, columns).read(list(own.values()))
+    where = f"{segment.files.path(component)}: frame {segment.stamps_us[frame]}"
+    return {
+        laser: tuple(_range_image(cells[row], name, channels, where) for name in names)
+        for laser, row in own.items()
+    }
 
 
-def _image(cells: dict[str, Any], name: str, channels: int, where: str) -> np.ndarray | None:
-    """A range image [H, W, channels], or None for null; its memory is the table's."""
+def _range_image(cells: dict[str, Any], name: str, channels: int, where: str) -> np.ndarray | None:
     values, shape = cells[f"{name}.values"].values, cells[f"{name}.shape"].as_py()
     if values is None or shape is None:
         return None
     is_size = len(shape) == 3 and all(isinstance(n, int) and 1 <= n <= MAX_SIDE for n in shape)
-    if not is_size or shape[2] != channels or len(values) != np.prod(shape) or values.null_count:
+    is_whole = is_size and shape[2] == channels and len(values) == np.prod(shape)
+    if not is_whole or values.null_count or not is_number(values.type):
         raise AdapterError(
-            f"{where}: {name} must have height x width x {channels} values, none of them null, and "
-            f"sides up to {MAX_SIDE}; got shape {shape} and {len(values)} values. Copy it again"
+            f"{where}: {name} must have height x width x {channels} numbers, none of them null, "
+            f"and sides up to {MAX_SIDE}; got shape {shape} and {len(values)} of {values.type}. "
+            f"Copy it again"
         )
     return values.to_numpy(zero_copy_only=False).reshape(shape)
 
 
+def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
+    """The classes of the recorded images' pixels, uint8 [H, W], by the camera's number."""
+    component = "camera_segmentation"
+    if not (segment.files.has(component) and segment.files.has("lidar_camera_projection")):
+        return {}
+    own = _index(segment, component, "key.camera_name", CAMERAS).get(frame, {})
+    image, divisor = (
+        f"[{COMPONENTS[component]}].{name}" for name in ("panoptic_label", "panoptic_label_divisor")
+    )
+    cells = _reader(segment, component, (image, divisor)).read(list(own.values()))
+    found = {}
+    for number, row in own.items():
+        name, path = CAMERAS[number - 1], segment.files.path(component)
+        lens = segment.cameras[name].lens if name in segment.cameras else None
+        data, step = cells[row][image].as_py(), cells[row][divisor].as_py()
+        header = image_header(data) if isinstance(data, bytes) else None
+        size = None if header is None else (header.width, header.height)
+        panoptic = None
+        if header and lens and header.format == "PNG" and size == (lens.width, lens.height):
+            panoptic = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if panoptic is None or panoptic.ndim != 2 or not isinstance(step, int) or step < 1:
+            raise AdapterError(
+                f"{path}: frame {segment.stamps_us[frame]}, camera {name}: panoptic_label must be "
+                f"a grey PNG of the camera's size with a divisor > 0; got size {size}, divisor "
+                f"{step}. Copy it again"
+            )
+        found[number] = (panoptic // step).clip(0, 255).astype(np.uint8)
+    return found
+
+
+def _reader(segment: Segment, component: str, columns: tuple[str, ...]) -> RowReader:
+    # Another process must not go on with this one's files.
+    return _reader_of(segment, component, columns, os.getpid())
+
+
 @lru_cache(maxsize=8)
-def _reader(segment: Segment, component: str, images: tuple[str, ...]) -> RowReader:
-    columns = [f"{name}.{part}" for name in images for part in ("values", "shape")]
+def _reader_of(segment: Segment, component: str, columns: tuple[str, ...], _pid: int) -> RowReader:
     return RowReader(segment.files.path(component), columns, _ROWS_AT_ONCE)
 
 
 @lru_cache(maxsize=8)
-def _index(segment: Segment, component: str) -> dict[int, dict[int, int]]:
-    """Row numbers by frame and laser."""
-    rows = Rows(segment.files, component, [STAMP, "key.laser_name"])
+def _index(
+    segment: Segment, component: str, key: str, words: tuple[str, ...]
+) -> dict[int, dict[int, int]]:
+    """Row numbers by frame and by laser or camera."""
+    rows = Rows(segment.files, component, [STAMP, key])
     frames = segment.frames_of(rows.stamps(), rows.path)
-    lasers = rows.enum("key.laser_name", LASERS)
     found: dict[int, dict[int, int]] = {}
-    for frame, laser, row in zip(frames, lasers, rows.numbers, strict=True):
+    for frame, number, row in zip(frames, rows.enum(key, words), rows.numbers, strict=True):
         own = found.setdefault(int(frame), {})
-        if own.setdefault(int(laser), int(row)) != row:
-            raise rows.fault(STAMP, f"has two rows of laser {LASERS[laser - 1]} and one frame")
+        if own.setdefault(int(number), int(row)) != row:
+            raise rows.fault(key, f"has two rows of {words[number - 1]} in one frame")
     return found
 
 
@@ -270,6 +340,30 @@ _CLASSES = dict(
         )
     )
 )  # fmt: skip
+# camera_segmentation's from 0; a return is not the recording car (1), nor sky (25).
+_CAMERA_CLASSES = dict(
+    enumerate(
+        (
+            _S.UNKNOWN, _S.UNKNOWN, _S.VEHICLE, _S.VEHICLE, _S.VEHICLE, _S.VEHICLE, _S.TWO_WHEELER,
+            _S.TWO_WHEELER, _S.VEHICLE, _S.PEDESTRIAN, _S.TWO_WHEELER, _S.TWO_WHEELER, _S.OTHER,
+            _S.OTHER, _S.OTHER, _S.POLE, _S.OTHER, _S.SIGN, _S.SIGN, _S.BUILDING, _S.ROAD,
+            _S.LANE_MARKING, _S.LANE_MARKING, _S.SIDEWALK, _S.VEGETATION, _S.UNKNOWN, _S.TERRAIN,
+            _S.OTHER, _S.OTHER,
+        )
+    )
+)  # fmt: skip
+
+
+def _semantic(classes: np.ndarray | None, seen: np.ndarray | None, count: int) -> np.ndarray:
+    """SemanticClass int16 [count] by the LiDAR's segmentation and, where that says nothing, by the
+    cameras'."""
+    known = np.zeros(count, np.int16) if classes is None else world_classes(classes, _CLASSES)
+    if seen is None:
+        return known
+    by_camera = world_classes(seen, _CAMERA_CLASSES)
+    return np.where(known == SemanticClass.UNKNOWN, by_camera, known)
+
+
 _BOX = (*(f"box.{n}.{axis}" for n in ("center", "size") for axis in "xyz"), "box.heading")
 # What becomes an attribute of that name, and what stands for null.
 _ATTRIBUTES = {
@@ -292,10 +386,17 @@ class WaymoLabels:
     of what was recorded, which has no upper limit), raw_intensity, elongation, sensor,
     return_number and in_no_label_zone (see Returns), timestamp_ns (of the TOP laser by column,
     which the dataset does not state; of the others that of the vehicle pose), and where the frame
-    has LiDAR segmentation semantic and instance (0 of lasers but TOP). All returns are among them,
-    also of the recording car."""
+    has LiDAR segmentation semantic and instance (0 of lasers but TOP), and where it has camera
+    segmentation and lidar_camera_projection camera_class. All returns are among them, also of the
+    recording car."""
 
     segment: Segment
+
+    @property
+    def lidar_top_rad(self) -> float:
+        """That of TOP: the others look 30 degrees up, and 20 m far."""
+        top = self.segment.lasers.get("TOP")
+        return 0.0 if top is None else float(top.highest_rad)
 
     def boxes(self, frame_index: int) -> Boxes:
         return _all_boxes(self.segment).get(frame_index, Boxes.empty())
@@ -316,11 +417,15 @@ class WaymoLabels:
         }
         if returns.classes is not None and returns.objects is not None:
             columns |= {"semantic": returns.classes, "instance": returns.objects}
+        if returns.camera_classes is not None:
+            columns["camera_class"] = returns.camera_classes
         return LidarSweep({name: np.array(column) for name, column in columns.items()})
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        numbers = sweep.columns.get("semantic")
-        return None if numbers is None else world_classes(numbers, _CLASSES)
+        numbers, seen = sweep.columns.get("semantic"), sweep.columns.get("camera_class")
+        if numbers is None and seen is None:
+            return None
+        return _semantic(numbers, seen, len(sweep))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Where the TOP laser was as each beam left it, by the dataset's pose of each pixel; the
@@ -427,7 +532,7 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
     frames = tuple(_frame(segment, n, origin, paths[n]) for n in chosen.numbers)
     boxes, box_problems = moving_boxes(segment, chosen.numbers, origin)
     sweeps, sweep_problems = read_sweeps(segment, chosen.used, origin)
-    top = segment.lasers.get("TOP")
+    labels = WaymoLabels(segment)
     return RawDrive(
         name=segment.files.name,
         source=format_uri("waymo", path, query),
@@ -435,9 +540,9 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
         held_out=chosen.held_out,
         sweeps=sweeps,
         boxes=boxes,
-        labels=WaymoLabels(segment),
+        labels=labels,
         world_origin_m=origin,
-        lidar_top_deg=0.0 if top is None else float(np.degrees(top.highest_rad)),
+        lidar_top_deg=float(np.degrees(labels.lidar_top_rad)),
         problems=(
             *segment.problems,
             *chosen.problems,
@@ -515,28 +620,27 @@ def read_sweeps(
     """The usable returns of the frames in the scene's world, and what was missing. Of long drives
     every second return is taken, or every third, and so on, so that there are at most
     _MAX_RETURNS."""
-    sweeps, missing, problems, step = [], [], [], 1
-    for n in tqdm(numbers, desc="LiDAR", unit="sweep", disable=None):
+    sweeps: dict[int, Sweep] = {}
+    missing, problems, step = [], [], 0
+    rows = _index(segment, "lidar", "key.laser_name", LASERS)
+    in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
+    for n in tqdm(in_file, desc="LiDAR", unit="sweep", disable=None):
         try:
-            returns = frame_returns(segment, n)
+            returns = frame_returns(segment, n, step or 1)
         except AdapterError as error:
             problems.append(f"frame {n}: its LiDAR returns are left out: {error}")
             continue
         if returns is None:
             missing.append(n)
             continue
-        if not sweeps:
-            step = -(-len(returns.points_m) * len(numbers) // _MAX_RETURNS)
-        own = slice(n % step, None, step)
-        points = returns.points_m[own]
-        classes = np.zeros(0) if returns.classes is None else returns.classes[own]
-        semantic = (
-            np.full(len(points), SemanticClass.UNKNOWN, np.int16)
-            if returns.classes is None
-            else world_classes(classes, _CLASSES)
-        )
-        sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns[own], semantic)
-        sweeps.append(sweep.select(is_usable(sweep, points, segment.world_from_vehicle[n], EGO_M)))
+        if not step:  # as if all frames had as many as the first
+            step = max(1, -(-len(returns.points_m) * len(numbers) // _MAX_RETURNS))
+            returns = frame_returns(segment, n, step) if step > 1 else returns
+        points = returns.points_m
+        semantic = _semantic(returns.classes, returns.camera_classes, len(points))
+        sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns, semantic)
+        keep = is_usable(sweep, points, segment.world_from_vehicle[n], EGO_M)
+        sweeps[n] = sweep.select(keep)
     if len(problems) > _MAX_FAULTS:
         problems[_MAX_FAULTS:] = [f"so are those of {len(problems) - _MAX_FAULTS} more frames"]
     if missing:
@@ -546,4 +650,4 @@ def read_sweeps(
             f"the scene is built from one return in {step}, of {len(numbers)} frames; fewer "
             f"(frames=) use all"
         )
-    return tuple(sweeps), tuple(problems)
+    return tuple(sweeps[n] for n in sorted(sweeps)), tuple(problems)

@@ -46,6 +46,8 @@ COMPONENTS = {
     "lidar_pose": "LiDARPoseComponent",
     "lidar_box": "LiDARBoxComponent",
     "lidar_segmentation": "LiDARSegmentationLabelComponent",
+    "camera_segmentation": "CameraSegmentationLabelComponent",
+    "lidar_camera_projection": "LiDARCameraProjectionComponent",
 }
 _REQUIRED = tuple(COMPONENTS)[:6]
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # numbered from 1
@@ -245,7 +247,7 @@ class Rows:
     def lists(self, field: str) -> list[np.ndarray | None]:
         """Float64 numbers of each row's list, None for null."""
         column = self.column(field)
-        if not _is_list(column.type) or not _is_number(column.type.value_type):
+        if not _is_list(column.type) or not is_number(column.type.value_type):
             raise self.fault(field, f"must hold lists of numbers; it holds {column.type}")
         found = [None if cell.values is None else _flat(cell) for cell in column]
         if any(values is not None and not np.isfinite(values).all() for values in found):
@@ -259,7 +261,7 @@ def _is_list(kind: pa.DataType) -> bool:
     )
 
 
-def _is_number(kind: pa.DataType) -> bool:
+def is_number(kind: pa.DataType) -> bool:
     return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
 
@@ -418,8 +420,6 @@ class Laser:
         up = low + (np.arange(rows) + 0.5) / rows * (high - low)
         if self.inclinations_rad is not None:
             up = self.inclinations_rad
-        if len(up) != rows:
-            raise AdapterError(f"{len(up)} inclinations for {rows} rows")
         up = up[::-1, None]
         turn = self.vehicle_from_laser[:3, :3]
         around = np.pi * (1 - (2 * np.arange(columns) + 1) / columns)

@@ -42,6 +42,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import tensor
 from augment.jobs.atomic import replaced_file, replaced_folder
+from augment.lod import keep_levels
 from augment.scene import (
     SH_COUNTS,
     Actor,
@@ -121,15 +122,23 @@ def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
 
 
 def take_parts(
-    tensors: dict[str, Tensor], document: SceneDocument, where: str
+    tensors: dict[str, Tensor], document: SceneDocument, where: str, *, unread: bool = False
 ) -> tuple[list[SavedPart], list[str]]:
-    """Background and actors, whose arrays are taken out of `tensors`, and what was left out."""
+    """Background and actors, whose arrays are taken out of `tensors`, and what was left out.
+    unread: nobody looks at the background's numbers yet.
+    """
     counts = [document.background_gaussians, *(actor.gaussians for actor in document.actors)]
     has_waves = [False, *(actor.color_waves is not None for actor in document.actors)]
     parts, problems = [], []
     for number, count in enumerate(counts):
         name = _part_name(number)
-        part = _take_part(tensors, name, count, document.precision, has_waves[number], where)
+        is_read = number > 0 or not unread
+        part = _take_part(
+            tensors, name, count, document.precision, has_waves[number], where, is_read=is_read
+        )
+        if not is_read:
+            parts.append(part)
+            continue
         waves = part.waves  # one look at each number tells whether every bit can stay as it is
         has_finite_waves = waves is None or bool(np.isfinite(_range(waves)).all())
         if not (has_finite_waves and is_drawable(part.gaussians)):
@@ -180,7 +189,7 @@ def _half(values: Tensor, where: str) -> Tensor:
 
 def _take_part(
     tensors: dict[str, Tensor], part: str, count: int, precision: Precision, has_waves: bool,
-    where: str,
+    where: str, *, is_read: bool = True,
 ) -> SavedPart:  # fmt: skip
     own = {
         name: _take_array(tensors, f"{part}.{name}", name, count, precision, where)
@@ -200,7 +209,7 @@ def _take_part(
     if name in tensors:
         semantic = tensor(tensors, name, (count,), where, dtype=torch.int16, error=SceneError)
         del tensors[name]
-        low, high = _range(semantic)
+        low, high = _range(semantic) if is_read else (0, 0)
         if low < min(SemanticClass) or high > max(SemanticClass):
             raise SceneError(
                 f"{where}: {name} must hold classes from {min(SemanticClass):d} to "
@@ -657,7 +666,7 @@ def _json_facts(scene: Scene) -> dict[str, Any]:
 # ---- Safetensors files: written without a copy of the arrays, read mapped into memory ------------
 
 MAX_HEADER_BYTES = 100_000_000  # the format's own limit
-_TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16"}
+_TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16", "<i4": "I32", "<i8": "I64"}
 _ALIGNMENT = 64  # bytes: a cache line, and any vector register
 
 
@@ -704,6 +713,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
 FILES = (DOCUMENT, GAUSSIANS, SKY)
+LEVELS = "levels.safetensors"  # of a large scene (augment.files.level_file)
 SCENE_SUFFIX = ".climategs"
 _SKY_PREFIX = "sky."
 _MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
@@ -723,13 +733,21 @@ def is_scene_file(path: Path) -> bool:
     return path.suffix.lower() == SCENE_SUFFIX
 
 
-def save_scene(scene: Scene, folder: str | Path) -> None:
+def save_scene(
+    scene: Scene,
+    folder: str | Path,
+    *,
+    levels: Mapping[str, np.ndarray] | None = None,
+    finest_m: float = 0.0,
+) -> None:
     """Write a scene folder, as a whole or not at all; what `load_scene_parts` gives back is equal
     to the bit, the labels excepted, which stay with the recording. A scene folder that is there
     already is replaced in one step; other files in it are kept. Raises SceneError: the scene has
     something the files cannot hold (a sky of another class, Gaussians that are not float32).
     OutputError: the folder holds something else than a scene, or the system refused (disk full, no
     permission ...); what was there before is then as it was.
+
+    levels, finest_m: of `augment.files.level_file`, which writes large scenes.
     """
     folder = Path(folder)
     document = scene_document(scene)
@@ -738,11 +756,14 @@ def save_scene(scene: Scene, folder: str | Path) -> None:
         raise OutputError(
             f"{folder} holds other files and no scene, so it is not replaced; choose another folder"
         )
-    with replaced_folder(folder, FILES) as new:
+    facts: dict[str, dict[str, str] | None] = dict.fromkeys(arrays)
+    if levels is not None:
+        arrays[LEVELS], facts[LEVELS] = dict(levels), {"finest_m": repr(finest_m)}
+    with replaced_folder(folder, (*FILES, LEVELS)) as new:
         (new / DOCUMENT).write_text(document_text(document), encoding="utf-8")
         for name, tensors in arrays.items():
             with (new / name).open("wb") as file:
-                write_tensors(file, tensors)
+                write_tensors(file, tensors, facts[name])
 
 
 def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> None:
@@ -792,12 +813,18 @@ def read_saved_scene(path: str | Path) -> SavedScene:
     path = Path(path)
     opened = _open_file(path) if path.is_file() else _open_folder(path)
     document, (in_document, in_parts, in_sky) = opened.document, opened.places
-    parts, problems = take_parts(opened.parts, document, in_parts)
+    levels = path / LEVELS
+    is_large = levels.is_file()
+    parts, problems = take_parts(opened.parts, document, in_parts, unread=is_large)
     if problems:
         found = [*document.problems, *problems]
         document = document.model_copy(update={"problems": found})
     sky = take_sky(opened.sky, document.sky, document.precision, in_sky)
     scene = scene_of(document, parts, sky, source=f"scene:{path}", where=in_document)
+    if is_large:
+        from augment.files.level_file import read_levels
+
+        keep_levels(scene.background, read_levels(levels, scene.background))
     return SavedScene(scene, Path(document.working_folder))
 
 

@@ -179,11 +179,12 @@ def map_colors(rgb, matrix):
     m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
     for i in prange(rgb.shape[0]):
-        for j in range(rgb.shape[1]):
-            r, g, b = rgb[i, j, 0], rgb[i, j, 1], rgb[i, j, 2]
-            rgb[i, j, 0] = m00 * r + m01 * g + m02 * b + m03
-            rgb[i, j, 1] = m10 * r + m11 * g + m12 * b + m13
-            rgb[i, j, 2] = m20 * r + m21 * g + m22 * b + m23
+        row = rgb[i].reshape(-1)
+        for j in range(U(0), U(row.size), U(3)):
+            r, g, b = row[j], row[j + U(1)], row[j + U(2)]
+            row[j] = m00 * r + m01 * g + m02 * b + m03
+            row[j + U(1)] = m10 * r + m11 * g + m12 * b + m13
+            row[j + U(2)] = m20 * r + m21 * g + m22 * b + m23
 
 
 # ---- Numba kernel: colour maps folded into spherical harmonics, as fast as memory gives and takes.

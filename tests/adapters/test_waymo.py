@@ -23,6 +23,7 @@ from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import reflectances
 from augment.errors import AdapterError
+from augment.recorded_sky import lidar_top_rad
 from augment.semantics import SemanticClass
 
 RIG = Rig()
@@ -122,6 +123,29 @@ def test_a_sweeps_columns_and_classes(written: Path) -> None:
     np.testing.assert_array_equal(origins, labels.lidar_origins(1, sweep)[5:9])
 
 
+def test_returns_take_the_classes_of_segmented_images(tmp_path: Path) -> None:
+    root = files.write_segment(tmp_path, frames=2, segmented=(), pictured=(1,))
+    labels = waymo_labels(str(root), {})
+    assert labels.lidar_classes(labels.lidar(0)) is None
+    sweep = labels.lidar(1)
+    classes, seen = labels.lidar_classes(sweep), sweep.columns["camera_class"]
+    first = (sweep.columns["return_number"] == 1) & (seen > 0)
+    assert set(np.unique(seen)) <= {0, 1, 2, 19, 20, 25}
+    street, points = Street((DRIVER, PARKED)), sweep.points_m
+    is_wall = np.abs((points - street.wall) @ street.normal) < 0.01
+    is_road = np.abs(points[:, 2] - ORIGIN[2]) < 0.01
+    # Cameras and lasers stand apart, so edges differ.
+    for part, expected in (
+        (is_wall & ~is_road, SemanticClass.BUILDING),
+        (is_road & ~is_wall, SemanticClass.ROAD),
+        (~is_wall & ~is_road, SemanticClass.VEHICLE),
+    ):
+        own = part & first & (seen != 1)
+        assert own.sum() > 20 and (classes[own] == expected).mean() > 0.9
+    assert (classes[(seen <= 1) | (seen == 25)] == SemanticClass.UNKNOWN).all()
+    assert 0.2 < first.mean() < 0.9
+
+
 def test_points_project_to_a_thousandth_of_a_pixel(written: Path) -> None:
     """Through the scene's pinhole camera and the lens against the dataset's formulas: the pose at
     the middle of the readout, the extrinsic with x out of the lens, OpenCV's model."""
@@ -138,11 +162,7 @@ def test_points_project_to_a_thousandth_of_a_pixel(written: Path) -> None:
             )
             local[:, 1:] *= local[:, :1]
             points = local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-            cv = np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
-            _, _, c_u, c_v = RIG.camera(n)
-            matrix = np.array([[RIG.focal, 0, c_u], [0, RIG.focal, c_v], [0, 0, 1]])
-            zero, lens = np.zeros(3), np.array(RIG.distortion)
-            expected = cv2.projectPoints(cv, zero, zero, matrix, lens)[0][:, 0]
+            expected = np.column_stack(files.pixels_of(RIG, n, middle, points)[:2])
             seen = (points - drive.world_origin_m) @ camera.camera_from_world.numpy()[:3, :3].T
             seen += camera.camera_from_world.numpy()[:3, 3]
             u = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
@@ -239,6 +259,8 @@ def test_a_scene_of_a_segment_looks_like_its_images(written: Path, cache: Path) 
     assert any("lens distortion" in p for p in scene.problems)
     assert any(f"{0.044 * files.SPEED / 2:.2f} m" in p for p in scene.problems)
     assert len(scene.problems) == 2
+    # Near lasers look 30 degrees up: their returns do not tell where far walls end.
+    assert lidar_top_rad(scene, [0, 1, 2]) == RIG.inclinations().max() < 0.05
     # Kept scenes come with their images, which may have been deleted meanwhile.
     (folder,) = (cache / "images").iterdir()
     before = {p: p.read_bytes() for p in folder.rglob("*.jpg")}
@@ -254,6 +276,19 @@ def test_frames_that_are_held_out_give_no_returns(written: Path) -> None:
     assert len(drive.frames) == 3 and len(drive.sweeps) == 2
     alone = read(written, frames="1:2")
     assert [frame.index for frame in alone.frames] == [1] and len(alone.sweeps) == 1
+
+
+def test_long_drives_are_built_from_some_returns_of_every_frame(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = read(written)
+    monkeypatch.setattr("adapters.waymo.adapter._MAX_RETURNS", sum(map(len, whole.sweeps)) // 3)
+    some = read(written)
+    assert any("one return in 4, of 3 frames" in problem for problem in some.problems)
+    for all_of_it, sweep in zip(whole.sweeps, some.sweeps, strict=True):
+        assert 0.2 < len(sweep) / len(all_of_it) < 0.3
+        assert set(map(bytes, sweep.points)) < set(map(bytes, all_of_it.points))
+    assert len(some.labels.lidar(0)) == len(whole.labels.lidar(0))  # labels have all of them
 
 
 def test_segments_go_by_their_names_or_first_parts(written: Path, tmp_path: Path) -> None:
@@ -373,7 +408,7 @@ def test_what_single_frames_lack_is_said(copy: Path) -> None:
     assert "is no whole JPEG; left out" in said and "of 0 bytes" in said
     assert "is of 30x20 pixels, its camera of 192x" in said
     assert "no image of 1 frame (" in said and "the LiDAR has no row of 1 frame (1)" in said
-    assert "must have height x width x 6 values" in said and "no boxes are known" in said
+    assert "must have height x width x 6 numbers" in said and "no boxes are known" in said
     assert len(drive.problems) == 10 and drive.sweeps == ()
     assert sum(len(frame.image_paths) for frame in drive.frames) == 11
     assert sum(len(frame.cameras) for frame in drive.frames) == 14

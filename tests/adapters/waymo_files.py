@@ -202,12 +202,13 @@ def image_of(rig: Rig, world: World, number: int, seconds: float) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class Scan:
     """A laser's range images of one frame, float32 [H, W, 4]; poses of the car by pixel [H, W, 6];
-    objects and classes [H, W, 2]."""
+    objects and classes [H, W, 2]. points: of the first returns, world [H, W, 3]."""
 
     first: np.ndarray
     second: np.ndarray
     poses: np.ndarray | None
     labels: np.ndarray
+    points: np.ndarray
 
 
 def scan_of(rig: Rig, world: World, number: int, stamp_s: float) -> Scan:
@@ -255,6 +256,7 @@ def scan_of(rig: Rig, world: World, number: int, stamp_s: float) -> Scan:
         second.astype(np.float32),
         poses.astype(np.float32) if number == 0 else None,
         labels,
+        origins + ranges[..., None] * rays,
     )
 
 
@@ -293,6 +295,8 @@ CLASSES = {
     "lidar_pose": "LiDARPoseComponent",
     "lidar_box": "LiDARBoxComponent",
     "lidar_segmentation": "LiDARSegmentationLabelComponent",
+    "camera_segmentation": "CameraSegmentationLabelComponent",
+    "lidar_camera_projection": "LiDARCameraProjectionComponent",
 }
 
 
@@ -361,11 +365,13 @@ def write_segment(
     form: Form = Form(),
     dropped: int | None = 2,
     segmented: Sequence[int] = (1,),
+    pictured: Sequence[int] = (),
     name: str = NAME,
     image: Callable[[Rig, World, int, float], np.ndarray] = image_of,
     quality: int = 98,
 ) -> Path:
-    """All components of a segment. segmented: frames with LiDAR segmentation. Returns root."""
+    """All components of a segment. segmented, pictured: frames with segmentation of TOP's returns,
+    and of images. Returns root."""
     world = Street(boxes) if world is None else world
     stamps = stamps_of(frames, dropped)
     key = [stamp_us(s) for s in stamps]
@@ -379,6 +385,8 @@ def write_segment(
     _write_images(root, rig, world, form, name, stamps, image, quality)
     _write_lasers(root, rig, form, name)
     _write_scans(root, rig, world, form, name, stamps, segmented)
+    if pictured:
+        _write_label_images(root, rig, world, form, name, [stamps[n] for n in pictured])
     _write_boxes(root, form, name, stamps, boxes)
     return root
 
@@ -471,6 +479,69 @@ def _write_scans(root, rig, world, form, name, stamps, segmented) -> None:
         columns = _ranges([scans[5 * n].labels for n in segmented], pa.int32())
         fields = {f"range_image_return{r}.{part}": c for r in (1, 2) for part, c in columns.items()}
         write_table(root, "lidar_segmentation", keys, fields, form, name=name)
+
+
+def _write_label_images(root, rig, world, form, name, stamps) -> None:
+    """Panoptic images, in whose corner the car shows itself, and where returns lie in them."""
+    pictures, projections = [], []
+    for s in stamps:
+        for n in range(5):
+            image = image_of(rig, world, n, s + MIDDLES_S[n])
+            grey, red = (image == image[..., :1]).all(-1), (image == [180, 60, 50]).all(-1)
+            blue = (image == [40, 90, 200]).all(-1)
+            classes = np.select([grey, red, blue], [20, 19, 2], 25)
+            classes[-4:, :8] = 1
+            panoptic = (classes * 1000 + 7 * (classes == 2)).astype(np.uint16)
+            pictures.append(cv2.imencode(".png", panoptic)[1].tobytes())
+        for laser in range(5):
+            scan = scan_of(rig, world, laser, s)
+            pixels = np.zeros((*scan.points.shape[:2], 6), np.float32)
+            seen = np.zeros(scan.points.shape[:2], int)
+            for n in range(5):
+                u, v, inside = pixels_of(rig, n, s + MIDDLES_S[n], scan.points)
+                for place in range(2):
+                    own = inside & (seen == place) & (scan.first[..., 0] > 0)
+                    values = np.stack([np.full(u.shape, n + 1), np.floor(u), np.floor(v)], -1)
+                    pixels[own, 3 * place : 3 * place + 3] = values[own]
+                    seen[own] += 10  # not again below
+                seen[seen >= 10] -= 9
+            projections.append(pixels)
+    key = np.repeat([stamp_us(s) for s in stamps], 5)
+    keys = {
+        "frame_timestamp_micros": pa.array(key),
+        "camera_name": form.names([1, 2, 3, 4, 5] * len(stamps), CAMERA_NAMES),
+    }
+    fields = {
+        "panoptic_label": pa.array(pictures),
+        "panoptic_label_divisor": pa.array([1000] * len(key), pa.int32()),
+    }
+    write_table(root, "camera_segmentation", keys, fields, form, name=name)
+    keys = {
+        "frame_timestamp_micros": keys["frame_timestamp_micros"],
+        "laser_name": form.names([1, 2, 3, 4, 5] * len(stamps), LASER_NAMES),
+    }
+    columns = _ranges(projections, pa.float32())
+    fields = {f"range_image_return{r}.{part}": c for r in (1, 2) for part, c in columns.items()}
+    write_table(root, "lidar_camera_projection", keys, fields, form, name=name)
+
+
+def pixels_of(
+    rig: Rig, number: int, seconds: float, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Recorded pixels u, v of points [..., 3] in camera 0 to 4 at a time, the left edge of the
+    first one being 0, and which are in the image."""
+    pose = car_pose(seconds) @ camera_extrinsic(number)
+    local = (points.reshape(-1, 3) - pose[:3, 3]) @ pose[:3, :3]
+    width, height, c_u, c_v = rig.camera(number)
+    matrix = np.array([[rig.focal, 0, c_u], [0, rig.focal, c_v], [0, 0, 1]])
+    cv = np.stack([-local[:, 1], -local[:, 2], local[:, 0]], axis=1)
+    zero, lens = np.zeros(3), np.array(rig.distortion)
+    u, v = cv2.projectPoints(cv, zero, zero, matrix, lens)[0][:, 0].T
+    ahead = (cv[:, 2] > 0.1) & (np.hypot(cv[:, 0], cv[:, 1]) < 0.9 * cv[:, 2])
+    inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return *(values.reshape(points.shape[:-1]) for values in (u, v)), inside.reshape(
+        points.shape[:-1]
+    )
 
 
 def _write_boxes(root, form, name, stamps, boxes) -> None:

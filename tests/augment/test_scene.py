@@ -160,6 +160,32 @@ def test_poses_are_those_of_the_geometry(turn_rad):
         torch.testing.assert_close(got, pose_by_tensors(moving, time), atol=1e-11, rtol=0)
 
 
+def test_poses_of_all_actors_at_once_are_those_of_their_tracks_to_the_bit():
+    rng = np.random.default_rng(0)
+    tracks = []
+    for number in range(40):
+        count = int(rng.integers(1, 7))
+        times = torch.from_numpy(10**18 + np.cumsum(rng.integers(1, 10**9, count)))
+        quats = torch.from_numpy(rng.normal(size=(count, 4)))
+        if number % 4 == 0:
+            quats = quats[:1] + 1e-7 * quats  # hardly any turn
+        poses = rigid(rotmat_from_quat(quats), torch.from_numpy(rng.normal(size=(count, 3))))
+        gap = None if number % 3 else 400_000_000
+        tracks.append(Track(times, poses, hold_ns=number * 10**7, max_gap_ns=gap))
+    gone = scene(
+        tuple(Actor(str(n), "car", some(), t, (4.0, 2.0, 1.0)) for n, t in enumerate(tracks))
+    )
+    samples = [time for t in tracks for time in t.timestamps_ns.tolist()]
+    for time in [*samples, *rng.integers(10**18, 10**18 + 4 * 10**9, 400).tolist()]:
+        expected = {n: t.pose_at(time) for n, t in enumerate(tracks, start=1)}
+        expected = {n: pose.numpy() for n, pose in expected.items() if pose is not None}
+        got = gone.poses_at(time)
+        assert got.keys() == expected.keys()
+        for number, pose in expected.items():
+            np.testing.assert_array_equal(got[number], pose)
+    assert scene().poses_at(0) == {}
+
+
 def test_track_times_must_increase():
     with pytest.raises(ValueError, match="strictly increasing"):
         Track(torch.tensor([5, 5]), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))

@@ -19,7 +19,20 @@ from augment.errors import ClimateGSError
 from augment.jobs.quality import Trial
 from recipes.schema import KNOBS, TIERS, knobs_of
 from tests.streets import SMALL_STREET, open_street
-from tools.bench import EFFECTS, dataset, fit, flood, gpu, jobs, raster, scenes, snow, style, trade
+from tools.bench import (
+    EFFECTS,
+    dataset,
+    fit,
+    flood,
+    gpu,
+    jobs,
+    lod,
+    raster,
+    scenes,
+    snow,
+    style,
+    trade,
+)
 from tools.bench.gpu import GpuCase, Timing, measure
 from tools.bench.harness import WallClock, rounds, run_in_subprocess
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect
@@ -99,6 +112,17 @@ def test_raster_measures_stages_work_and_the_reference():
     assert 0 < case["visible"] <= 400 and case["listed_pairs"] <= case["pairs"]
     assert beside["pixels"] == 64 * 48 and beside["flipped"] <= 3
     assert beside["p999"] <= 1e-4  # the agreement that backends promise
+
+
+@pytest.mark.long
+def test_levels_of_detail_are_measured_on_a_long_street():
+    tables = check_figures(lod.measure(quick=True, repeats=1))
+    views = {name: figures for name, *figures in next(iter(tables.values()))}
+    assert all(ms > 0 for ms, *_ in views.values())
+    errors = [views[f"lod_px {px:g}"][-2] for px in lod.SIZES_PX]  # FLIP
+    assert 0 <= errors[0] <= errors[-1] < 0.1
+    levels = [count for _, _, count, _ in tables["Levels"]]
+    assert levels == sorted(levels, reverse=True)
 
 
 @pytest.mark.long

@@ -34,6 +34,21 @@ def bench_raster(
     return _show(_subject("raster").measure(quick, repeats), json_file)
 
 
+def bench_lod(
+    scene: str | None = None, repeats: int = 7, quick: bool = False, json_file: JsonFile = None
+) -> int:
+    """Levels of detail: a view down a long street over its nearest 100 m alone, memory, accuracy.
+
+    Args:
+        scene: A scene folder with levels; by default a kilometre of 20 million splats is written,
+            which takes minutes and, for a while, 4 GB of the temporary folder's disk.
+        repeats: Timed frames of each kind.
+        quick: 200 metres of 100,000 splats.
+        json_file: Also write the figures to this file.
+    """
+    return _show(_subject("lod").measure(quick, repeats, scene), json_file)
+
+
 def bench_effects(
     only: tuple[Effect, ...] = EFFECTS,
     repeats: int = 7,
@@ -183,6 +198,7 @@ def bench_trade(
 
 COMMANDS = {
     "raster": bench_raster,
+    "lod": bench_lod,
     "effects": bench_effects,
     "trade": bench_trade,
     "fit": bench_fit,

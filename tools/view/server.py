@@ -283,7 +283,7 @@ class Viewer:
             self._draw(page, wish, moving=moving)
             own.due = due
         except _Outdated:
-            pass
+            own.last = time.monotonic()  # a small picture comes first, however long the pass took
         except Exception:
             page.show_status("not drawn")
             raise

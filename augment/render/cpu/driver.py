@@ -111,12 +111,12 @@ def gather_inputs(
         g, count = part.gaussians, len(part.gaussians)
         order = order_of(g) if culled else None
         if order is None:
-            firsts = np.arange(0, count, layout.BLOCK)
-            kept = np.stack([firsts, np.minimum(firsts + layout.BLOCK, count)], 1)
+            firsts = range(0, count, layout.BLOCK)
+            kept = [(first, min(first + layout.BLOCK, count)) for first in firsts]
             tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
             own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
         else:
-            kept = order.blocks_seen(part, camera, settings, fog, clip)
+            kept = order.blocks_seen(part, camera, settings, fog, clip).tolist()
             own = [order.means, *(order.sorted(t).rows for t in (g.quats, g.scales, g.opacities))]
             own.append(g.sh.detach().to(torch.float32).contiguous().numpy())
             arrays.append(order.ids)
@@ -124,7 +124,7 @@ def gather_inputs(
         arrays += own
         addresses.append([array.ctypes.data for array in own])
         orders.append(0 if order is None else order.ids.ctypes.data)
-        blocks.append(np.insert(kept, 0, number, axis=1))
+        blocks += [(number, first, last) for first, last in kept]
     sizes = [(len(part.gaussians), part.gaussians.sh.shape[1]) for part in parts]
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, fog, clip, with_color=with_color)
@@ -134,7 +134,7 @@ def gather_inputs(
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
         views=views_of(parts, camera, settings, fog, clip),
-        blocks=np.concatenate(blocks).astype(np.int64),
+        blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=modes,
         arrays=arrays,
         orders=np.array(orders, np.uint64),

@@ -1,0 +1,176 @@
+"""The documentation's pictures of rain and snowfall, made again, some minutes in all:
+
+    python -m tools.bench.pictures --drive scene:scenes/002
+
+A fitted PandaSet drive (docs/reconstruction.md) is what `drive` and `lidar` show; without --drive
+they are left as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import tyro
+
+from adapters.base import open_scene
+from augment.effects.lidar import codes
+from augment.effects.lidar.sweep import weathered_sweep
+from augment.geometry import invert_rigid
+from augment.scene import Scene
+from augment.views import render_view
+from recipes.load import load_recipe, read_overrides
+from recipes.schema import Recipe
+from tools.drawing import resized, write, write_rgb, write_video
+
+Which = Literal["street", "drive", "lidar", "video"]
+STREET = "procedural:street?seed=3&frames=40"
+FRAME = 12
+CELL_WIDTH, COLUMNS, QUALITY = 600, 3, 76
+SHOWN = ("drizzle", "rain", "downpour", "flurries", "snowfall", "blizzard")
+# One map on the finished picture, so that snow and flakes stand in the same light as the rest.
+DUSK = ("style.preset=grey-dusk", "style.strength=1", "style.applied_to=picture")
+VIDEO = {"downpour": range(20), "blizzard": range(20, 40)}
+VIDEO_SIZE, VIDEO_HZ = (640, 360), 10
+
+SWEEPS: dict[str, tuple[str, ...]] = {
+    "clear": (),
+    "fog, visibility 60 m": ("weather.smog.visibility_m=60",),
+    "flood, 12 cm, 60 NTU": ("weather.flood={level_m: 0.12, turbidity_ntu: 60}",),
+    "rain, 50 mm/h, wet road": ("weather.rain.rate_mm_h=50",),
+    "snowfall, 1 mm/h": ("weather.snowfall.rate_mm_h=1",),
+    "snow on the ground, 20 cm": ("weather.snow.depth_m=0.2",),
+}
+CODES = {
+    codes.UNCHANGED: ("unchanged", (150, 150, 150)),
+    codes.ATTENUATED: ("attenuated", (120, 185, 235)),
+    codes.LOST: ("lost (where it was)", (85, 85, 85)),
+    codes.MOVED: ("moved", (255, 255, 255)),
+    codes.SCATTERED: ("scattered", (255, 115, 60)),
+    codes.PRECIPITATION: ("drops, flakes", (255, 225, 70)),
+}
+PX_PER_M, PANEL, SIDE, GROUND = (
+    8,
+    (500, 350),
+    96,
+    24,
+)  # of a sweep's panel: its view from above, from the side; its grey
+
+
+def main(
+    which: tuple[Which, ...] = ("street", "drive", "lidar", "video"),
+    drive: str | None = None,
+    out: Path = Path("docs/images"),
+) -> None:
+    """Draw the documentation's pictures of rain and snowfall.
+
+    Args:
+        which: Which of them.
+        drive: A fitted drive with a camera front_camera and LiDAR sweeps.
+        out: The folder.
+    """
+    if "street" in which or "video" in which:
+        street = open_scene(STREET)
+        if "street" in which:
+            draw_weathers(street, "front", 1.0, out / "rain-street.jpg")
+        if "video" in which:
+            frames = drive_through(street, "front")
+            write_video(out / "rain.mp4", frames, VIDEO_HZ)
+    if drive is not None and ("drive" in which or "lidar" in which):
+        fitted = open_scene(drive)
+        if "drive" in which:
+            draw_weathers(fitted, "front_camera", 0.5, out / "rain-drive.jpg")
+        if "lidar" in which:
+            write_rgb(out / "lidar-weather.png", sweeps_from_above(fitted))
+
+
+def recipe_of(preset: str, sets: Sequence[str], scale: float = 1.0) -> Recipe:
+    overrides = read_overrides([*sets, f"render.scale={scale}"])
+    return load_recipe(preset, overrides).resolve(0)
+
+
+def draw_weathers(scene: Scene, camera: str, scale: float, path: Path) -> None:
+    """What falls, COLUMNS beside each other, each by day above itself at dusk."""
+    lines = []
+    own = scene.frame(FRAME).cameras[camera]
+    for first in range(0, len(SHOWN), COLUMNS):
+        for time, sets in (("day", ()), ("dusk", DUSK)):
+            cells = []
+            for preset in SHOWN[first : first + COLUMNS]:
+                rgb = render_view(scene, own, recipe_of(preset, sets, scale)).rgb
+                cell = resized(rgb, CELL_WIDTH, cv2.INTER_AREA)
+                named(cell, f"{preset}, {time}")
+                cells.append(cell)
+            lines.append(np.hstack(cells))
+    write_rgb(path, np.vstack(lines), jpeg_quality=QUALITY)
+
+
+def drive_through(scene: Scene, camera: str) -> Iterator[np.ndarray]:
+    """One drive whose weather changes."""
+    for preset, numbers in VIDEO.items():
+        for number in numbers:
+            own = scene.frame(number).cameras[camera].resized(*VIDEO_SIZE)
+            rgb = render_view(scene, own, recipe_of(preset, ("camera.noise=0",))).rgb.copy()
+            named(rgb, preset)
+            yield rgb
+
+
+def named(image: np.ndarray, text: str) -> None:
+    write(image, text, 11, 25, size=0.6, color=(0, 0, 0))
+    write(image, text, 10, 24, size=0.6, color=(255, 255, 255))
+
+
+def sweeps_from_above(scene: Scene) -> np.ndarray:
+    """A panel for each of SWEEPS: from above, the shares of its codes, from the side."""
+    panels = [_panel(scene, title, recipe_of("clear", sets)) for title, sets in SWEEPS.items()]
+    lines = [np.hstack(panels[k : k + COLUMNS]) for k in range(0, len(panels), COLUMNS)]
+    return np.vstack(lines)
+
+
+def _panel(scene: Scene, title: str, recipe: Recipe) -> np.ndarray:
+    frame = scene.frame(FRAME)
+    source = scene.lidar(FRAME)
+    assert source is not None, f"{scene.name} has no sweep of frame {FRAME}"
+    sweep = weathered_sweep(scene, recipe, FRAME, source)
+    found = sweep.columns.get(codes.CODE_COLUMN, np.zeros(len(sweep.points_m), np.uint8))
+    points = np.where((found == codes.LOST)[:, None], source.points_m, sweep.points_m)
+    ego_from_world = invert_rigid(frame.world_from_ego).numpy()
+    points = points - np.asarray(scene.world_origin_m)
+    points = points @ ego_from_world[:3, :3].T + ego_from_world[:3, 3]
+
+    width, height = PANEL
+    panel = np.full((height + SIDE, width, 3), GROUND, np.uint8)
+    across = width / 3 + PX_PER_M * points[:, 0]
+    above = height / 2 - PX_PER_M * points[:, 1]
+    beside = height + SIDE - 12 - PX_PER_M * points[:, 2]
+    is_near = np.abs(points[:, 1]) < 6  # what the view from the side shows
+    shares = []
+    for code, (name, color) in CODES.items():
+        own = found == code
+        _dot(panel[:height], across[own], above[own], color)
+        if code != codes.LOST:
+            _dot(panel[height:], across[own & is_near], beside[own & is_near] - height, color)
+        if own.any():
+            percent = 100 * own.mean()
+            shares.append(
+                (f"{name} {percent:.0f} %" if percent >= 1 else f"{name} {percent:.1g} %", color)
+            )
+    panel[: 36 + 17 * len(shares), :210] = GROUND
+    write(panel, title, 12, 24, size=0.6, color=(255, 255, 255))
+    for line, (text, color) in enumerate(shares):
+        write(panel, text, 12, 44 + 17 * line, size=0.42, color=color)
+    panel[height] = panel[0] = panel[:, 0] = 90
+    return panel
+
+
+def _dot(image: np.ndarray, x: np.ndarray, y: np.ndarray, color: tuple[int, int, int]) -> None:
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
+    image[row[inside], column[inside]] = color
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
