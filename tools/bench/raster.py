@@ -156,7 +156,7 @@ def multiply_add(rounds, sums):
 
 def _blending(repeats: int) -> Figures:
     """How many blends a second of one core's time, and multiply-adds in turn with them."""
-    (width, height), side = SHEETS_SIZE, SHEETS_SIZE[0]
+    (width, height), side = SHEETS_SIZE, float(SHEETS_SIZE[0])
     means = torch.zeros(SHEETS, 3)
     means[:, 2] = torch.linspace(2, 3, SHEETS)
     sheets = Gaussians(
