@@ -35,6 +35,7 @@ from tools.bench import (
 )
 from tools.bench.gpu import GpuCase, Timing, measure
 from tools.bench.harness import WallClock, rounds, run_in_subprocess
+from tools.bench.pictures import DUSK, SHOWN, SWEEPS, recipe_of
 from tools.bench.scenes import EffectCase, RasterCase, measure_effect
 from tools.bench.trade import (
     DEPTH,
@@ -396,3 +397,19 @@ def test_errors_of_settings_grow_away_from_the_reference(monkeypatch):
     assert rows[DEPTH, "none"]["off_5cm"] is None
     assert rows[DEPTH, "median"]["depth_against"] == trade.TRUTH  # the street's surfaces
     assert 0.01 < rows[DEPTH, "median"]["abs_rel"] < 0.3  # a pixel of this picture is 15 of its own
+
+
+# ---- the documentation's pictures ----------------------------------------------------------------
+
+
+def test_the_documentations_pictures_show_what_their_captions_say():
+    for preset in SHOWN:
+        day, dusk = (recipe_of(preset, sets) for sets in ((), DUSK))
+        assert dusk.weather == day.weather and day.sections().keys() & {
+            "weather.rain",
+            "weather.snowfall",
+        }
+        assert dusk.style is not None and dusk.style.preset == "grey-dusk"
+    sections = [recipe_of("clear", sets).sections() for sets in SWEEPS.values()]
+    shown = [section.rpartition(".")[2] for each in sections for section in each]
+    assert shown == ["smog", "flood", "rain", "snowfall", "snow"]
