@@ -92,7 +92,7 @@ def recognise(path: Path) -> str:
     scheme = recognised(path)
     if scheme is None:
         raise AdapterError(
-            f"{path}: not recognised as a scene; looked for {looked_for(path)}. "
+            f"{path}: not recognised as a scene. {looked_for(path)}. "
             f"Or name the scheme: {known_schemes()}"
         )
     return scheme

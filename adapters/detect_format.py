@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,14 +131,92 @@ def recognised(path: Path) -> str | None:
 
 
 def looked_for(path: Path) -> str:
-    """What was looked for at a path that is not recognised, and scenes that lie below it."""
+    """Sentences: what lies at a path that is not recognised, or below it, what it lacks, and what
+    was looked for."""
     signatures = FILES if path.is_file() else FOLDERS
     *most, last = (s.what for s in signatures)
     text = f"{', '.join(most)}, or {last}"
     if path.is_file():
-        return text
+        return f"Looked for {text}"
     below = next(_scenes_below(path), None)
-    return text if below is None else f"{text}. It holds scenes: give one, such as {below}"
+    if below is not None:
+        return f"It holds scenes: give one, such as {below}. Looked for {text}"
+    return f"{_advice(path)}. Looked for {text}"
+
+
+# What makes a folder each of these: patterns below it, any of which does, in the words for them.
+_RECORDING = "a recording"
+_PARTS: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
+    "a PandaSet sequence": (("camera/", ("camera",)), ("lidar/", ("lidar",))),
+    "a nuScenes dataset": (
+        ("v1.0-*/scene.json", ("v1.0-*/scene.json",)),
+        ("samples/", ("samples",)),
+    ),
+    "a KITTI drive": (
+        ("image_02/", ("image_0?",)),
+        ("velodyne_points/", ("velodyne_points",)),
+        ("calib_cam_to_cam.txt", ("calib_cam_to_cam.txt", "../calib_cam_to_cam.txt")),
+    ),
+    "a KITTI object folder": (
+        ("image_2/", ("image_2", "training/image_2")),
+        ("velodyne/", ("velodyne", "training/velodyne")),
+        ("calib/", ("calib", "training/calib")),
+    ),
+    "an Argoverse 2 log": (
+        ("city_SE3_egovehicle.feather", ("city_SE3_egovehicle.feather",)),
+        ("calibration/intrinsics.feather", ("calibration/intrinsics.feather",)),
+        ("sensors/lidar/", ("sensors/lidar",)),
+        ("sensors/cameras/", ("sensors/cameras",)),
+    ),
+    _RECORDING: (
+        ("calibration.json", ("calibration.json", "calibration/*.json")),
+        ("images/<camera>/000000.jpg", ("images/*/*[0-9].jpg", "images/*/*[0-9].png")),
+    ),
+}
+_IMAGES, _VIDEOS = (".jpg", ".jpeg", ".png"), (".mp4", ".mov", ".avi", ".mkv")
+_MAX_SEEN = 20_000  # files of an unknown folder that are counted
+_MOST_KINDS = 6  # that are named
+
+
+def _advice(folder: Path) -> str:
+    """What an unknown folder holds, what it nearly is, and what would make it a recording."""
+    from adapters.camera_files.camera_files import find_colmap_model
+
+    places: dict[str, Counter[str]] = {}
+    walk = ((place, name) for place, _, names in os.walk(folder) for name in sorted(names))
+    for place, name in itertools.islice(walk, _MAX_SEEN):
+        kind = os.path.splitext(name)[1].lower() or name
+        places.setdefault(kind, Counter())[os.path.relpath(place, folder)] += 1
+    kinds = sorted(places.items(), key=lambda kind: (-kind[1].total(), kind[0]))
+    counts = [
+        f"{where.total()} {kind} ({where.most_common(1)[0][0]}/"
+        f"{' and others' if len(where) > 1 else ''})".replace(" (./)", "")
+        for kind, where in kinds[:_MOST_KINDS]
+    ]
+    more = f" and {len(kinds) - _MOST_KINDS} more kinds" if len(kinds) > _MOST_KINDS else ""
+    said = [f"It holds {', '.join(counts) or 'no files'}{more}"]
+    for what, parts in _PARTS.items():
+        there = [n for n, patterns in parts if any(any(folder.glob(p)) for p in patterns)]
+        missing = [name for name, _ in parts if name not in there]
+        if there and missing:
+            is_are = "is" if len(there) == 1 else "are"
+            said.append(
+                f"It is nearly {what}: {', '.join(there)} {is_are} there, {', '.join(missing)} not"
+            )
+    guide = "docs/reconstruction.md, A drive of your own"
+    if (model := find_colmap_model(folder)) is not None:
+        said.append(
+            f"It holds a COLMAP model: `climategs record {model} --images FOLDER --out RECORDING "
+            f"--fps N --camera-height METRES` makes a recording of it"
+        )
+    elif any(kind in places for kind in _IMAGES):
+        said.append(
+            f"Its images make a recording with their poses: images/<camera>/000000.jpg and "
+            f"calibration.json (docs/scenes.md); COLMAP finds poses ({guide})"
+        )
+    elif any(kind in places for kind in _VIDEOS):
+        said.append(f"Of a video's frames COLMAP and `climategs record` make a recording ({guide})")
+    return ". ".join(said)
 
 
 def _scenes_below(folder: Path) -> Iterator[Path]:
@@ -188,11 +267,11 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    return sum(name.lower().endswith((".ply", ".splat")) for name in _names(folder)) == 1
+    return sum(name.lower().endswith((".ply", ".splat", ".spz")) for name in _names(folder)) == 1
 
 
 def _is_splat_file(path: Path) -> bool:
-    return path.suffix.lower() == ".splat" or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+    return path.suffix.lower() in (".splat", ".spz") or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
 
 def _is_multi_part(path: Path) -> bool:
@@ -250,8 +329,8 @@ FOLDERS = (
     Signature(
         "gaussians",
         _holds_splats,
-        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply or "
-        ".splat file in it",
+        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
+        ".splat or .spz file in it",
     ),
 )
 FILES = (
@@ -266,5 +345,5 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply or .splat file"),
+    Signature("gaussians", _is_splat_file, "a .ply, .splat or .spz file"),
 )

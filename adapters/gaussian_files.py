@@ -1,4 +1,4 @@
-"""Scenes from plain splat files: a .ply or .splat, alone or in a trained 3DGS model's folder.
+"""Scenes from plain splat files: a .ply, .splat or .spz, alone or in a trained 3DGS model's folder.
 
     gaussians:PATH?up=-y&scale=1&cameras=FILE
 
@@ -358,12 +358,12 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
         if iteration is not None and iteration not in found:
             raise AdapterError(f"{path}: no iteration {iteration}; it has {sorted(found)}")
         return found[max(found) if iteration is None else iteration]
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in (".ply", ".splat"))
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in (".ply", ".splat", ".spz"))
     if len(files) != 1:
         names = [p.name for p in files[:8]]
         raise AdapterError(
-            f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply or "
-            f".splat file in this folder; found {names or 'none'}. Give the file itself"
+            f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply, "
+            f".splat or .spz file in this folder; found {names or 'none'}. Give the file itself"
         )
     return files[0]
 

@@ -443,7 +443,8 @@ class RawDrive:
     all frames, in the dataset's world, with the meaning of the sweeps' classes. lidar_top_deg: the
     highest elevation that the LiDAR looks at. problems: what is missing or damaged, a sentence
     each. used_rows: by camera, the part of the rows from the top that does not show the car.
-    grey_cameras: those whose images say nothing of colour."""
+    grey_cameras: those whose images say nothing of colour. colour_every: of the frames that are
+    used, every such one gives colours and sky."""
 
     name: str
     source: str
@@ -457,6 +458,7 @@ class RawDrive:
     problems: tuple[str, ...]
     used_rows: Mapping[str, float] = field(default_factory=dict)
     grey_cameras: frozenset[str] = frozenset()
+    colour_every: int = 1
     has_metric_scale: bool = True
 
     @property

@@ -183,6 +183,60 @@ class InspectOptions(SceneCommand):
         return 0
 
 
+class RecordOptions(Command):
+    """Make a recording of a COLMAP reconstruction, of a phone's video, say.
+
+    docs/reconstruction.md has every command on the way.
+
+    Args:
+        model: The folder of the COLMAP model, or of the project that holds sparse/0.
+        images: The folder of the images that COLMAP was run on, named by their frame's number;
+            those of several cameras in a folder each.
+        out: The recording's folder, new.
+        fps: Images a second.
+        camera_height: Height of the camera above the road in metres. Without it and positions the
+            recording has no metres.
+        positions: A CSV table with the columns image, lat, lon, or image, x, y in metres: where
+            images were taken. It also turns the recording's x to the east.
+    """
+
+    model: Positional[Path]
+    images: Path
+    out: Path
+    fps: Annotated[float, Field(gt=0, le=1000)]
+    camera_height: Annotated[float, Field(gt=0.05, le=20)] | None = None
+    positions: Path | None = None
+
+    def run(self) -> int:
+        from adapters.recording.from_colmap import record_colmap
+
+        made = record_colmap(
+            self.model,
+            self.images,
+            self.out,
+            fps=self.fps,
+            camera_height_m=self.camera_height,
+            positions=self.positions,
+        )
+        road = made.road
+        print(f"{made.frames} frames, {made.images} images; {made.left_out} have no pose, left out")
+        print(
+            f"road: {road.points} points, half of them within {100 * road.residual:.1f} % of the "
+            f"cameras' height of one plane, which is taken for level"
+        )
+        if made.metres is None:
+            print("metres are not known: give --camera-height or --positions")
+        else:
+            print(
+                f"scale: {made.metres:.4g} m a unit of COLMAP's; the cameras are "
+                f"{made.metres * road.height:.2f} m above the road"
+            )
+        if made.residual_m is not None:
+            print(f"positions: half of them within {made.residual_m:.2f} m")
+        print(f"recording: {self.out}")
+        return 0
+
+
 class ExplainOptions(RecipeCommand):
     """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
@@ -390,31 +444,31 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
 
 
 class ExportOptions(SceneCommand):
-    """Write a scene as one file to share, or for other programs: .ply, .splat.
+    """Write a scene as one file to share, or for other programs: .ply, .splat, .spz.
 
     What the kind of file cannot keep is said.
 
     Args:
         scene: The scene, as for render.
         out: The file or folder; a file's suffix is added where it lacks.
-        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat:
+        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz:
             Gaussians as they are at one frame. ply-parts: background and every actor apart.
-        frame: At which ply and splat are baked. The first by default.
+        frame: At which ply, splat and spz are baked. The first by default.
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
 
     scene: Positional[str]
     out: Path
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat"] = "file"
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz"] = "file"
     frame: int | None = None
     half: bool = False
     overwrite: bool = False
 
     @model_validator(mode="after")
     def _kind_has_them(self) -> Self:
-        if self.frame is not None and self.kind not in ("ply", "splat"):
-            text = "--frame is for ply and splat, which show one moment; not for"
+        if self.frame is not None and self.kind not in ("ply", "splat", "spz"):
+            text = "--frame is for ply, splat and spz, which show one moment; not for"
             raise ValueError(f"{text} {self.kind}")
         if self.half and self.kind != "file":
             text = "--half is for a single scene file (--kind file); not for"
@@ -546,6 +600,7 @@ COMMANDS = {
     "render": RenderOptions,
     "generate": GenerateOptions,
     "fit": FitOptions,
+    "record": RecordOptions,
     "inspect": InspectOptions,
     "explain": ExplainOptions,
     "view": ViewOptions,

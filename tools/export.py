@@ -24,6 +24,7 @@ from augment.files.export import (
     export_ply,
     export_ply_parts,
     export_splat,
+    export_spz,
 )
 from augment.files.scene_file import (
     FILES,
@@ -60,7 +61,12 @@ from tools.output import fill, print_note
 if TYPE_CHECKING:
     from tools.cli import ExportOptions
 
-_SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
+_SUFFIXES: dict[ExportKind, str] = {
+    "file": SCENE_SUFFIX,
+    "ply": ".ply",
+    "splat": ".splat",
+    "spz": ".spz",
+}
 
 
 def recipes_for_source(
@@ -345,6 +351,9 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
+    if kind == "spz":
+        export_spz(scene, out, moment)
+        return [out]
     if kind == "ply":
         export_ply(scene, out, moment)
     else:

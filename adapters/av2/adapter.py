@@ -333,6 +333,8 @@ _LIDAR_TOP_DEG = 25.0  # down_lidar's uppermost laser: it hangs upside down
 _NEAR_NS = 25_000_000  # images come every 50 ms
 # The car (4.9 m by 1.9 m, origin at the rear axle). Published sweeps hold no return in it.
 _EGO_M = np.array([[-1.3, -1.1, -0.5], [4.0, 1.1, 1.9]])
+# Of a whole log: an image every few metres shows all there is, and a voxel is hit more than once.
+_MAX_COLOUR_IMAGES, _MAX_RETURNS = 150, 8_000_000
 _GREY_LEVELS = 6  # apart, colours of a grey image are the JPEG's rounding
 
 
@@ -366,6 +368,8 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
         for number, camera in times
     ]
     images = usable_images(pictures) if pictures else DriveImages({}, {}, ())
+    grey = _grey_cameras(images)
+    coloured = sum(len(images.paths.get(n, {}).keys() - grey) for n in chosen.used)
     frames = tuple(_frame(log, number, times, images, origin) for number in chosen.numbers)
     sweeps, spin, sweep_problems = _read_sweeps(log, chosen.used, origin)
     moving, box_problems = _moving_boxes(log, spin, frames, origin)
@@ -387,7 +391,8 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
             *sweep_problems,
             *box_problems,
         ),
-        grey_cameras=_grey_cameras(images),
+        grey_cameras=grey,
+        colour_every=max(1, -(-coloured // _MAX_COLOUR_IMAGES)),
     )
 
 
@@ -490,6 +495,10 @@ def _read_sweeps(
         sweep = Sweep(points, stamp + returns.offsets_ns, classes)
         pose = log.city.at(np.array([stamp]))[0]
         sweeps.append(sweep.select(is_usable(sweep, city, pose, _EGO_M)))
+    part = _MAX_RETURNS / max(_MAX_RETURNS, sum(map(len, sweeps)))
+    if part < 1:  # rows go by lasers in turn: every other one would be half of the lasers
+        rng = np.random.default_rng(len(sweeps))
+        sweeps = [sweep.select(rng.random(len(sweep)) < part) for sweep in sweeps]
     return tuple(sweeps), spin, tuple(problems)
 
 

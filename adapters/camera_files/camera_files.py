@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -261,8 +261,8 @@ def find_colmap_model(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap_views(model: Path) -> ViewSet:
-    """Views of the registered images. Lens distortion is left out, and said so."""
+def open_colmap_model(model: Path) -> Any:
+    """pycolmap's Reconstruction of the model in a folder."""
     try:
         import pycolmap  # a large native library: only those who have COLMAP models need it
     except ImportError:
@@ -271,12 +271,17 @@ def read_colmap_views(model: Path) -> ViewSet:
             "pip install 'climategs[colmap]'"
         ) from None
     try:
-        reconstruction = pycolmap.Reconstruction(str(model))
+        return pycolmap.Reconstruction(str(model))
     except (ValueError, RuntimeError, IndexError) as error:
         raise AdapterError(
             f"{model}: pycolmap cannot read this COLMAP model: {error}. Expected cameras, images "
             "and points3D, all .bin or all .txt"
         ) from error
+
+
+def read_colmap_views(model: Path) -> ViewSet:
+    """Views of the registered images. Lens distortion is left out, and said so."""
+    reconstruction = open_colmap_model(model)
     # Images of a model in project/sparse/0, project/sparse or project.
     folders = [parent / "images" for parent in (model, model.parent, model.parent.parent)]
     folder = next((f for f in folders if f.is_dir()), None)

@@ -109,7 +109,7 @@ def build_lidar_scene(
     surfels = [surfels_from_points(p.points, e, semantic=p.semantic) for p, e in sampled]
     bodies = [Body(*pair) for pair in zip(surfels, [None, *tracks], strict=True)]
     sky = SkyGatherer(options.sky_size, math.radians(drive.lidar_top_deg))
-    views = views_of(drive.used, drive.used_rows)
+    views = views_of(drive.used[:: drive.colour_every], drive.used_rows)
     views = with_own_car([v for v in views if v.camera.name not in drive.grey_cameras])
     seen, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
     parts = [

@@ -22,6 +22,7 @@ from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
+from augment.files.spz import write_spz
 from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
@@ -32,7 +33,7 @@ from augment.semantics import SemanticClass
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 
 _SEEN_PX = 0.1
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat"]
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz"]
 
 
 def export_losses(
@@ -44,7 +45,7 @@ def export_losses(
     if kind in ("scene", "file"):
         return tuple(_of_saved(scene, kind, half=half))
     found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
-    return (*found, *_of_facts(scene))
+    return (*found, *_of_facts(scene, kind))
 
 
 def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
@@ -80,11 +81,14 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
                 f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
-    if kind == "splat" and scene.world_origin_m.any():
+    if kind in ("splat", "spz") and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
     if kind == "splat":
         yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
+    if kind == "spz":
+        yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
+        yield "cameras are left out"
 
 
 def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
@@ -103,6 +107,13 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
             "colours of actors by direction are for directions of the world, and viewers turn them "
             "with the actor"
         )
+    if kind == "spz":
+        yield (
+            "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
+            "degrees, opacities, colours and SH to 8 bits and less; SH beyond -1 and 1 is cut off"
+        )
+        if any(part.semantic is not None for part in scene.all_gaussians):
+            yield "semantic classes are left out"
     if kind == "splat":
         yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
@@ -111,13 +122,13 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
             yield "semantic classes are left out"
 
 
-def _of_facts(scene: Scene) -> Iterator[str]:
+def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if scene.labels is not None:
         yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras:
+    if cameras and kind != "spz":
         off = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -232,6 +243,13 @@ def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     """Write the scene as it is at a moment into a .splat."""
     gaussians = _something(scene, timestamp_ns)
     write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
+
+
+def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .spz, y up."""
+    z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+    gaussians = _something(scene, timestamp_ns)
+    write_spz(path, moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64)))
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:

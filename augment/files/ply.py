@@ -356,21 +356,25 @@ class SplatFile:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a .ply or .splat file, told apart by its first bytes. Raises SceneError: no such file,
-    an unknown format, or damaged content; says what was expected.
+    """Read a .ply, .splat or .spz file, told apart by its first bytes. Raises SceneError: no such
+    file, an unknown format, or damaged content; says what was expected.
     """
+    from augment.files.spz import GZIP, read_spz  # which takes this module's records
+
     path = Path(path)
     if not path.is_file():
-        raise SceneError(f"{path}: no such file; expected a .ply or .splat file")
+        raise SceneError(f"{path}: no such file; expected a .ply, .splat or .spz file")
     with path.open("rb") as file:
         start = file.read(4)
     if start[:3] == b"ply" and start[3:] in (b"\n", b"\r"):
         return read_ply(path)
+    if start[:2] == GZIP:
+        return read_spz(path)
     if path.suffix.lower() == ".splat":
         return read_splat(path)
     raise SceneError(
-        f"{path}: neither a .ply (its first line would be 'ply') nor named .splat; convert other "
-        "splat formats (.spz, .ksplat, .sog) to .ply first, for example with SuperSplat"
+        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz, nor named .splat; "
+        "convert other splat formats (.ksplat, .sog) to .ply first, for example with SuperSplat"
     )
 
 

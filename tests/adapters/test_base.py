@@ -108,8 +108,8 @@ def test_what_opens_no_scene_is_answered_with_what_would(tmp_path: Path) -> None
         f"gaussians:{tmp_path}/a/b.ply": f"no such file or folder.*exists up to {tmp_path}",
         f"pandaset:{tmp_path}/x": "no such file or folder",
         f"{tmp_path}/x?up=z": "no such file or folder",
-        f"{tmp_path}/text.txt": r"looked for .*a \.ply or \.splat file",
-        str(tmp_path): r"not recognised as a scene; looked for .*a PandaSet",
+        f"{tmp_path}/text.txt": r"Looked for .*a \.ply or \.splat file",
+        str(tmp_path): r"not recognised as a scene\. It holds 1 \.txt\. Looked for .*a PandaSet",
     }.items():
         with pytest.raises(AdapterError, match=message):
             open_scene(uri)
@@ -205,9 +205,33 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
         recognise(tmp_path / "set")
     for signature in FOLDERS:
         assert signature.what in str(caught.value)
-    assert f"give one, such as {tmp_path}/set/seq. Or name the scheme" in str(caught.value)
+    assert f"give one, such as {tmp_path}/set/seq. Looked for" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
     assert all(signature.what in looked_for(tmp_path / "a.txt") for signature in FILES)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ([], r"It holds no files\. Looked for"),
+        (["a/1.jpg", "a/2.jpg", "b/3.jpg", "x.db"], r"It holds 3 \.jpg \(a/ and others\), 1 \.db\. "
+         r"Its images make a recording with their poses: images/<camera>/000000\.jpg and calib"),
+        (["drive.mp4"], r"It holds 1 \.mp4\. Of a video's frames COLMAP and `climategs record`"),
+        (["images/front/000000.jpg"], r"nearly a recording: images/<camera>/000000\.jpg is there, "
+         r"calibration\.json not"),
+        (["image_02/data/0.png", "velodyne_points/data/0.bin"], r"nearly a KITTI drive: image_02/, "
+         r"velodyne_points/ are there, calib_cam_to_cam\.txt not"),
+        (["sensors/lidar/1.feather"], r"nearly an Argoverse 2 log: sensors/lidar/ is there, "
+         r"city_SE3_egovehicle\.feather, calibration/intrinsics\.feather, sensors/cameras/ not"),
+        (["frames/1.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin"],
+         r"a COLMAP model: `climategs record .*/sparse/0 --images FOLDER"),
+    ],
+)  # fmt: skip
+def test_an_unknown_folder_is_told_what_it_lacks(tmp_path, files, said):
+    grow(tmp_path / "new", files, b"x")
+    (tmp_path / "new").mkdir(exist_ok=True)
+    with pytest.raises(AdapterError, match=said):
+        recognise(tmp_path / "new")
 
 
 def uris(folder: Path, *entries: str | JobScene) -> list[str]:

@@ -365,9 +365,9 @@ def test_bad_splat_files(tmp_path: Path) -> None:
     path.write_bytes(np.random.default_rng(0).bytes(32_000))
     with pytest.raises(SceneError, match=r"probably no \.splat"):
         read_splats(path)
-    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b")
+    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04")
     with pytest.raises(SceneError, match="convert other splat formats"):
-        read_splats(tmp_path / "a.spz")
+        read_splats(tmp_path / "a.sog")
     for read in (read_splats, read_ply):
         with pytest.raises(SceneError, match="no such file"):
             read(tmp_path / "absent.ply")

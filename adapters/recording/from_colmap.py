@@ -1,0 +1,452 @@
+"""A COLMAP reconstruction of a video as a recording: undistorted images, poses in metres with z up,
+and depth between the points that were found.
+
+COLMAP knows neither metres nor which way is up. Both come from the road: the plane under the
+cameras that most of the low points lie on is taken for level, and a camera's height above it, or
+GPS, says how long a unit is. Without moving boxes all that moves by itself is part of the street.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from tqdm import tqdm
+
+from adapters.camera_files.camera_files import find_colmap_model, open_colmap_model
+from adapters.plain_files import LARGEST, decode_image, inside, read_text
+from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
+from adapters.world import invert_pose
+from augment.errors import AdapterError
+from augment.jobs.files import encode_depth
+
+CAMERA = "camera"  # of images that lie in no folder of their own
+_JPEG_QUALITY = 97
+_MAX_ERROR_PX = 2.0  # of a point's reprojection
+# The road: heights of its points stray by this part of their distance from the cameras.
+_ON_ROAD, _MAX_TILT_DEG, _MIN_ON_ROAD = 0.01, 8.0, 30
+_MAX_RESIDUAL = 0.1  # of the cameras' height
+_TRIES, _MOST_POINTS, _SEED = 2000, 20_000, 20260101
+_MIN_PATH_HEIGHTS = 2.0
+_LOW_DEG = 3.0  # points that are seen further below the horizon may be the road's
+# Depth between points: across triangles whose corners are this near in pixels of the width, and in
+# depth; where the cameras drove, the road itself has points.
+_MAX_EDGE, _MAX_RATIO = 1 / 6, 1.5
+_LANE_M, _LANE_STEP_M, _LANE_REACH_M = 1.0, 0.5, 30.0
+_EARTH_M = 6_378_137.0
+_MIN_PATH_M = 5.0  # GPS is wrong by metres
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """An image with a pose. name: in the model, which is its path below the images' folder. lens:
+    pycolmap's camera. model_from_camera: float64 [4, 4]. points: float64 [N, 3], those that it
+    shows, in the model's world."""
+
+    name: str
+    camera: str
+    frame: int
+    lens: Any
+    model_from_camera: np.ndarray
+    points: np.ndarray
+
+
+class Road(NamedTuple):
+    """The plane normal @ p + offset = 0 under the cameras, its unit normal upwards, in the model's
+    world. height: the cameras' median one above it, in the model's unit. points: how many lie on
+    it; residual: their median distance from it over the height."""
+
+    normal: np.ndarray
+    offset: float
+    height: float
+    points: int
+    residual: float
+
+
+class Recorded(NamedTuple):
+    """What was written. metres: in a unit of the model; None where that is not known. left_out:
+    images of the folder that have no pose."""
+
+    frames: int
+    images: int
+    left_out: int
+    road: Road
+    metres: float | None
+    residual_m: float | None
+
+
+def record_colmap(
+    model: Path,
+    images: Path,
+    out: Path,
+    *,
+    fps: float,
+    camera_height_m: float | None = None,
+    positions: Path | None = None,
+) -> Recorded:
+    """Writes the recording of a COLMAP model to the folder `out`.
+
+    images: the folder of its images; one in a subfolder is of a camera of that name. An image's
+    last digits are its frame, taken at frame / fps seconds. camera_height_m: of the cameras' middle
+    above the road. positions: a table of where images were taken, see `read_positions`; it also
+    says which way is north.
+
+    Raises:
+        AdapterError: no model or images; no road under the cameras; positions that say nothing."""
+    if out.exists() and any(out.iterdir()):
+        raise AdapterError(f"{out} is not empty; give a new folder")
+    shots = read_shots(model)
+    road = find_road(shots)
+    _check_path(shots, road, model)
+    metres = None if camera_height_m is None else camera_height_m / road.height
+    world_from_model, residual_m = _levelled(shots[0], road), None
+    if positions is not None:
+        known = read_positions(positions)
+        turn, measured, residual_m = _fit_positions(shots, world_from_model, known, positions)
+        world_from_model = turn @ world_from_model
+        metres = measured if metres is None else metres
+    scale = 1.0 if metres is None else metres
+    poses = {shot.name: _scaled(world_from_model @ shot.model_from_camera, scale) for shot in shots}
+    egos = _egos(shots, poses, scale * road.height)
+    lane = _lane(list(egos.values()))
+    frames: dict[int, dict[str, Any]] = {}
+    for shot in tqdm(shots, desc="images", unit="image", disable=None):
+        lens = _write_image(shot, images, out)
+        world = shot.points @ world_from_model[:3, :3].T + world_from_model[:3, 3]
+        _write_depth(out, shot, lens, poses[shot.name], scale * world, lane)
+        frame = frames.setdefault(
+            shot.frame,
+            {
+                "frame": shot.frame,
+                "timestamp_ns": round(shot.frame / fps * 1e9),
+                "world_from_ego": egos[shot.frame].tolist(),
+                "cameras": {},
+            },
+        )
+        frame["cameras"][shot.camera] = lens | {"world_from_camera": poses[shot.name].tolist()}
+    content = {
+        "scene": out.absolute().name,
+        "has_metric_scale": metres is not None,
+        "frames": [frames[number] for number in sorted(frames)],
+    }
+    (out / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
+    there = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in images.rglob("*"))
+    return Recorded(len(frames), len(shots), there - len(shots), road, metres, residual_m)
+
+
+# ---- The model -----------------------------------------------------------------------------------
+
+
+def read_shots(model: Path) -> list[Shot]:
+    """The images that have poses, by frame and camera."""
+    found = find_colmap_model(model)
+    if found is None:
+        raise AdapterError(
+            f"{model} holds no COLMAP model: expected cameras, images and points3D, .bin or .txt, "
+            f"in it or in sparse/0"
+        )
+    reconstruction = open_colmap_model(found)
+    points = {
+        number: np.asarray(point.xyz)
+        for number, point in reconstruction.points3D.items()
+        if point.error <= _MAX_ERROR_PX
+    }
+    shots: dict[tuple[int, str], Shot] = {}
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        digits = re.search(r"(\d{1,15})\D*$", Path(image.name).stem)
+        if digits is None:
+            raise AdapterError(
+                f"{found}: image {image.name} has no frame number; name images as 000001.jpg"
+            )
+        camera = re.sub(r"[^\w.-]", "-", Path(image.name).parent.as_posix().replace("/", "-"))
+        camera = CAMERA if camera == "." else camera
+        ids = [p.point3D_id for p in image.points2D if p.has_point3D()]
+        seen = [points[number] for number in ids if number in points]
+        key = int(digits[1]), camera
+        if key in shots:
+            raise AdapterError(
+                f"{found}: {shots[key].name} and {image.name} are both frame {key[0]} of camera "
+                f"{camera}; give each camera a folder of its own"
+            )
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        lens = reconstruction.cameras[image.camera_id]
+        where = np.array(seen).reshape(-1, 3)
+        shots[key] = Shot(image.name, camera, key[0], lens, invert_pose(pose), where)
+    if not shots:
+        raise AdapterError(f"{found}: no image of this model has a pose")
+    return [shots[key] for key in sorted(shots)]
+
+
+def find_road(shots: Sequence[Shot]) -> Road:
+    """The plane under the cameras that most low points lie on and few below; the same every time.
+
+    Raises:
+        AdapterError: too few points lie on any."""
+    centres = np.stack([shot.model_from_camera[:3, 3] for shot in shots])
+    up = -np.mean([shot.model_from_camera[:3, 1] for shot in shots], axis=0)
+    up /= np.linalg.norm(up)
+    low = []
+    for shot, centre in zip(shots, centres, strict=True):
+        rays = shot.points - centre
+        below = rays @ up < -np.sin(np.radians(_LOW_DEG)) * np.linalg.norm(rays, axis=1)
+        low.append(shot.points[below])
+    points = np.unique(np.concatenate(low), axis=0)
+    rng = np.random.default_rng(_SEED)
+    if len(points) > _MOST_POINTS:
+        points = points[np.sort(rng.choice(len(points), _MOST_POINTS, replace=False))]
+    far = np.linalg.norm(points - centres.mean(axis=0), axis=1)
+    best, road = 0, None
+    for _ in range(_TRIES if len(points) >= _MIN_ON_ROAD else 0):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        plane = _plane_under(np.cross(b - a, c - a), a, centres, up)
+        if plane is None:
+            continue
+        heights = (points @ plane[0] + plane[1]) / far
+        score = int((np.abs(heights) < _ON_ROAD).sum()) - 2 * int((heights < -3 * _ON_ROAD).sum())
+        if score > best:
+            best, road = score, plane
+    for _ in range(3 if road is not None else 0):
+        assert road is not None
+        own = points[np.abs(points @ road[0] + road[1]) < _ON_ROAD * far]
+        normal = np.linalg.svd(own - own.mean(axis=0))[2][2] if len(own) > 2 else road[0]
+        road = _plane_under(normal, own.mean(axis=0), centres, up) or road
+    if road is None or best < _MIN_ON_ROAD:
+        raise AdapterError(
+            f"no road is seen under the cameras: at most {max(best, 0)} of {len(points)} low "
+            f"points lie on one plane within {_MAX_TILT_DEG:.0f} degrees of the cameras' level; "
+            f"{_MIN_ON_ROAD} are needed. Film with the road in view, hold the camera level, take "
+            f"more frames"
+        )
+    distance = np.abs(points @ road[0] + road[1])
+    own = distance[distance < _ON_ROAD * far]
+    found = Road(*road, len(own), float(np.median(own)) / road[2])
+    if found.residual > _MAX_RESIDUAL:
+        raise AdapterError(
+            f"no road is clear under the cameras: {found.points} points of the best plane stray "
+            f"from it by {100 * found.residual:.0f} % of the cameras' height (median; at most "
+            f"{100 * _MAX_RESIDUAL:.0f}). Film with more of the road in view, take more frames"
+        )
+    return found
+
+
+def _plane_under(
+    normal: np.ndarray, point: np.ndarray, centres: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, float, float] | None:
+    """The plane through a point with its normal upwards, and the cameras' median height over it;
+    None where it is too steep or above a camera."""
+    length = np.linalg.norm(normal)
+    if length == 0:
+        return None
+    normal = normal * np.sign(normal @ up) / length
+    if normal @ up < np.cos(np.radians(_MAX_TILT_DEG)):
+        return None
+    heights = (centres - point) @ normal
+    return (
+        (normal, float(-normal @ point), float(np.median(heights))) if heights.min() > 0 else None
+    )
+
+
+def _check_path(shots: Sequence[Shot], road: Road, model: Path) -> None:
+    """Refuse cameras that hardly moved: all that COLMAP found rests on that base."""
+    centres = np.stack([shot.model_from_camera[:3, 3] for shot in shots])
+    heights = float(np.linalg.norm(np.ptp(centres, axis=0))) / road.height
+    if heights < _MIN_PATH_HEIGHTS:
+        raise AdapterError(
+            f"{model}: the cameras of its {len(shots)} images moved by {heights:.1f} of their "
+            f"height above the road, too little to tell distances by; take frames over "
+            f"{_MIN_PATH_HEIGHTS:.0f} heights at least, some 10 m are better"
+        )
+
+
+def _levelled(shot: Shot, road: Road) -> np.ndarray:
+    """world_from_model in the model's unit: z up, the road at 0, the shot at x = y = 0 looking
+    along x."""
+    forward = shot.model_from_camera[:3, 2]
+    forward = forward - (forward @ road.normal) * road.normal
+    if np.linalg.norm(forward) < 1e-6:
+        raise AdapterError(
+            f"image {shot.name} looks straight down; which way is ahead is not known"
+        )
+    forward /= np.linalg.norm(forward)
+    out = np.eye(4)
+    out[:3, :3] = np.stack([forward, np.cross(road.normal, forward), road.normal])
+    out[:3, 3] = -out[:3, :3] @ shot.model_from_camera[:3, 3]
+    out[2, 3] = road.offset
+    return out
+
+
+def _scaled(pose: np.ndarray, scale: float) -> np.ndarray:
+    out = pose.copy()
+    out[:3, 3] *= scale
+    return out
+
+
+def _egos(
+    shots: Sequence[Shot], poses: Mapping[str, np.ndarray], height_m: float
+) -> dict[int, np.ndarray]:
+    """world_from_ego by frame: on the road under the frame's first camera, level, x where that
+    looks."""
+    egos: dict[int, np.ndarray] = {}
+    for shot in shots:
+        pose = poses[shot.name]
+        yaw = np.arctan2(pose[1, 2], pose[0, 2])
+        ego = np.eye(4)
+        ego[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        ego[:3, 3] = pose[:3, 3] - [0, 0, height_m]
+        egos.setdefault(shot.frame, ego)
+    return egos
+
+
+# ---- GPS -----------------------------------------------------------------------------------------
+
+
+def read_positions(path: Path) -> dict[str, np.ndarray]:
+    """Metres east and north [2] by image: a table (CSV) with the columns image, lat, lon (degrees),
+    or image, x, y (metres). image: its path below the images' folder, or its name."""
+    rows = list(
+        csv.DictReader(io.StringIO(read_text(path, if_missing="give a table of positions")))
+    )
+    names = set(rows[0]) if rows else set()
+    wanted = next((c for c in (("lat", "lon"), ("x", "y")) if {"image", *c} <= names), None)
+    if wanted is None:
+        raise AdapterError(
+            f"{path} must be a table with the columns image, lat, lon or image, x, y, separated by "
+            f"commas; it has {sorted(map(str, names))[:10]}"
+        )
+    found: dict[str, np.ndarray] = {}
+    for number, row in enumerate(rows, start=2):
+        try:
+            value = np.array([float(row[name]) for name in wanted])
+        except (TypeError, ValueError):
+            value = np.full(2, np.nan)
+        if not (np.abs(value) <= LARGEST).all():
+            raise AdapterError(
+                f"{path}, line {number}: {', '.join(wanted)} must be numbers; got {row}"
+            )
+        found[str(row["image"])] = value
+    if wanted == ("x", "y"):
+        return found
+    first = next(iter(found.values()))
+    east = np.cos(np.radians(first[0]))
+    scale = np.radians(1.0) * _EARTH_M
+    return {n: scale * (v - first)[::-1] * [east, 1.0] for n, v in found.items()}
+
+
+def _fit_positions(
+    shots: Sequence[Shot], world_from_model: np.ndarray, known: Mapping[str, np.ndarray], path: Path
+) -> tuple[np.ndarray, float, float]:
+    """The turn about z that lays the cameras' path on the positions, metres per unit, and how far
+    apart they are then (median, metres)."""
+    pairs = [
+        ((world_from_model @ shot.model_from_camera)[:2, 3], known[name])
+        for shot in shots
+        for name in (shot.name, Path(shot.name).name)[: 1 if shot.name in known else 2]
+        if name in known
+    ]
+    model, metres = (np.array([p[i] for p in pairs]).reshape(-1, 2) for i in (0, 1))
+    spread = float(np.linalg.norm(np.ptp(metres, axis=0))) if len(pairs) else 0.0
+    if len(pairs) < 3 or spread < _MIN_PATH_M:
+        raise AdapterError(
+            f"{path} gives positions of {len(pairs)} of the {len(shots)} images, {spread:.1f} m "
+            f"apart; three are needed, over {_MIN_PATH_M:.0f} m. Names must be those of the "
+            f"images, such as {shots[0].name}"
+        )
+    a, b = (xy[:, 0] + 1j * xy[:, 1] - (xy[:, 0] + 1j * xy[:, 1]).mean() for xy in (model, metres))
+    ratio = (np.conj(a) * b).sum() / (np.abs(a) ** 2).sum()
+    unit = ratio / abs(ratio)
+    turn = np.eye(4)
+    turn[:2, :2] = [[unit.real, -unit.imag], [unit.imag, unit.real]]
+    return turn, float(abs(ratio)), float(np.median(np.abs(ratio * a - b)))
+
+
+# ---- Files ---------------------------------------------------------------------------------------
+
+
+def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
+    """The image without its lens's distortion; returns width, height, fx, fy, cx, cy."""
+    import pycolmap
+
+    source = inside(images, shot.name, "the model")
+    target = out / "images" / shot.camera / f"{shot.frame:06d}.jpg"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lens, plain = shot.lens, shot.lens
+    if not lens.is_undistorted():
+        plain = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    params = plain.params
+    fx, fy, cx, cy = params if len(params) == 4 else (params[0], *params)
+    image = decode_image(source, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.shape[:2] != (lens.height, lens.width):
+        got = "no image" if image is None else f"{image.shape[1]}x{image.shape[0]} pixels"
+        raise AdapterError(
+            f"{source} is {got}, the model's camera {lens.width}x{lens.height}; give the folder of "
+            f"the images that COLMAP was run on"
+        )
+    if lens.is_undistorted() and source.suffix.lower() in (".jpg", ".jpeg"):
+        shutil.copyfile(source, target)
+    else:
+        u, v = np.meshgrid(np.arange(plain.width) + 0.5, np.arange(plain.height) + 0.5)
+        rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1)
+        # OpenCV has whole numbers at the middle of pixels, COLMAP at their corners.
+        at = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*u.shape, 2).astype(np.float32) - 0.5
+        image = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        flags = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        target.write_bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
+    size = {"width": int(plain.width), "height": int(plain.height)}
+    return size | {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
+
+
+def _lane(egos: Sequence[np.ndarray]) -> np.ndarray:
+    """Points of the road that the cameras drove over and a little beyond its end, [N, 3]."""
+    steps = np.arange(0, _LANE_REACH_M / 2, _LANE_STEP_M)
+    across = np.arange(-_LANE_M, _LANE_M + 1e-6, _LANE_STEP_M)
+    local = [[0.0, y, 0.0, 1.0] for y in across]
+    ahead = [[x, y, 0.0, 1.0] for x in steps for y in across]
+    parts = [np.array(local) @ ego.T for ego in egos] + [np.array(ahead) @ egos[-1].T]
+    return np.concatenate(parts)[:, :3]
+
+
+def _write_depth(
+    out: Path,
+    shot: Shot,
+    lens: Mapping[str, Any],
+    world_from_camera: np.ndarray,
+    points: np.ndarray,
+    lane: np.ndarray,
+) -> None:
+    """Depth between the points that the image shows and the lane, where neighbours are near."""
+    centre, turn = world_from_camera[:3, 3], world_from_camera[:3, :3]
+    near = lane[np.linalg.norm(lane - centre, axis=1) < _LANE_REACH_M]
+    local = (np.concatenate([points, near]) - centre) @ turn
+    local = local[local[:, 2] > 0.1]
+    uv = local[:, :2] / local[:, 2:] * [lens["fx"], lens["fy"]] + [lens["cx"], lens["cy"]]
+    size = np.array([lens["width"], lens["height"]])
+    shown = ((uv > 0) & (uv < size)).all(axis=1)
+    uv, inverse = uv[shown], 1 / local[shown, 2]
+    if len(np.unique(uv.round(), axis=0)) < 4:
+        return
+    between = LinearNDInterpolator(uv, inverse, fill_value=0.0)
+    corners = between.tri.simplices
+    edges = np.linalg.norm(uv[corners] - uv[np.roll(corners, 1, axis=1)], axis=2).max(axis=1)
+    ratio = inverse[corners].max(axis=1) / inverse[corners].min(axis=1)
+    known = (edges < _MAX_EDGE * size[0]) & (ratio < _MAX_RATIO)
+    u, v = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    triangle = between.tri.find_simplex(pixels)
+    is_known = (triangle >= 0) & known[triangle]
+    depth = np.zeros(len(pixels), np.float32)
+    depth[is_known] = 1 / between(pixels[is_known])
+    path = out / "depth" / shot.camera / f"{shot.frame:06d}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_depth(depth.reshape(size[1], size[0])))
