@@ -176,11 +176,32 @@ def test_the_veil_kernel_equals_its_definition(width):
     depth = torch.where(depth > 0.2, 40 * depth**4, 0.0)
     depth[40:80] += 30.0
     rest = alpha, depth, camera, falling
-    slow, slow_mask = draw_falling(rgb.clone(), *rest, scene=scene, backend=REFERENCE)
-    fast, mask = draw_falling(rgb, *rest, scene=scene)
-    np.testing.assert_allclose(fast, slow, atol=1e-4)
-    assert (mask == slow_mask).all() and (width < 8 or 0.01 < mask.float().mean() < 0.5)
-    assert fast.data_ptr() == rgb.data_ptr() or width < 8
+    for splats in (0.5 * rgb, None):
+        own = rgb.clone()
+        slow, slow_mask = draw_falling(
+            own.clone(), *rest, scene=scene, splats=splats, backend=REFERENCE
+        )
+        fast, mask = draw_falling(own, *rest, scene=scene, splats=splats)
+        np.testing.assert_allclose(fast, slow, atol=1e-4)
+        assert (mask == slow_mask).all() and (width < 8 or 0.01 < mask.float().mean() < 0.5)
+        assert fast.data_ptr() == own.data_ptr() or width < 8
+
+
+def test_a_bright_sky_does_not_shine_through_the_edges_of_what_is_near():
+    """Half a splat, half a sky that the veil hides: the mean of both behind their veils."""
+    scene, shape, camera = drive(), (120, 160), view()
+    falling = dataclasses.replace(RAIN, rate_mm_h=300.0, min_width_px=50.0)  # all is veil
+    dark, bright, near = 0.1, 1.0, torch.full(shape, 3.0)
+
+    def veiled(value: float, alpha: float, splats: float):
+        whole = torch.full((*shape, 3), value)
+        parts = torch.full((*shape, 3), splats)
+        opacity = torch.full(shape, alpha)
+        return draw_falling(whole, opacity, near, camera, falling, scene=scene, splats=parts)[0]
+
+    half = veiled(0.5 * (dark + bright), 0.5, 0.5 * dark)
+    mean = 0.5 * (veiled(dark, 1.0, dark) + veiled(bright, 0.0, 0.0))
+    np.testing.assert_allclose(half, mean, atol=1e-4)
 
 
 def test_a_streak_takes_twice_its_drops_cross_section():

@@ -113,6 +113,9 @@ def test_raster_measures_stages_work_and_the_reference():
     assert 0 < case["visible"] <= 400 and case["listed_pairs"] <= case["pairs"]
     assert beside["pixels"] == 64 * 48 and beside["flipped"] <= 3
     assert beside["p999"] <= 1e-4  # the agreement that backends promise
+    # A blend takes more than one instruction, and no core does more of them than it can.
+    blending = result["facts"]["blending"]
+    assert blending["multiply_adds_per_blend"] > 1 and 0 < blending["share"] <= 1
 
 
 @pytest.mark.long

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
+import numpy as np
 import torch
+from numba import prange
 
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, RGB, RenderOutput
 from augment.render.constants import RasterSettings
+from augment.render.cpu import simd as v8
 from augment.render.cpu.driver import rasterize_cpu, warm_up
+from augment.render.cpu.jit import kernel
 from augment.render.fog import Fog
 from augment.render.reference import bin_to_tiles, project_parts, rasterize_reference
-from augment.scene import PosedGaussians
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, PosedGaussians
 from tools.bench.harness import (
     Action,
     Figures,
@@ -37,6 +44,12 @@ COLUMNS = ("scene", "smog / clear", "splats used", "pairs", "pairs listed", "M p
            "scene MiB", "frame MiB")  # fmt: skip
 REFERENCE_COLUMNS = ("reference ms", "cpu ms", "speed-up", "99.9 % within", "max", "flipped",
                      "pixels")  # fmt: skip
+BLEND_COLUMNS = ("lanes", "M blends/s", "M multiply-adds/s", "multiply-adds a blend",
+                 "instructions a blend", "share of the machine")  # fmt: skip
+# Of one register of pixels that are all blended, loads and stores aside; by lanes.
+BLEND_INSTRUCTIONS = {16: 20, 8: 23}
+SHEETS, SHEETS_SIZE = 400, (640, 480)  # splats that cover the whole image, and its size
+FMA_ROUNDS = 1 << 21
 REFERENCE_CASE = RasterCase(5_000, 320, 240)  # what the torch reference draws within a second
 
 
@@ -66,9 +79,17 @@ def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = N
         memory = (found["scene_mib"], found["frame_mib"])
         work.append((case.name, found["smog_over_clear"]["median"], *counts, *memory))
     beside = _beside_reference(cases.reference, min(repeats, 3))
+    blending = _blending(repeats)
     tables = [
         Table("Frames", ("scene", "stage", "ms", "min", "p90"), stages),
         Table("What a frame takes", COLUMNS, work, "pairs: of splats and 16x16 tiles"),
+        Table(
+            "Blending on one core, of splats that cover the whole image",
+            BLEND_COLUMNS,
+            [[*blending.values()]],
+            "a blend: of one splat on one pixel, with all that its frame takes; multiply-adds a "
+            "blend: how many a loop of nothing else does meanwhile",
+        ),
         Table(
             f"Beside the torch reference, {cases.reference.name}",
             REFERENCE_COLUMNS,
@@ -76,7 +97,7 @@ def measure(quick: bool = False, repeats: int = 7, cases: RasterCases | None = N
             "difference of rgb; flipped: pixels off by more than 0.001",
         ),
     ]
-    extra = {"warm_up_s": warm_up_s, "cases": facts, "reference": beside}
+    extra = {"warm_up_s": warm_up_s, "cases": facts, "blending": blending, "reference": beside}
     return figures("raster", tables, machine=machine, **extra)
 
 
@@ -105,6 +126,73 @@ def _measure(case: RasterCase, repeats: int, memory: bool) -> Figures:
         "listed_pairs": int(stages[1]["pairs"]),
         "scene_mib": gaussians.nbytes / 2**20,
         "frame_mib": frame_mib,
+    }
+
+
+@kernel
+def multiply_add(rounds, sums):
+    """Chains of fused multiply-adds of v8.WIDE lanes, as many as keep all units busy, a thread."""
+    for run in prange(sums.size // v8.WIDE):
+        one = v8.wide_columns()
+        half = v8.splat_as(one, np.float32(0.5))
+        a, b, c, d, e, f = one, one, one, one, one, one
+        g, h, i, j, k, m = one, one, one, one, one, one
+        for _ in range(rounds):
+            a, b, c = (
+                v8.fmuladd(a, half, one), v8.fmuladd(b, half, one), v8.fmuladd(c, half, one)
+            )  # fmt: skip
+            d, e, f = (
+                v8.fmuladd(d, half, one), v8.fmuladd(e, half, one), v8.fmuladd(f, half, one)
+            )  # fmt: skip
+            g, h, i = (
+                v8.fmuladd(g, half, one), v8.fmuladd(h, half, one), v8.fmuladd(i, half, one)
+            )  # fmt: skip
+            j, k, m = (
+                v8.fmuladd(j, half, one), v8.fmuladd(k, half, one), v8.fmuladd(m, half, one)
+            )  # fmt: skip
+        a, d, g, j = a + b + c, d + e + f, g + h + i, j + k + m
+        v8.store(sums, np.uint64(run * v8.WIDE), a + d + g + j)
+
+
+def _blending(repeats: int) -> Figures:
+    """How many blends a second of one core's time, and multiply-adds in turn with them."""
+    (width, height), side = SHEETS_SIZE, float(SHEETS_SIZE[0])
+    means = torch.zeros(SHEETS, 3)
+    means[:, 2] = torch.linspace(2, 3, SHEETS)
+    sheets = Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(SHEETS, 1),
+        scales=torch.tensor([[50.0, 50.0, 0.01]]).repeat(SHEETS, 1),
+        opacities=torch.full((SHEETS,), 0.01),  # no pixel is finished by all of them
+        sh=torch.zeros(SHEETS, 1, 3),
+    )
+    ahead = torch.eye(4, dtype=torch.float64)
+    camera = Camera("sheets", width, height, side, side, width / 2, height / 2, ahead)
+    sums, seconds = np.zeros(v8.WIDE, np.float32), []
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        for _ in range(repeats + 1):
+            marks = [time.thread_time()]
+            rasterize_cpu([PosedGaussians(sheets)], camera, BUFFERS, SETTINGS, None)
+            marks.append(time.thread_time())
+            with kernel_threads():
+                multiply_add(FMA_ROUNDS, sums)
+            marks.append(time.thread_time())
+            seconds.append(np.diff(marks))
+    finally:
+        numba.set_num_threads(before)
+    frame_s, compute_s = np.median(seconds[1:], 0).tolist()
+    blends = SHEETS * width * height / frame_s
+    fmas = 12 * FMA_ROUNDS * v8.WIDE / compute_s
+    instructions = BLEND_INSTRUCTIONS[v8.WIDE]
+    return {
+        "lanes": v8.WIDE,
+        "blends_m_per_s": blends / 1e6,
+        "multiply_adds_m_per_s": fmas / 1e6,
+        "multiply_adds_per_blend": fmas / blends,
+        "instructions_per_blend": instructions,
+        "share": instructions * blends / fmas,
     }
 
 

@@ -326,13 +326,15 @@ def draw_falling(
     scene: Scene,
     fog: Fog | None = None,
     motion: Motion = STANDING,
+    splats: Float[Tensor, "H W 3"] | None = None,
     backend: str = CPU,
 ) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The picture behind what falls, and where drawn drops leave less than CLEAR of a pixel.
 
     depth: z, metres; 0 where there is no surface. scene: whose light it is. fog: in the air as
-    well. backend: on the CPU pixels go through a kernel, equal to the definition in
-    augment.effects.falling.reference within 1e-4, and `rgb` is overwritten.
+    well. splats: what of rgb is the surfaces', where the rest is the sky's. backend: on the CPU
+    pixels go through a kernel, equal to the definition in augment.effects.falling.reference within
+    1e-4, and `rgb` is overwritten.
     """
     surfaces = [t.detach().float().cpu().numpy() for t in (alpha, depth)]
     drops = find_drops(walk_of(falling, camera, motion, scene.name))
@@ -343,9 +345,12 @@ def draw_falling(
         from augment.effects.falling.reference import blend_by_torch
 
         clear = torch.from_numpy(left_clear(drops, *surfaces)).to(rgb.device)
-        return blend_by_torch(rgb, alpha, depth, clear, veil), clear < CLEAR
+        return blend_by_torch(rgb, alpha, depth, clear, veil, splats), clear < CLEAR
     own = rgb.detach().numpy()
-    wide, *surfaces = (_wide(image) for image in (own, *surfaces))
+    apart = (
+        np.empty((0, own.shape[1], 3), np.float32) if splats is None else splats.detach().numpy()
+    )
+    wide, *surfaces = (_wide(image) for image in (own, apart, *surfaces))
     mask = np.empty(wide.shape[:2], bool)
     with kernel_threads(1):
         kernels.blend_falling(

@@ -8,6 +8,8 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 from augment.boxes import PlacedBoxes
 from augment.cameras import Camera
@@ -130,7 +132,17 @@ def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> 
             scene=own.light,
             fog=drawn.layers.fog,
             motion=motion_of(own.scene, camera),
+            splats=_surfaces_of(drawn),
             backend=own.backend,
         )
     masks = {**drawn.masks, mask: near}
     return replace(drawn, rgb=rgb, masks=masks)
+
+
+def _surfaces_of(drawn: Drawn) -> Float[Tensor, "H W 3"] | None:
+    """What the splats give to the picture, where nothing has been drawn over all of it since."""
+    splats = drawn.raster.rgb
+    if splats is None or drawn.layers.photo is not None:
+        return None
+    is_first = not drawn.masks.keys() & {"rain", "snowfall"}
+    return splats if is_first and splats.data_ptr() != drawn.rgb.data_ptr() else None

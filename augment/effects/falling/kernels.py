@@ -20,6 +20,7 @@ ROWS = 16  # image rows of a band, which a thread draws at a time
 FADE = 0.75  # of the distance to which a class is drawn: beyond, its drops fade into the veil
 SOFT = 0.03  # of its depth: so far behind a surface a drop is hidden
 LEAST_RADIUS = 1.25  # pixels; a smaller one would show where pixels lie
+EDGE = 0.02  # of alpha, and of green from the sky: from here on a pixel shows both
 NUM_NUMBERS = 9  # of a drop in the picture
 _HALF = float(2**-21)
 _CELL_X, _CELL_Y, _CELL_Z = (np.uint64(f) for f in CELL_FACTORS)
@@ -353,33 +354,63 @@ def _decay(x):
 
 
 @inner()
-def _blend_pixels(pixels, at, u, lengths, shown, clear, tau, sky, light):
+def _blend_pixels(pixels, at, splats, pixel, u, lengths, shown, clear, tau, sky, light):
     """Eight pixels behind the veil and the drops, in place.
 
-    shown: alpha. tau: the veil's optical depth at unit depth. sky: transmittance up to the sky.
-    light [3, 4]: airlight; light of a drop in the mean, what of it grows to the right, and ahead.
+    splats: as of blend_falling. shown: alpha. tau: the veil's optical depth at unit depth. sky:
+    transmittance up to the sky. light [3, 4]: airlight; light of a drop in the mean, what of it
+    grows to the right, and ahead.
     """
     zeros, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
-    veil = sky + shown * (_decay(tau * lengths) - sky)
+    near = _decay(tau * lengths)
     per_length = one / lengths
     red, green, blue = v8.load_colours(pixels, at)
-    red = _blend_colour(v8.maximum(red, zeros), light[0], u, veil, clear, per_length)
-    green = _blend_colour(v8.maximum(green, zeros), light[1], u, veil, clear, per_length)
-    blue = _blend_colour(v8.maximum(blue, zeros), light[2], u, veil, clear, per_length)
+    r, g, b = red, green, blue
+    edge = v8.minimum(shown, one - shown) - v8.splat(np.float32(EDGE))
+    is_mixed = False
+    if splats.size > 0 and v8.any_not_negative(edge):
+        r, g, b = v8.load_colours(splats, U(3) * pixel)
+        edge = v8.minimum(edge, green - g - v8.splat(np.float32(EDGE)))
+        is_mixed = v8.any_not_negative(edge)
+    edge = v8.at_least(edge, zeros)
+    red = _veil(v8.maximum(red, zeros), r, is_mixed, edge, light[0], shown, near, sky)
+    green = _veil(v8.maximum(green, zeros), g, is_mixed, edge, light[1], shown, near, sky)
+    blue = _veil(v8.maximum(blue, zeros), b, is_mixed, edge, light[2], shown, near, sky)
+    red = _blend_colour(red, light[0], u, clear, per_length)
+    green = _blend_colour(green, light[1], u, clear, per_length)
+    blue = _blend_colour(blue, light[2], u, clear, per_length)
     v8.store_colours(pixels, at, red, green, blue)
 
 
 @inner()
-def _blend_colour(own, light, u, veil, clear, per_length):
-    air = v8.splat(light[0])
+def _veil(own, splats, is_mixed, edge, light, shown, near, sky):
+    """The square of a colour behind the veil. edge: lanes whose pixels show both surfaces and sky,
+    each behind its own, if any is_mixed. near: transmittance up to the surfaces.
+    """
+    zeros, air = v8.splat(np.float32(0)), v8.splat(light[0])
+    veiled = air + (sky + shown * (near - sky)) * (own * own - air)
+    if is_mixed:
+        rest = v8.splat(np.float32(1)) - shown
+        behind = v8.minimum(v8.maximum(own - splats, zeros), rest)
+        ahead = (own - behind) / v8.maximum(shown, v8.splat(np.float32(EDGE)))
+        behind = behind / v8.maximum(rest, v8.splat(np.float32(EDGE)))
+        ahead = shown * v8.sqrt(v8.maximum(air + near * (ahead * ahead - air), zeros))
+        behind = rest * v8.sqrt(v8.maximum(air + sky * (behind * behind - air), zeros))
+        veiled = v8.select(edge, (ahead + behind) * (ahead + behind), veiled)
+    return veiled
+
+
+@inner()
+def _blend_colour(veiled, light, u, clear, per_length):
+    """The colour whose square is `veiled`, behind the drops."""
     glow = v8.splat(light[1]) + (v8.splat(light[2]) * u + v8.splat(light[3])) * per_length
-    out = glow + clear * (air + veil * (own * own - air) - glow)
+    out = glow + clear * (veiled - glow)
     return v8.sqrt(v8.maximum(out, v8.splat(np.float32(0))))
 
 
 @inner()
 def _blend_row(
-    row, width, rgb, alpha, depth, clear, first, nearest,
+    row, width, rgb, splats, alpha, depth, clear, first, nearest,
     rays, climb, bands, upwards, light, own, rest,
 ):  # fmt: skip
     """A row of blend_falling. clear: from place `first` on. own, rest: spare."""
@@ -410,23 +441,27 @@ def _blend_row(
         shown = v8.select(v8.greater(z, zeros), v8.load(alpha, pixel), zeros)
         through = v8.load(clear, first + U(at))
         if at == j:
-            _blend_pixels(rgb, U(3) * pixel, u, lengths, shown, through, tau, sky, light)
+            _blend_pixels(
+                rgb, U(3) * pixel, splats, pixel, u, lengths, shown, through, tau, sky, light
+            )
         else:
             for k in range(U(3 * LANES)):
                 rest[k] = rgb[U(3) * pixel + k]
-            _blend_pixels(rest, U(0), u, lengths, shown, through, tau, sky, light)
+            _blend_pixels(rest, U(0), splats, pixel, u, lengths, shown, through, tau, sky, light)
             for k in range(U(3 * (j - at)), U(3 * LANES)):
                 rgb[U(3) * pixel + k] = rest[k]
 
 
 @kernel
 def blend_falling(
-    rgb, alpha, depth, drops, listed, begins, least,
+    rgb, splats, alpha, depth, drops, listed, begins, least,
     rays, climb, bands, upwards, airlight, glow, mask,
 ):  # fmt: skip
     """rgb [3 H W] behind the veil and the drops, in place; mask [H, W]: where a drawn drop leaves
     less than `least` of a pixel clear.
 
+    splats [3 H W]: what of rgb is the surfaces', the rest being the sky's; empty where that is not
+    known: then both are seen through the mean of their veils, so that a bright sky shines at edges.
     alpha, depth, drops, listed, begins: as of cover_pixels. rays: 1 / fx, 1 / fy, cx, cy. climb
     [3]: the world's z along the camera's axes. bands [NUM_CLASSES, 5]: extinction of a class, depth
     where it begins, over which depth it grows, half its inverse, depth from which on it is whole.
@@ -455,6 +490,6 @@ def blend_falling(
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
                 light[c, 3] = glow[c, 1] * v + glow[c, 2]
             _blend_row(
-                row, width, rgb, alpha, depth, clear, first, nearest[row - top],
+                row, width, rgb, splats, alpha, depth, clear, first, nearest[row - top],
                 rays, climb, bands, upwards, light, own, rest,
             )  # fmt: skip

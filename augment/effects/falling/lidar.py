@@ -30,7 +30,8 @@ from augment.effects.lidar.codes import LOST, PRECIPITATION
 
 WATER_INDEX_905 = 1.3275  # of water at 0.9 um (Hale and Querry 1973)
 # Extinction over backscatter, sr, of ice crystals that lie at random: 25 in CALIPSO's first three
-# releases, somewhat more since (Young et al. 2018).
+# releases, somewhat more since (Young et al. 2018). Not fitted to a car's sensor: nobody publishes
+# its receiver near by, on which echoes of flakes depend as much.
 ICE_LIDAR_RATIO_SR = 25.0
 _STEP_M, _NEAR_M, _GROWTH = 0.05, 5.0, 0.01  # of the ranges: even ones, then a share of the range
 _SIGNALS = 256

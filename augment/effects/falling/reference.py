@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from augment.effects.falling.drops import CELL_FACTORS, MAX_IN_CELL
-from augment.effects.falling.kernels import FADE, LEAST_RADIUS, SOFT
+from augment.effects.falling.kernels import EDGE, FADE, LEAST_RADIUS, SOFT
 from augment.rng import STEP_X, mix
 
 if TYPE_CHECKING:
@@ -145,6 +145,7 @@ def blend_by_torch(
     depth: Float[Tensor, "H W"],
     clear: Float[Tensor, "H W"],
     veil: Veil,
+    splats: Float[Tensor, "H W 3"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """As kernels.blend_falling."""
     rays, climb, bands, upwards, airlight, glow = (
@@ -162,8 +163,21 @@ def blend_by_torch(
     slope = climb[0] * u + climb[1] * v + climb[2]
     sky = torch.exp(-(upwards * length / slope.clamp_min(1e-6)).clamp_max(80))
     shown = torch.where(depth > 0, alpha, 0)
-    seen = sky + shown * (torch.exp(-(tau * length).clamp_max(80)) - sky)
+    near = torch.exp(-(tau * length).clamp_max(80))
     directions = torch.stack([u, v, torch.ones_like(u)], -1) / length[..., None]
     light = directions @ glow[:, :3].T + glow[:, 3]
-    own = airlight + seen[..., None] * (rgb.clamp_min(0) ** 2 - airlight)
+    own = rgb.clamp_min(0)
+    mixed = airlight + (sky + shown * (near - sky))[..., None] * (own**2 - airlight)
+    if splats is not None:
+        parts, rest = shown[..., None], 1 - shown[..., None]
+        behind = torch.minimum((own - splats).clamp_min(0), rest)
+        ahead = ((own - behind) / parts.clamp_min(EDGE)) ** 2
+        behind = (behind / rest.clamp_min(EDGE)) ** 2
+        ahead = airlight + near[..., None] * (ahead - airlight)
+        behind = airlight + sky[..., None] * (behind - airlight)
+        both = parts * ahead.clamp_min(0).sqrt() + rest * behind.clamp_min(0).sqrt()
+        green = rgb[..., 1:2] - splats[..., 1:2]
+        is_mixed = torch.minimum(torch.minimum(parts, rest), green) >= EDGE
+        mixed = torch.where(is_mixed, both**2, mixed)
+    own = mixed
     return (light + clear[..., None].to(rgb.dtype) * (own - light)).clamp_min(0).sqrt()

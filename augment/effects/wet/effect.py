@@ -57,6 +57,7 @@ DARKER, MIRRORED, SHINE = PASSES = (
 )
 LEAST_SEEN = 0.05  # of a photo's ground through fog, below which its colour is not known
 COARSE = 0.5  # resolution of the mirrored view
+STOP = 0.01  # of its transmittance: a film reflects little of what is behind that
 LOWERED_M = 0.3  # below the plane: what stands on ground that is no plane is whole
 LOW_MARGIN_PX = 8
 UP_MARGIN = 0.2  # of the image's height, that rough ground looks higher than its mirror
@@ -190,7 +191,9 @@ def _draw_mirror(
         for part in layers.parts
         if not part.is_overlay
     ]
-    layers = replace(layers, parts=parts, photo=None)
+    stop = max(STOP, layers.settings.transmittance_stop)
+    settings = replace(layers.settings, transmittance_stop=stop)
+    layers = replace(layers, parts=parts, photo=None, settings=settings)
     raster = layers.draw(view, plane.above(LOWERED_M), frozenset({RGB, ALPHA, EXPECTED_DEPTH}))
     assert raster.rgb is not None and raster.alpha is not None
     assert raster.expected_depth is not None

@@ -12,6 +12,7 @@ from numba import prange
 
 from augment.kernels import mix
 from augment.render.cpu.jit import inner, kernel
+from augment.render.layout import U
 from augment.rng import STEP_X, STEP_Y
 
 # Channels of the ground's map.
@@ -103,47 +104,48 @@ class View(NamedTuple):
 
 
 @inner()
-def _smoothstep(low, high, value):
-    t = min(max((value - low) / (high - low), 0.0), 1.0)
+def _smoothstep(t):
+    """From 0 at t = 0 to 1 at 1."""
+    t = min(max(t, 0.0), 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 @inner()
-def _place(x, y, corner, cell, rows, columns):
+def _place(x, y, corner, per_cell, rows, columns):
     """(is it in the map, index of the texel below left, shares to the right and up)."""
-    u, v = (x - corner[0]) / cell - 0.5, (y - corner[1]) / cell - 0.5
+    u, v = (x - corner[0]) * per_cell - 0.5, (y - corner[1]) * per_cell - 0.5
     inside = u >= 0.0 and v >= 0.0 and u <= columns - 1 and v <= rows - 1
     if not inside:
-        return False, np.int64(0), 0.0, 0.0
+        return False, U(0), 0.0, 0.0
     i, j = min(np.int64(u), columns - 2), min(np.int64(v), rows - 2)
-    return True, j * columns + i, u - i, v - j
+    return True, U(j * columns + i), u - i, v - j
 
 
 @inner()
 def _between(flat, at, columns, channel, u, v):
-    a = flat[at, channel] + (flat[at + 1, channel] - flat[at, channel]) * u
-    below = at + columns
-    b = flat[below, channel] + (flat[below + 1, channel] - flat[below, channel]) * u
+    channel, below = U(channel), at + U(columns)
+    a = flat[at, channel] + (flat[at + U(1), channel] - flat[at, channel]) * u
+    b = flat[below, channel] + (flat[below + U(1), channel] - flat[below, channel]) * u
     return a + (b - a) * v
 
 
 @inner()
 def _find_in_row(row, view, depth, shown, flat, rows, columns, share, most):
-    lens, pose, corner, cell = view.lens, view.pose, view.corner, view.cell_m
-    b = (row + 0.5 - lens[3]) / lens[1]
+    lens, pose, corner, per_cell = view.lens, view.pose, view.corner, 1.0 / view.cell_m
+    b, per_focal = (row + 0.5 - lens[3]) / lens[1], 1.0 / lens[0]
     best = np.float32(0)
     for x in range(depth.shape[1]):
         share[row, x] = np.float32(0)
         z = np.float64(depth[row, x])
         if not (z > 0.0 and shown[row, x] > 0):
             continue
-        a = (x + 0.5 - lens[2]) / lens[0]
+        a = (x + 0.5 - lens[2]) * per_focal
         rise = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
         if not rise < 0.0:
             continue
         px = pose[0, 3] + z * (pose[0, 0] * a + pose[0, 1] * b + pose[0, 2])
         py = pose[1, 3] + z * (pose[1, 0] * a + pose[1, 1] * b + pose[1, 2])
-        inside, at, u, v = _place(px, py, corner, cell, rows, columns)
+        inside, at, u, v = _place(px, py, corner, per_cell, rows, columns)
         if not inside:
             continue
         open_ = _between(flat, at, columns, OPEN, u, v)
@@ -152,7 +154,7 @@ def _find_in_row(row, view, depth, shown, flat, rows, columns, share, most):
         off = abs(pose[2, 3] + z * rise - _between(flat, at, columns, HEIGHT, u, v))
         distance = z * math.sqrt(1.0 + a * a + b * b)
         near, far = NEAR_OFF + NEAR_PER_M * distance, FAR_OFF + FAR_PER_M * distance
-        s = shown[row, x] * open_ * (1.0 - _smoothstep(near, far, off))
+        s = shown[row, x] * open_ * (1.0 - _smoothstep((off - near) / (far - near)))
         if s > FAINT:
             share[row, x] = np.float32(s)
             best = max(best, np.float32(s))
@@ -218,13 +220,13 @@ class Water(NamedTuple):
 
 
 @inner()
-def _mottle(noise, x, y, texel):
-    u, v = x / texel, y / texel
+def _mottle(noise, x, y, per_texel):
+    u, v = x * per_texel, y * per_texel
     i, j = math.floor(u), math.floor(v)
     u, v = u - i, v - j
     side = MOTTLE_SIDE
-    i0, j0 = np.int64(i) & (side - 1), np.int64(j) & (side - 1)
-    i1, j1 = (i0 + 1) & (side - 1), (j0 + 1) & (side - 1)
+    i0, j0 = U(np.int64(i) & (side - 1)), U(np.int64(j) & (side - 1))
+    i1, j1 = (i0 + U(1)) & U(side - 1), (j0 + U(1)) & U(side - 1)
     a = noise[j0, i0] + (noise[j0, i1] - noise[j0, i0]) * u
     b = noise[j1, i0] + (noise[j1, i1] - noise[j1, i0]) * u
     return a + (b - a) * v
@@ -232,18 +234,20 @@ def _mottle(noise, x, y, texel):
 
 @inner()
 def _look_up(table, cosine, rough):
-    u, v = cosine * COSINES, min(rough / ROUGHEST, 1.0) * ROUGHNESSES
-    i, j = min(np.int64(u), COSINES - 1), min(np.int64(v), ROUGHNESSES - 1)
-    u, v = u - i, v - j
-    a = table[j, i] + (table[j, i + 1] - table[j, i]) * u
-    b = table[j + 1, i] + (table[j + 1, i + 1] - table[j + 1, i]) * u
+    u, v = cosine * COSINES, min(rough * (1.0 / ROUGHEST), 1.0) * ROUGHNESSES
+    i, j = U(min(np.int64(u), COSINES - 1)), U(min(np.int64(v), ROUGHNESSES - 1))
+    u, v = u - np.int64(i), v - np.int64(j)
+    right, down = i + U(1), j + U(1)
+    a = table[j, i] + (table[j, right] - table[j, i]) * u
+    b = table[down, i] + (table[down, right] - table[down, i]) * u
     return a + (b - a) * v
 
 
 @inner()
 def _step_of(table, at):
     i = min(np.int64(at), TABLE - 1)
-    return table[i] + (table[i + 1] - table[i]) * (at - i)
+    low, high = table[U(i)], table[U(i + 1)]
+    return low + (high - low) * (at - i)
 
 
 @inner()
@@ -264,20 +268,20 @@ def _encode(table, linear):
 def _project(rotation, lens, x, y, z):
     a = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
     b = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-    c = max(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z, 1e-3)
-    return lens[0] * a / c + lens[2], lens[1] * b / c + lens[3]
+    c = 1.0 / max(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z, 1e-3)
+    return lens[0] * a * c + lens[2], lens[1] * b * c + lens[3]
 
 
 @inner()
-def _way_at(depth, rotation, lens, offset, column, row, x, y, z):
+def _way_at(depth, rotation, lens, per_x, per_y, offset, column, row, x, y, z):
     """Metres from a point of the ground to what the mirrored picture shows."""
     h, w = depth.shape
     i = np.int64(min(max(column, 0.0), w - 1.0))
     j = np.int64(min(max(row, 0.0), h - 1.0))
-    far = np.float64(depth[j, i])
+    far = np.float64(depth[U(j), U(i)])
     if not far > 0.0:
         return FARTHEST_M
-    a, b = (i + 0.5 - lens[2]) / lens[0] * far, (j + 0.5 - lens[3]) / lens[1] * far
+    a, b = (i + 0.5 - lens[2]) * per_x * far, (j + 0.5 - lens[3]) * per_y * far
     dx = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * far + offset[0] - x
     dy = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * far + offset[1] - y
     dz = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * far + offset[2] - z
@@ -291,15 +295,24 @@ def _texel(colors, table, level, column, row):
         row = row / (1 << (level - 1))
     x, y = min(max(column - 0.5, 0.0), w - 1.0), min(max(row - 0.5, 0.0), h - 1.0)
     i, j = np.int64(x), np.int64(y)
-    u, v, at = x - i, y - j, first + j * w + i
-    right = at + 1 if i < w - 1 else at
-    down = w if j < h - 1 else 0
+    u, v, at = x - i, y - j, U(first + j * w + i)
+    right = at + U(i < w - 1)
+    down = U(w if j < h - 1 else 0)
     a, b, c, d = (1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v
     low, low_right = at + down, right + down
     return (
-        a * colors[at, 0] + b * colors[right, 0] + c * colors[low, 0] + d * colors[low_right, 0],
-        a * colors[at, 1] + b * colors[right, 1] + c * colors[low, 1] + d * colors[low_right, 1],
-        a * colors[at, 2] + b * colors[right, 2] + c * colors[low, 2] + d * colors[low_right, 2],
+        a * colors[at, U(0)]
+        + b * colors[right, U(0)]
+        + c * colors[low, U(0)]
+        + d * colors[low_right, U(0)],
+        a * colors[at, U(1)]
+        + b * colors[right, U(1)]
+        + c * colors[low, U(1)]
+        + d * colors[low_right, U(1)],
+        a * colors[at, U(2)]
+        + b * colors[right, U(2)]
+        + c * colors[low, U(2)]
+        + d * colors[low_right, U(2)],
     )
 
 
@@ -315,7 +328,7 @@ def decode(rgb, table, linear):
 
 @inner()
 def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb):
-    lens, pose, corner, cell = view.lens, view.pose, view.corner, view.cell_m
+    lens, pose, corner, per_cell = view.lens, view.pose, view.corner, 1.0 / view.cell_m
     m_lens, rotation, offset = mirror.lens, mirror.rotation, mirror.offset
     colors, table, m_depth = mirror.colors, mirror.table, mirror.depth
     wetness, level, rings, noise = water.wetness, water.level, water.rings, water.noise
@@ -323,33 +336,36 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
     decoded, encoded = water.decoded, water.encoded
     reflectance = water.reflectance
     drops = np.full((AT + 1, 4), np.nan)
-    b = (line + 0.5 - lens[3]) / lens[1]
+    per_x, per_y = 1.0 / m_lens[0], 1.0 / m_lens[1]
+    per_focal, per_row = 1.0 / lens[0], 1.0 / lens[1]
+    b = (line + 0.5 - lens[3]) * per_row
     for x in range(depth.shape[1]):
         own = np.float64(share[line, x])
         if not own > 0.0:
             continue
-        a = (x + 0.5 - lens[2]) / lens[0]
+        a = (x + 0.5 - lens[2]) * per_focal
         z = np.float64(depth[line, x])
         px = z * (pose[0, 0] * a + pose[0, 1] * b + pose[0, 2])
         py = z * (pose[1, 0] * a + pose[1, 1] * b + pose[1, 2])
         pz = z * (pose[2, 0] * a + pose[2, 1] * b + pose[2, 2])
         wx, wy = px + pose[0, 3], py + pose[1, 3]
-        _, at, u, v = _place(wx, wy, corner, cell, rows, columns)
+        _, at, u, v = _place(wx, wy, corner, per_cell, rows, columns)
         hollow = _between(flat, at, columns, HOLLOW, u, v)
-        puddle = wetness * _smoothstep(level - RIM, level + RIM, hollow)
+        puddle = wetness * _smoothstep((hollow - level) * (0.5 / RIM) + 0.5)
         track = _between(flat, at, columns, TRACK, u, v)
         distance = math.sqrt(px * px + py * py + pz * pz)
-        ex, ey, ez = -px / distance, -py / distance, -pz / distance
-        footprint = distance / lens[1] / max(ez, LEAST_SINE)
+        per_distance = -1.0 / distance
+        ex, ey, ez = px * per_distance, py * per_distance, pz * per_distance
+        footprint = distance * per_row / max(ez, LEAST_SINE)
         nx = -_between(flat, at, columns, RISE_X, u, v) * (1.0 - puddle)
         ny = -_between(flat, at, columns, RISE_Y, u, v) * (1.0 - puddle)
-        fine = FINE * min(max(2.0 - footprint / FINE_M, 0.0), 1.0)
-        coarse = COARSE * min(max(2.0 - footprint / COARSE_M, 0.0), 1.0)
+        fine = FINE * min(max(2.0 - footprint * (1.0 / FINE_M), 0.0), 1.0)
+        coarse = COARSE * min(max(2.0 - footprint * (1.0 / COARSE_M), 0.0), 1.0)
         uneven = 0.0
         if coarse > 0.0:
-            uneven += coarse * _mottle(noise, wx, wy, COARSE_M)
+            uneven += coarse * _mottle(noise, wx, wy, 1.0 / COARSE_M)
         if fine > 0.0:
-            uneven += fine * _mottle(noise, wx, wy, FINE_M)
+            uneven += fine * _mottle(noise, wx, wy, 1.0 / FINE_M)
         rough = ASPHALT * (1.0 - TRACK_SMOOTHS * track) * (1.0 - uneven)
         still = PUDDLE
         if puddle > 0.0:
@@ -358,8 +374,8 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
             ny -= sy * puddle
             still = math.sqrt(PUDDLE * PUDDLE + 0.5 * variance)
         rough += puddle * (still - rough)
-        length = math.sqrt(nx * nx + ny * ny + 1.0)
-        nx, ny, nz = nx / length, ny / length, 1.0 / length
+        nz = 1.0 / math.sqrt(nx * nx + ny * ny + 1.0)
+        nx, ny = nx * nz, ny * nz
         cosine = min(max(nx * ex + ny * ey + nz * ez, 0.005), 1.0)
         film = min(max(FILM + uneven + 0.1 * track, 0.0), 1.0)
         cover = wetness * (film + (1.0 - film) * puddle)
@@ -367,7 +383,7 @@ def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb
         rx, ry, rz = 2.0 * cosine * nx - ex, 2.0 * cosine * ny - ey, 2.0 * cosine * nz - ez
         mx, my, mz = px - offset[0], py - offset[1], pz - offset[2]
         column, row = _project(rotation, m_lens, mx, my, mz)
-        way = _way_at(m_depth, rotation, m_lens, offset, column, row, px, py, pz)
+        way = _way_at(m_depth, rotation, m_lens, per_x, per_y, offset, column, row, px, py, pz)
         tx, ty, tz = mx + way * rx, my + way * ry, mz + way * rz
         column, row = _project(rotation, m_lens, tx, ty, tz)
         sigma = m_lens[1] * 2.0 * rough * way / (way + distance)
