@@ -20,6 +20,7 @@ from augment.files.export import (
     PARTS,
     ExportKind,
     export_cameras,
+    export_glb,
     export_losses,
     export_ply,
     export_ply_parts,
@@ -66,6 +67,7 @@ _SUFFIXES: dict[ExportKind, str] = {
     "ply": ".ply",
     "splat": ".splat",
     "spz": ".spz",
+    "glb": ".glb",
 }
 
 
@@ -351,8 +353,8 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
-    if kind == "spz":
-        export_spz(scene, out, moment)
+    if kind in ("spz", "glb"):
+        (export_spz if kind == "spz" else export_glb)(scene, out, moment)
         return [out]
     if kind == "ply":
         export_ply(scene, out, moment)
