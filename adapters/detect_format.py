@@ -331,7 +331,7 @@ FOLDERS = (
         "gaussians",
         _holds_splats,
         "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
-        ".splat, .spz, .glb or .gltf file in it",
+        ".splat, .spz, .glb, .gltf or .usd file in it",
     ),
 )
 FILES = (
@@ -346,5 +346,5 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply, .splat, .spz, .glb or .gltf file"),
+    Signature("gaussians", _is_splat_file, "a .ply, .splat, .spz, .glb, .gltf or .usd file"),
 )

@@ -363,7 +363,7 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
         names = [p.name for p in files[:8]]
         raise AdapterError(
             f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply, "
-            f".splat, .spz, .glb or .gltf file in this folder; found {names or 'none'}. "
+            f".splat, .spz, .glb, .gltf or .usd file in this folder; found {names or 'none'}. "
             "Give the file itself"
         )
     return files[0]

@@ -26,6 +26,7 @@ from augment.files.export import (
     export_ply_parts,
     export_splat,
     export_spz,
+    export_usd,
 )
 from augment.files.scene_file import (
     FILES,
@@ -68,6 +69,7 @@ _SUFFIXES: dict[ExportKind, str] = {
     "splat": ".splat",
     "spz": ".spz",
     "glb": ".glb",
+    "usd": ".usdc",
 }
 
 
@@ -353,8 +355,9 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
-    if kind in ("spz", "glb"):
-        (export_spz if kind == "spz" else export_glb)(scene, out, moment)
+    alone = {"spz": export_spz, "glb": export_glb, "usd": export_usd}
+    if kind in alone:
+        alone[kind](scene, out, moment)
         return [out]
     if kind == "ply":
         export_ply(scene, out, moment)

@@ -24,6 +24,7 @@ from augment.files.gltf import write_glb
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
 from augment.files.spz import write_spz
+from augment.files.usd import write_usd
 from augment.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
 from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
@@ -34,7 +35,7 @@ from augment.semantics import SemanticClass
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 
 _SEEN_PX = 0.1
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "glb"]
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "glb", "usd"]
 
 
 def export_losses(
@@ -82,13 +83,15 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
                 f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
-    if kind in ("splat", "spz", "glb") and scene.world_origin_m.any():
+    if kind in ("splat", "spz", "glb", "usd") and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
     if kind == "splat":
         yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
     if kind == "spz":
         yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
+        yield "cameras are left out"
+    if kind == "usd":
         yield "cameras are left out"
     if kind == "glb":
         unit = "its unit is the metre, y points up in it; cameras are left out"
@@ -123,7 +126,7 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
             yield "colours do not depend on the direction of view: SH bands above 0 are left out"
     has_classes = any(part.semantic is not None for part in scene.all_gaussians)
-    if kind in ("splat", "spz", "glb") and has_classes:
+    if kind in ("splat", "spz", "glb", "usd") and has_classes:
         yield "semantic classes are left out"
 
 
@@ -133,7 +136,7 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras and kind not in ("spz", "glb"):
+    if cameras and kind not in ("spz", "glb", "usd"):
         off = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -284,6 +287,12 @@ def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 def export_glb(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     """Write the scene as it is at a moment into a .glb with KHR_gaussian_splatting, y up."""
     write_glb(path, _y_up(_something(scene, timestamp_ns)))
+
+
+def export_usd(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .usdc, in the scene's axes."""
+    upright, metric = scene.has_known_gravity, scene.has_metric_scale
+    write_usd(path, _something(scene, timestamp_ns), is_upright=upright, is_metric=metric)
 
 
 def _y_up(gaussians: Gaussians) -> Gaussians:

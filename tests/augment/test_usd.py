@@ -1,0 +1,112 @@
+"""Gaussians in OpenUSD files: round trips, transforms, the schema's defaults, refusals."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from test_spz import some_gaussians
+
+from adapters.base import open_scene
+from augment.errors import SceneError
+from augment.files.export import export_usd
+from augment.files.ply import read_splats, write_ply
+from augment.files.usd import read_usd, write_usd
+
+SPLATS = "def ParticleField3DGaussianSplat"
+# A Gaussian at (1, 2, 3), a turn of 90 degrees about z, opacity 0.25.
+ONE = """
+    half3[] scalesh = [(0.5, 1, 2)]
+    point3f[] positions = [(1, 2, 3)]
+    quath[] orientationsh = [(0.70711, 0, 0, 0.70711)]
+    float[] opacities = [0.25, 1]
+    uniform int radiance:sphericalHarmonicsDegree = 0
+    float3[] radiance:sphericalHarmonicsCoefficients = [(0.1, 0.2, 0.3)]
+"""
+
+
+def saved(folder: Path, body: str, head: str = "") -> Path:
+    path = folder / f"{len(list(folder.iterdir()))}.usda"  # OpenUSD keeps open layers by name
+    path.write_text(f"#usda 1.0\n({head})\n{body}\n")
+    return path
+
+
+@pytest.mark.parametrize("bands", [1, 16])
+def test_a_round_trip_keeps_floats(tmp_path: Path, bands: int) -> None:
+    before = some_gaussians(bands=bands)
+    for name in ("a.usdc", "b.usdc"):
+        write_usd(tmp_path / name, before, is_upright=True, is_metric=True)
+    assert (tmp_path / "a.usdc").read_bytes() == (tmp_path / "b.usdc").read_bytes()
+    read = read_splats(tmp_path / "a.usdc")
+    assert read.notes == {"up": "+z", "unit": "metre"} and not read.problems
+    for name in ("means", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(read.gaussians, name), getattr(before, name)), name
+    # Lengths are made 1 again: two roundings of float32.
+    assert (read.gaussians.quats - before.quats).abs().max() <= 2.5e-7
+
+
+def test_a_scene_comes_back(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", some_gaussians())
+    before = open_scene(f"gaussians:{tmp_path}/a.ply?up=+z&scale=1")
+    export_usd(before, tmp_path / "a.usdc", 0)
+    after = open_scene(f"{tmp_path}/a.usdc")  # told by its suffix
+    assert after.has_metric_scale and after.has_known_gravity
+    assert torch.equal(after.background.means, before.background.means)
+    assert torch.equal(after.background.sh, before.background.sh)
+
+
+def test_transforms_units_halves_and_defaults(tmp_path: Path) -> None:
+    """Centimetres, y up; a prim turned by 90 degrees about x, another with places only."""
+    body = f"""
+def Xform "a" {{
+    double3 xformOp:translate = (100, 0, 0)
+    float xformOp:rotateX = 90
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateX"]
+    {SPLATS} "one" {{ {ONE} }}
+    {SPLATS} "hidden" {{ {ONE} token visibility = "invisible"
+}}
+}}
+{SPLATS} "bare" {{ point3f[] positions = [(0, 0, 500)]
+}}"""
+    read = read_usd(saved(tmp_path, body, 'upAxis = "Y"; metersPerUnit = 0.01'))
+    assert read.notes == {"up": "+y", "unit": "metre"}
+    found = read.gaussians
+    assert found.means.tolist() == [pytest.approx([1.01, -0.03, 0.02]), [0, 0, 5]]
+    assert found.scales.tolist() == [pytest.approx([0.005, 0.01, 0.02]), pytest.approx([0.01] * 3)]
+    assert found.opacities.tolist() == [0.25, 1]
+    half = 0.5  # the turn about x after the one about z, each of cos 45 degrees
+    turned = found.quats[0] * math.copysign(1, found.quats[0, 0])
+    assert turned.tolist() == pytest.approx([half, half, -half, half], abs=1e-3)  # of halves
+    assert found.sh[:, 0].tolist() == [pytest.approx([0.1, 0.2, 0.3]), [0, 0, 0]]
+    told = " ".join(read.problems)
+    assert "/a/hidden is invisible" in told and "/bare: scales has 0 of 1 values" in told
+
+
+def test_refusals(tmp_path: Path) -> None:
+    other = saved(tmp_path, f'{SPLATS} "one" {{ {ONE} }}')
+    scale = "float3 xformOp:scale = (-1, 1, 1)\nuniform token[] xformOpOrder = ['xformOp:scale']\n"
+    copies = "".join(
+        f'def "c{n}" (instanceable = true; references = </p>) {{}}\n' for n in range(40)
+    )
+    rows = ", ".join(["(0, 0, 0)"] * 900)
+    many = f'def "p" {{ {SPLATS} "a" {{ point3f[] positions = [{rows}]\n}}\n}}\n'
+    cases = (
+        ("no splats", 'def Xform "a" {}', "no visible ParticleField3DGaussianSplat"),
+        ("another file", f'def "a" (references = @{other}@) {{}}', "refers to .*usdcat --flatten"),
+        ("a payload", f'def "a" (payload = @./{other.name}@) {{}}', "refers to"),
+        ("a mirror", f'{SPLATS} "a" {{ {ONE} {scale} }}', "mirrors"),
+        ("degree", f'{SPLATS} "a" {{ {ONE.replace("Degree = 0", "Degree = 99")} }}', "degree 99"),
+        ("not USD", "def {", "not a whole OpenUSD file"),
+        ("copies", many + copies, "more than 16 times"),
+    )
+    for name, body, message in cases:
+        with pytest.raises(SceneError, match=message):
+            read_splats(saved(tmp_path, body))
+            pytest.fail(name)
+    path = tmp_path / "a.usdc"
+    write_usd(path, some_gaussians(), is_upright=True, is_metric=True)
+    path.write_bytes(path.read_bytes()[:-5000])
+    with pytest.raises(SceneError, match="not a whole OpenUSD file"):
+        read_usd(path)
