@@ -72,7 +72,7 @@ def _check_layers(pxr: Any, path: Path, root: Any) -> None:
         if layer.identifier in seen:
             continue
         seen.add(layer.identifier)
-        for name in layer.GetCompositionAssetDependencies():
+        for name in filter(None, layer.GetCompositionAssetDependencies()):  # '': the layer itself
             where = layer.ComputeAbsolutePath(name)
             inner = None
             if where.startswith(f"{path.absolute()}["):
