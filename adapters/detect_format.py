@@ -15,6 +15,7 @@ from typing import NamedTuple
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_SPLITS, parse_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import is_scene_file, is_scene_folder
+from augment.files.sog import META, is_sog_folder
 from augment.jobs.mirror import SourceTree
 from augment.scene import Scene
 from recipes.files import open_file
@@ -267,11 +268,16 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    return sum(name.lower().endswith((".ply", ".splat", ".spz")) for name in _names(folder)) == 1
+    suffixes = (".ply", ".splat", ".spz", ".sog")
+    found = sum(name.lower().endswith(suffixes) for name in _names(folder))
+    return found == 1 or (found == 0 and is_sog_folder(folder))
 
 
 def _is_splat_file(path: Path) -> bool:
-    return path.suffix.lower() in (".splat", ".spz") or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+    named = path.suffix.lower() in (".splat", ".spz", ".sog") or (
+        path.name == META and is_sog_folder(path.parent)
+    )
+    return named or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
 
 def _is_multi_part(path: Path) -> bool:
@@ -330,7 +336,7 @@ FOLDERS = (
         "gaussians",
         _holds_splats,
         "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
-        ".splat or .spz file in it",
+        ".splat, .spz or .sog file, or meta.json and images of SOG, in it",
     ),
 )
 FILES = (
@@ -345,5 +351,7 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply, .splat or .spz file"),
+    Signature(
+        "gaussians", _is_splat_file, "a .ply, .splat, .spz or .sog file, or a SOG's meta.json"
+    ),
 )

@@ -444,31 +444,31 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
 
 
 class ExportOptions(SceneCommand):
-    """Write a scene as one file to share, or for other programs: .ply, .splat, .spz.
+    """Write a scene as one file to share, or for other programs: .ply, .splat, .spz, .sog.
 
     What the kind of file cannot keep is said.
 
     Args:
         scene: The scene, as for render.
         out: The file or folder; a file's suffix is added where it lacks.
-        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz:
-            Gaussians as they are at one frame. ply-parts: background and every actor apart.
-        frame: At which ply, splat and spz are baked. The first by default.
+        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz,
+            sog: Gaussians as they are at one frame. ply-parts: background and every actor apart.
+        frame: At which ply, splat, spz and sog are baked. The first by default.
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
 
     scene: Positional[str]
     out: Path
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz"] = "file"
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "sog"] = "file"
     frame: int | None = None
     half: bool = False
     overwrite: bool = False
 
     @model_validator(mode="after")
     def _kind_has_them(self) -> Self:
-        if self.frame is not None and self.kind not in ("ply", "splat", "spz"):
-            text = "--frame is for ply, splat and spz, which show one moment; not for"
+        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "sog"):
+            text = "--frame is for ply, splat, spz and sog, which show one moment; not for"
             raise ValueError(f"{text} {self.kind}")
         if self.half and self.kind != "file":
             text = "--half is for a single scene file (--kind file); not for"

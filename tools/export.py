@@ -23,6 +23,7 @@ from augment.files.export import (
     export_losses,
     export_ply,
     export_ply_parts,
+    export_sog,
     export_splat,
     export_spz,
 )
@@ -66,6 +67,7 @@ _SUFFIXES: dict[ExportKind, str] = {
     "ply": ".ply",
     "splat": ".splat",
     "spz": ".spz",
+    "sog": ".sog",
 }
 
 
@@ -353,6 +355,9 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
     if kind == "spz":
         export_spz(scene, out, moment)
+        return [out]
+    if kind == "sog":
+        export_sog(scene, out, moment)
         return [out]
     if kind == "ply":
         export_ply(scene, out, moment)

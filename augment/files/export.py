@@ -22,6 +22,7 @@ from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
+from augment.files.sog import MAX_PALETTE, write_sog
 from augment.files.spz import write_spz
 from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
@@ -33,7 +34,7 @@ from augment.semantics import SemanticClass
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 
 _SEEN_PX = 0.1
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz"]
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog"]
 
 
 def export_losses(
@@ -81,13 +82,14 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
                 f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
-    if kind in ("splat", "spz") and scene.world_origin_m.any():
+    if kind in ("splat", "spz", "sog") and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
     if kind == "splat":
         yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
     if kind == "spz":
         yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
+    if kind in ("spz", "sog"):
         yield "cameras are left out"
 
 
@@ -107,13 +109,21 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
             "colours of actors by direction are for directions of the world, and viewers turn them "
             "with the actor"
         )
+    if kind == "sog":
+        yield (
+            "places are rounded to 0.1 mm at the origin, 1 cm at 100 m and 10 cm at 1 km from it, "
+            "rotations 8 bits a component, opacities 8 bits; scales and colours "
+            "are the nearest of 256 each"
+        )
+        if any(part.sh_degree > 0 for part in scene.all_gaussians):
+            yield f"SH is the nearest of {MAX_PALETTE} entries at most"
     if kind == "spz":
         yield (
             "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
             "degrees, opacities, colours and SH to 8 bits and less; SH beyond -1 and 1 is cut off"
         )
-        if any(part.semantic is not None for part in scene.all_gaussians):
-            yield "semantic classes are left out"
+    if kind in ("spz", "sog") and any(part.semantic is not None for part in scene.all_gaussians):
+        yield "semantic classes are left out"
     if kind == "splat":
         yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
@@ -128,7 +138,7 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras and kind != "spz":
+    if cameras and kind not in ("spz", "sog"):
         off = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -250,6 +260,19 @@ def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     gaussians = _something(scene, timestamp_ns)
     write_spz(path, moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64)))
+
+
+def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .sog, y down: viewers turn it as they turn a
+    .ply. Its meta.json says `up` and `unit` as the .ply's comments do.
+    """
+    z_to_minus_y = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    gaussians = _something(scene, timestamp_ns)
+    notes = {key: note for key, note in _notes(scene).items() if key in ("up", "unit")}
+    if "up" in notes:
+        notes["up"] = "-y"
+    zero = torch.zeros(3, dtype=torch.float64)
+    write_sog(path, moved_gaussians(gaussians, z_to_minus_y, zero), notes=notes)
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:

@@ -356,25 +356,29 @@ class SplatFile:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a .ply, .splat or .spz file, told apart by its first bytes. Raises SceneError: no such
-    file, an unknown format, or damaged content; says what was expected.
+    """Read a .ply, .splat, .spz or .sog file, told apart by its first bytes, or the meta.json of a
+    SOG folder. Raises SceneError: no such file, an unknown format, or damaged content; says what
+    was expected.
     """
+    from augment.files.sog import META, ZIP, read_sog
     from augment.files.spz import GZIP, read_spz  # which takes this module's records
 
     path = Path(path)
     if not path.is_file():
-        raise SceneError(f"{path}: no such file; expected a .ply, .splat or .spz file")
+        raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz or .sog file")
     with path.open("rb") as file:
         start = file.read(4)
     if start[:3] == b"ply" and start[3:] in (b"\n", b"\r"):
         return read_ply(path)
     if start[:2] == GZIP:
         return read_spz(path)
+    if start == ZIP or path.name == META:
+        return read_sog(path)
     if path.suffix.lower() == ".splat":
         return read_splat(path)
     raise SceneError(
-        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz, nor named .splat; "
-        "convert other splat formats (.ksplat, .sog) to .ply first, for example with SuperSplat"
+        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz or .sog, nor named "
+        ".splat; convert other splat formats (.ksplat) to .ply first, for example with SuperSplat"
     )
 
 
