@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_SPLITS, parse_uri
 from augment.errors import AdapterError
+from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
 from augment.jobs.mirror import SourceTree
@@ -268,16 +269,14 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    suffixes = (".ply", ".splat", ".spz", ".sog")
-    found = sum(name.lower().endswith(suffixes) for name in _names(folder))
+    found = sum(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
     return found == 1 or (found == 0 and is_sog_folder(folder))
 
 
 def _is_splat_file(path: Path) -> bool:
-    named = path.suffix.lower() in (".splat", ".spz", ".sog") or (
-        path.name == META and is_sog_folder(path.parent)
-    )
-    return named or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+    if path.name == META and is_sog_folder(path.parent):
+        return True
+    return path.suffix.lower() in SPLAT_SUFFIXES[1:] or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
 
 def _is_multi_part(path: Path) -> bool:
@@ -336,7 +335,7 @@ FOLDERS = (
         "gaussians",
         _holds_splats,
         "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
-        ".splat, .spz or .sog file, or meta.json and images of SOG, in it",
+        ".splat, .spz, .sog, .glb or .gltf file, or meta.json and images of SOG, in it",
     ),
 )
 FILES = (
@@ -351,7 +350,5 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature(
-        "gaussians", _is_splat_file, "a .ply, .splat, .spz or .sog file, or a SOG's meta.json"
-    ),
+    Signature("gaussians", _is_splat_file, "a .ply, .splat, .spz, .sog, .glb or .gltf file"),
 )

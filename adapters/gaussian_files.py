@@ -1,5 +1,4 @@
-"""Scenes from plain splat files: a .ply, .splat, .spz or SOG, alone or in a trained 3DGS
-model's folder.
+"""Scenes from plain splat files, such as a .ply, alone or in a trained 3DGS model's folder.
 
     gaussians:PATH?up=-y&scale=1&cameras=FILE
 
@@ -43,7 +42,7 @@ from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.files.ply import SplatFile, read_splats, recentring_origin
+from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
 from augment.files.sog import META, is_sog_folder
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
@@ -360,16 +359,15 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
         if iteration is not None and iteration not in found:
             raise AdapterError(f"{path}: no iteration {iteration}; it has {sorted(found)}")
         return found[max(found) if iteration is None else iteration]
-    suffixes = (".ply", ".splat", ".spz", ".sog")
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes)
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SPLAT_SUFFIXES)
     if not files and is_sog_folder(path):
         return path / META
     if len(files) != 1:
         names = [p.name for p in files[:8]]
         raise AdapterError(
             f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply, "
-            f".splat, .spz or .sog file, or meta.json and images of SOG, in this folder; found "
-            f"{names or 'none'}. Give the file itself"
+            f".splat, .spz, .sog, .glb or .gltf file, or meta.json and images of SOG, in this "
+            f"folder; found {names or 'none'}. Give the file itself"
         )
     return files[0]
 

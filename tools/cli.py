@@ -444,7 +444,7 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
 
 
 class ExportOptions(SceneCommand):
-    """Write a scene as one file to share, or for other programs: .ply, .splat, .spz, .sog.
+    """Write a scene as one file to share, or for other programs: .ply, .splat, .spz, .sog, .glb.
 
     What the kind of file cannot keep is said.
 
@@ -452,23 +452,24 @@ class ExportOptions(SceneCommand):
         scene: The scene, as for render.
         out: The file or folder; a file's suffix is added where it lacks.
         kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz,
-            sog: Gaussians as they are at one frame. ply-parts: background and every actor apart.
-        frame: At which ply, splat, spz and sog are baked. The first by default.
+            sog, glb (glTF, KHR_gaussian_splatting): Gaussians as they are at one frame.
+            ply-parts: background and every actor apart.
+        frame: At which ply, splat, spz, sog and glb are baked. The first by default.
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
 
     scene: Positional[str]
     out: Path
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "sog"] = "file"
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "sog", "glb"] = "file"
     frame: int | None = None
     half: bool = False
     overwrite: bool = False
 
     @model_validator(mode="after")
     def _kind_has_them(self) -> Self:
-        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "sog"):
-            text = "--frame is for ply, splat, spz and sog, which show one moment; not for"
+        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "sog", "glb"):
+            text = "--frame is for ply, splat, spz, sog and glb, which show one moment; not for"
             raise ValueError(f"{text} {self.kind}")
         if self.half and self.kind != "file":
             text = "--half is for a single scene file (--kind file); not for"

@@ -20,6 +20,7 @@ from augment.files.export import (
     PARTS,
     ExportKind,
     export_cameras,
+    export_glb,
     export_losses,
     export_ply,
     export_ply_parts,
@@ -68,6 +69,7 @@ _SUFFIXES: dict[ExportKind, str] = {
     "splat": ".splat",
     "spz": ".spz",
     "sog": ".sog",
+    "glb": ".glb",
 }
 
 
@@ -353,11 +355,8 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
-    if kind == "spz":
-        export_spz(scene, out, moment)
-        return [out]
-    if kind == "sog":
-        export_sog(scene, out, moment)
+    if kind in ("spz", "sog", "glb"):
+        {"spz": export_spz, "sog": export_sog, "glb": export_glb}[kind](scene, out, moment)
         return [out]
     if kind == "ply":
         export_ply(scene, out, moment)

@@ -384,8 +384,8 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
     lens, plain = shot.lens, shot.lens
     if not lens.is_undistorted():
         plain = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
-    params = plain.params
-    fx, fy, cx, cy = params if len(params) == 4 else (params[0], *params)
+    fx, fy = plain.focal_length_x, plain.focal_length_y
+    cx, cy = plain.principal_point_x, plain.principal_point_y
     image = decode_image(source, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.shape[:2] != (lens.height, lens.width):
         got = "no image" if image is None else f"{image.shape[1]}x{image.shape[0]} pixels"

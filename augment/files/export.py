@@ -20,11 +20,12 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
+from augment.files.gltf import write_glb
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
 from augment.files.sog import MAX_PALETTE, write_sog
 from augment.files.spz import write_spz
-from augment.geometry import multiply_quats, quat_from_rotmat
+from augment.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
 from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
 from augment.render.sh import rotate_sh
@@ -34,7 +35,7 @@ from augment.semantics import SemanticClass
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 
 _SEEN_PX = 0.1
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog"]
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog", "glb"]
 
 
 def export_losses(
@@ -82,7 +83,7 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
                 f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
-    if kind in ("splat", "spz", "sog") and scene.world_origin_m.any():
+    if kind in ("splat", "spz", "sog", "glb") and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
     if kind == "splat":
@@ -91,6 +92,11 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
         yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
     if kind in ("spz", "sog"):
         yield "cameras are left out"
+    if kind == "glb":
+        unit = "its unit is the metre, y points up in it; cameras are left out"
+        yield (
+            unit if scene.has_metric_scale else f"how long the scene's unit is is not known; {unit}"
+        )
 
 
 def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
@@ -112,24 +118,23 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if kind == "sog":
         yield (
             "places are rounded to 0.1 mm at the origin, 1 cm at 100 m and 10 cm at 1 km from it, "
-            "rotations 8 bits a component, opacities 8 bits; scales and colours "
-            "are the nearest of 256 each"
+            "rotations to 1 degree, opacities to 8 bits, scales and colours to the nearest of "
+            "256 each"
         )
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
-            yield f"SH is the nearest of {MAX_PALETTE} entries at most"
+            yield f"SH is rounded to the nearest of {MAX_PALETTE} sets, where there are more"
     if kind == "spz":
         yield (
             "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
             "degrees, opacities, colours and SH to 8 bits and less; SH beyond -1 and 1 is cut off"
         )
-    if kind in ("spz", "sog") and any(part.semantic is not None for part in scene.all_gaussians):
-        yield "semantic classes are left out"
     if kind == "splat":
         yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
             yield "colours do not depend on the direction of view: SH bands above 0 are left out"
-        if any(part.semantic is not None for part in scene.all_gaussians):
-            yield "semantic classes are left out"
+    has_classes = any(part.semantic is not None for part in scene.all_gaussians)
+    if kind in ("splat", "spz", "sog", "glb") and has_classes:
+        yield "semantic classes are left out"
 
 
 def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
@@ -138,7 +143,7 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras and kind not in ("spz", "sog"):
+    if cameras and kind not in ("spz", "sog", "glb"):
         off = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -191,6 +196,32 @@ def moved_gaussians(
     quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
     sh = gaussians.sh if gaussians.sh_degree == 0 else _turned_sh(gaussians.sh, rotation)
     return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
+
+
+def transformed_gaussians(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
+    """The Gaussians under a linear map without mirrors, float64: exact for their shapes; SH turn by
+    the rotation nearest to it.
+    """
+    u, stretch, vh = torch.linalg.svd(matrix)
+    rotation, scale, still = u @ vh, float(stretch.mean()), torch.zeros(3, dtype=torch.float64)
+    if float(stretch[0] - stretch[2]) <= 1e-6 * scale:
+        if torch.allclose(rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12):
+            rotation = torch.eye(3, dtype=torch.float64)  # turns nothing, to the bit
+        return moved_gaussians(gaussians, rotation, still, scale)
+    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
+    axes = matrix @ rotmat_from_quat(quats) * gaussians.scales.double()[:, None]
+    usable = axes.isfinite().all(2).all(1)
+    axes = torch.where(usable[:, None, None], axes, torch.eye(3, dtype=torch.float64))
+    axes, scales, _ = torch.linalg.svd(axes)  # covariance = axes scales^2 axes^T
+    scales = torch.where(usable[:, None], scales, torch.nan)
+    axes = axes * torch.linalg.det(axes)[:, None, None]
+    moved = moved_gaussians(gaussians, rotation, still)
+    return dataclasses.replace(
+        moved,
+        means=(gaussians.means.double() @ matrix.T).to(gaussians.means.dtype),
+        quats=quat_from_rotmat(axes).to(gaussians.quats.dtype),
+        scales=scales.to(gaussians.scales.dtype),
+    )
 
 
 def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
@@ -257,9 +288,17 @@ def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 
 def export_spz(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     """Write the scene as it is at a moment into a .spz, y up."""
+    write_spz(path, _y_up(_something(scene, timestamp_ns)))
+
+
+def export_glb(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .glb with KHR_gaussian_splatting, y up."""
+    write_glb(path, _y_up(_something(scene, timestamp_ns)))
+
+
+def _y_up(gaussians: Gaussians) -> Gaussians:
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
-    gaussians = _something(scene, timestamp_ns)
-    write_spz(path, moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64)))
+    return moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
 
 
 def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:

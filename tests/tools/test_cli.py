@@ -217,7 +217,7 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         ([*here, "--workers", "0"], "--workers must be"),
         (["explain", "clear", "--scene", scene_uri, "--variant", "9"], "clear has one variant, 0"),
         (["evaluate", out[1], "--short", "7"], "--long must be above --short 7; got 7"),
-        (["export", scene_uri, *out, "--frame", "4"], "--frame is for ply and splat"),
+        (["export", scene_uri, *out, "--frame", "4"], "--frame is for ply, splat"),
         (["export", scene_uri, *out, "--kind", "ply", "--half"], "--half is for a single scene"),
         (["sheet", out[1]], "manifest.parquet does not exist"),
         (["inspect", scene_uri, "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts"),
