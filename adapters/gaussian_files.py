@@ -43,6 +43,7 @@ from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
+from augment.files.sog import META, is_sog_folder
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
@@ -359,12 +360,14 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
             raise AdapterError(f"{path}: no iteration {iteration}; it has {sorted(found)}")
         return found[max(found) if iteration is None else iteration]
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SPLAT_SUFFIXES)
+    if not files and is_sog_folder(path):
+        return path / META
     if len(files) != 1:
         names = [p.name for p in files[:8]]
         raise AdapterError(
             f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply, "
-            f".splat, .spz, .glb, .gltf or .usd file in this folder; found {names or 'none'}. "
-            "Give the file itself"
+            f".splat, .spz, .sog, .glb, .gltf or .usd file, or meta.json and images of SOG, in "
+            f"this folder; found {names or 'none'}. Give the file itself"
         )
     return files[0]
 

@@ -452,24 +452,24 @@ class ExportOptions(SceneCommand):
         scene: The scene, as for render.
         out: The file or folder; a file's suffix is added where it lacks.
         kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat, spz,
-            glb (glTF), usd: Gaussians as they are at one frame. ply-parts: background
-            and every actor apart.
-        frame: At which ply, splat, spz, glb and usd are baked. The first by default.
+            sog, glb (glTF), usd: Gaussians as they are at one frame.
+            ply-parts: background and every actor apart.
+        frame: At which ply, splat, spz, sog, glb and usd are baked. The first by default.
         half: A file of about half the size, at a small loss.
         overwrite: Replace what is there.
     """
 
     scene: Positional[str]
     out: Path
-    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "glb", "usd"] = "file"
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat", "spz", "sog", "glb", "usd"] = "file"
     frame: int | None = None
     half: bool = False
     overwrite: bool = False
 
     @model_validator(mode="after")
     def _kind_has_them(self) -> Self:
-        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "glb", "usd"):
-            text = "--frame is for ply, splat, spz, glb and usd, which show one moment; not for"
+        if self.frame is not None and self.kind not in ("ply", "splat", "spz", "sog", "glb", "usd"):
+            text = "--frame is for ply, splat, spz, sog, glb and usd, of one moment; not for"
             raise ValueError(f"{text} {self.kind}")
         if self.half and self.kind != "file":
             text = "--half is for a single scene file (--kind file); not for"

@@ -24,6 +24,7 @@ from augment.files.export import (
     export_losses,
     export_ply,
     export_ply_parts,
+    export_sog,
     export_splat,
     export_spz,
     export_usd,
@@ -68,6 +69,7 @@ _SUFFIXES: dict[ExportKind, str] = {
     "ply": ".ply",
     "splat": ".splat",
     "spz": ".spz",
+    "sog": ".sog",
     "glb": ".glb",
     "usd": ".usdc",
 }
@@ -355,7 +357,7 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     if kind == "ply-parts":
         export_ply_parts(scene, out)
         return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
-    alone = {"spz": export_spz, "glb": export_glb, "usd": export_usd}
+    alone = {"spz": export_spz, "sog": export_sog, "glb": export_glb, "usd": export_usd}
     if kind in alone:
         alone[kind](scene, out, moment)
         return [out]

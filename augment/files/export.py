@@ -23,6 +23,7 @@ from augment.errors import OutputError, SceneError
 from augment.files.gltf import write_glb
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
+from augment.files.sog import MAX_PALETTE, write_sog
 from augment.files.spz import write_spz
 from augment.files.usd import write_usd
 from augment.geometry import multiply_quats, quat_from_rotmat, rotmat_from_quat
@@ -35,7 +36,7 @@ from augment.semantics import SemanticClass
 # ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
 
 _SEEN_PX = 0.1
-ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "glb", "usd"]
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat", "spz", "sog", "glb", "usd"]
 
 
 def export_losses(
@@ -83,15 +84,14 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
                 f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
                 f"moment, so that moving actors are a little off in them"
             )
-    if kind in ("splat", "spz", "glb", "usd") and scene.world_origin_m.any():
+    if kind in ("splat", "spz", "sog", "glb", "usd") and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
     if kind == "splat":
         yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
     if kind == "spz":
         yield "how long a unit is is left out: open it with ?scale=1; y points up in it"
-        yield "cameras are left out"
-    if kind == "usd":
+    if kind in ("spz", "sog", "usd"):
         yield "cameras are left out"
     if kind == "glb":
         unit = "its unit is the metre, y points up in it; cameras are left out"
@@ -116,6 +116,14 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
             "colours of actors by direction are for directions of the world, and viewers turn them "
             "with the actor"
         )
+    if kind == "sog":
+        yield (
+            "places are rounded to 0.1 mm at the origin, 1 cm at 100 m and 10 cm at 1 km from it, "
+            "rotations to 1 degree, opacities to 8 bits, scales and colours to the nearest of "
+            "256 each"
+        )
+        if any(part.sh_degree > 0 for part in scene.all_gaussians):
+            yield f"SH is rounded to the nearest of {MAX_PALETTE} sets, where there are more"
     if kind == "spz":
         yield (
             "places are rounded to 0.12 mm within 2 km, scales by up to 3 %, rotations to 0.25 "
@@ -126,7 +134,7 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
         if any(part.sh_degree > 0 for part in scene.all_gaussians):
             yield "colours do not depend on the direction of view: SH bands above 0 are left out"
     has_classes = any(part.semantic is not None for part in scene.all_gaussians)
-    if kind in ("splat", "spz", "glb", "usd") and has_classes:
+    if kind in ("splat", "spz", "sog", "glb", "usd") and has_classes:
         yield "semantic classes are left out"
 
 
@@ -136,7 +144,7 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if scene.ground_z_m is not None:
         yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    if cameras and kind not in ("spz", "glb", "usd"):
+    if cameras and kind not in ("spz", "sog", "glb", "usd"):
         off = max(
             max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
             for camera in cameras
@@ -298,6 +306,19 @@ def export_usd(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 def _y_up(gaussians: Gaussians) -> Gaussians:
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     return moved_gaussians(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
+
+
+def export_sog(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .sog, y down: viewers turn it as they turn a
+    .ply. Its meta.json says `up` and `unit` as the .ply's comments do.
+    """
+    z_to_minus_y = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    gaussians = _something(scene, timestamp_ns)
+    notes = {key: note for key, note in _notes(scene).items() if key in ("up", "unit")}
+    if "up" in notes:
+        notes["up"] = "-y"
+    zero = torch.zeros(3, dtype=torch.float64)
+    write_sog(path, moved_gaussians(gaussians, z_to_minus_y, zero), notes=notes)
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:

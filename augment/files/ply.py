@@ -334,7 +334,8 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
 
 # ---- Files ---------------------------------------------------------------------------------------
 
-SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
+_USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf", *_USD_SUFFIXES)
 RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
 _SPLAT_RECORD = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
@@ -357,32 +358,36 @@ class SplatFile:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a .ply, .splat, .spz, glTF or USD file, told apart by its first bytes. Raises
-    SceneError: no such file, an unknown format, or damaged content; says what was expected.
+    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, or the
+    meta.json of a SOG folder. Raises SceneError: no such file, an unknown format, or damaged
+    content; says what was expected.
     """
     from augment.files.gltf import GLB, read_gltf  # which take this module's records
+    from augment.files.sog import META, ZIP, read_sog
     from augment.files.spz import GZIP, read_spz
-    from augment.files.usd import SUFFIXES, read_usd
+    from augment.files.usd import read_usd
 
     path = Path(path)
     if not path.is_file():
-        raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz, .glb or .usd file")
+        raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz, .sog, .glb or .usd")
     with path.open("rb") as file:
         start = file.read(4)
     if start[:3] == b"ply" and start[3:] in (b"\n", b"\r"):
         return read_ply(path)
     if start[:2] == GZIP:
         return read_spz(path)
+    if path.suffix.lower() in _USD_SUFFIXES:  # before ZIP, which a .usdz is too
+        return read_usd(path)
+    if start == ZIP or path.name == META:
+        return read_sog(path)
     if start == GLB or path.suffix.lower() == ".gltf":
         return read_gltf(path)
-    if path.suffix.lower() in SUFFIXES:
-        return read_usd(path)
     if path.suffix.lower() == ".splat":
         return read_splat(path)
     raise SceneError(
-        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz or .glb, nor "
-        "named .splat, .gltf or .usd; convert other splat formats (.ksplat, .sog) to .ply first, "
-        "for example with SuperSplat"
+        f"{path}: neither a .ply (its first line would be 'ply') nor a .spz, .sog or .glb, nor "
+        "named .splat, .gltf or .usd; convert other splat formats (.ksplat) to .ply first, for "
+        "example with SuperSplat"
     )
 
 

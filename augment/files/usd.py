@@ -25,7 +25,6 @@ from augment.files.ply import SplatFile, recentring_origin
 from augment.jobs.atomic import replaced_file
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
-SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _LEAST_ROW = 6  # bytes of a place, in halves
 _MAX_COPIES = 16  # of all Gaussians that the file has room for
 

@@ -365,9 +365,9 @@ def test_bad_splat_files(tmp_path: Path) -> None:
     path.write_bytes(np.random.default_rng(0).bytes(32_000))
     with pytest.raises(SceneError, match=r"probably no \.splat"):
         read_splats(path)
-    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04")
+    (tmp_path / "a.ksplat").write_bytes(b"\0\1\0\0")
     with pytest.raises(SceneError, match="convert other splat formats"):
-        read_splats(tmp_path / "a.sog")
+        read_splats(tmp_path / "a.ksplat")
     for read in (read_splats, read_ply):
         with pytest.raises(SceneError, match="no such file"):
             read(tmp_path / "absent.ply")

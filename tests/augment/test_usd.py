@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from pxr import UsdUtils
 from test_spz import some_gaussians
 
 from adapters.base import open_scene
@@ -55,6 +56,8 @@ def test_a_scene_comes_back(tmp_path: Path) -> None:
     assert after.has_metric_scale and after.has_known_gravity
     assert torch.equal(after.background.means, before.background.means)
     assert torch.equal(after.background.sh, before.background.sh)
+    assert UsdUtils.CreateNewUsdzPackage(str(tmp_path / "a.usdc"), str(tmp_path / "a.usdz"))
+    assert torch.equal(read_splats(tmp_path / "a.usdz").gaussians.sh, before.background.sh)
 
 
 def test_transforms_units_halves_and_defaults(tmp_path: Path) -> None:

@@ -1,0 +1,246 @@
+"""Gaussians in SOG files: what is kept, bytes against the format's rules, and refusals."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from fitted_scenes import START_NS, fitted_scene
+
+from adapters.base import open_scene
+from adapters.detect_format import recognised
+from augment.errors import SceneError
+from augment.files import sog
+from augment.files.export import export_sog
+from augment.files.ply import read_splats
+from augment.files.sog import read_sog, write_sog
+from augment.geometry import rotmat_from_quat
+from augment.scene import Gaussians
+
+LEVELS = [float(level) for level in range(256)]
+
+
+def some_gaussians(count: int, bands: int) -> Gaussians:
+    """Along x, and so in the order in which the file has them: y and z are 0."""
+    rng = torch.Generator().manual_seed(1)
+    x = torch.linspace(-50, 50, count)
+    return Gaussians(
+        means=torch.stack([x, 0 * x, 0 * x], dim=1),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=1),
+        scales=torch.exp(8 * torch.rand(count, 3, generator=rng) - 7),
+        opacities=torch.rand(count, generator=rng),
+        sh=torch.rand(count, bands, 3, generator=rng) - 0.5,
+    )
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_a_round_trip_loses_what_the_steps_are(tmp_path: Path, bands: int) -> None:
+    before = some_gaussians(800, bands)
+    write_sog(tmp_path / "a.sog", before, notes={"up": "-y", "unit": "metre"})
+    read = read_splats(tmp_path / "a.sog")
+    after = read.gaussians
+    assert read.notes == {"up": "-y", "unit": "metre"} and not read.problems
+    assert after.sh_degree == before.sh_degree
+    # Half a step of 2 ln(51) / 65535, times the slope of the exponential.
+    step = math.log(51) / 65535 * (1 + before.means.abs())
+    assert ((after.means - before.means).abs() <= step + 1e-5).all()
+    assert (after.opacities - before.opacities).abs().max() <= 0.5 / 255 + 1e-6
+    # 256 even levels leave a uniform distribution 1/256 of its deviation.
+    for old, new in ((before.scales.log(), after.scales.log()), (before.sh, after.sh)):
+        assert (new - old).std() < old.std() / 256
+    # Three components off by up to half a step of sqrt(2)/255 each, the fourth by what follows.
+    turn = rotmat_from_quat(after.quats) @ rotmat_from_quat(before.quats).transpose(1, 2)
+    cosine = (turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 1.0
+    write_sog(tmp_path / "b.sog", before, notes={"up": "-y", "unit": "metre"})
+    assert (tmp_path / "b.sog").read_bytes() == (tmp_path / "a.sog").read_bytes()
+
+
+def test_few_values_and_colours_of_the_invisible_are_kept(tmp_path: Path) -> None:
+    before = some_gaussians(40, 1)
+    before.opacities[:] = 0  # where an encoder may drop the colours
+    write_sog(tmp_path / "a.sog", before)
+    after = read_sog(tmp_path / "a.sog").gaussians
+    assert torch.equal(after.sh, before.sh) and not after.opacities.any()
+    assert (after.scales / before.scales - 1).abs().max() < 1e-6
+
+
+def test_a_palette_that_does_not_hold_all_is_near_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """600 rows around 20 centres in a palette of 64: what is left is the spread around them."""
+    monkeypatch.setattr(sog, "MAX_PALETTE", 64)
+    monkeypatch.setattr(sog, "_COARSE", 8)
+    before = some_gaussians(600, 4)
+    rng = torch.Generator().manual_seed(2)
+    centres = torch.rand(20, 3, 3, generator=rng) - 0.5
+    near = centres[torch.arange(600) % 20] + 0.01 * torch.randn(600, 3, 3, generator=rng)
+    before.sh[:, 1:] = near
+    write_sog(tmp_path / "a.sog", before)
+    after = read_sog(tmp_path / "a.sog").gaussians
+    error = (after.sh - before.sh)[:, 1:]
+    assert error.std() < 0.02 < near.std() / 10
+
+
+# ---- Files by hand -------------------------------------------------------------------------------
+
+
+def webp(*pixels: tuple[int, ...], wide: int = 0, suffix: str = ".webp") -> bytes:
+    """A lossless image of RGBA pixels in one row, filled up to `wide` with zeros."""
+    row = [*pixels, *[(0, 0, 0, 255)] * (wide - len(pixels))]
+    image = cv2.cvtColor(np.array([row], np.uint8), cv2.COLOR_RGBA2BGRA)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []
+    return cv2.imencode(suffix, image, quality)[1].tobytes()
+
+
+def one_gaussian() -> tuple[dict[str, Any], dict[str, bytes]]:
+    """meta.json and the files of a Gaussian at (e - 1, 0, 1 - e), with a band of harmonics."""
+    logs = [(level - 128) / 16 for level in LEVELS]
+    meta = {
+        "version": 2,
+        "count": 1,
+        "later": "ignored",
+        "means": {"mins": [-1, -1, -1], "maxs": [1, 1, 1], "files": ["l", "u"]},
+        "scales": {"codebook": logs, "files": ["s"]},
+        "quats": {"files": ["q"]},
+        "sh0": {"codebook": LEVELS, "files": ["c"]},
+        "shN": {"count": 3, "bands": 1, "codebook": LEVELS, "files": ["p", "i"]},
+    }
+    entries = [(number, number + 50, number + 100, 255) for number in range(9)]
+    images = {
+        "l": webp((255, 255, 0, 255)),
+        "u": webp((255, 127, 0, 255)),
+        "s": webp((128, 144, 112, 255)),
+        "q": webp((255, 128, 128, 254)),
+        "c": webp((1, 2, 3, 51)),
+        "p": webp(*entries, wide=192),
+        "i": webp((2, 0, 0, 255)),
+    }
+    return meta, images
+
+
+def folder_of(path: Path, meta: dict[str, Any], images: dict[str, bytes]) -> Path:
+    path.mkdir()
+    (path / "meta.json").write_text(json.dumps(meta))
+    for name, data in images.items():
+        (path / name).write_bytes(data)
+    return path / "meta.json"
+
+
+def zipped(meta: dict[str, Any], images: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", kind) as archive:
+        for name, content in {"meta.json": json.dumps(meta).encode(), **images}.items():
+            archive.writestr(name, content)
+    return data.getvalue()
+
+
+def test_bytes_mean_what_the_format_says(tmp_path: Path) -> None:
+    meta, images = one_gaussian()
+    (tmp_path / "a.sog").write_bytes(zipped(meta, images, zipfile.ZIP_DEFLATED))
+    png = webp((128, 144, 112, 255), suffix=".png")
+    for path in (tmp_path / "a.sog", folder_of(tmp_path / "f", meta, {**images, "s": png})):
+        found = read_splats(path).gaussians
+        # 32767/65535 of -1 to 1 is 1/65535 below 0.
+        assert found.means[0].tolist() == pytest.approx([math.e - 1, 0, 1 - math.e], abs=2e-5)
+        assert found.scales[0].tolist() == pytest.approx([1, math.e, 1 / math.e], rel=1e-6)
+        assert found.opacities.item() == pytest.approx(0.2)
+        assert found.sh[0, 0].tolist() == [1, 2, 3]
+        assert found.sh[0, 1:].tolist() == [[6, 56, 106], [7, 57, 107], [8, 58, 108]]
+        # 254 says that the third of wxyz is missing; w is sqrt(1/2), and 128 is 1/255 from 0.
+        half = math.sqrt(0.5)
+        assert found.quats[0].tolist() == pytest.approx([half, 0, half, 0], abs=0.005)
+    # The first number of early codebooks is null, and stands for the next in line.
+    first = {**meta, "sh0": {"codebook": [None, *LEVELS[1:]], "files": ["c"]}}
+    (tmp_path / "a.sog").write_bytes(zipped(first, {**images, "c": webp((0, 1, 255, 255))}))
+    colours = read_splats(tmp_path / "a.sog").gaussians.sh[0, 0]
+    assert colours.tolist() == pytest.approx([1 - 254 / 255, 1, 255])
+
+
+def test_a_rotation_that_is_none_is_left_out_and_said(tmp_path: Path) -> None:
+    meta, images = one_gaussian()
+    images = {name: webp(*[pixel] * 2) for name, pixel in TWICE.items()} | {"p": images["p"]}
+    images["q"] = webp((1, 2, 3, 251), (1, 2, 3, 255))
+    (tmp_path / "a.sog").write_bytes(zipped({**meta, "count": 2}, images))
+    read = read_splats(tmp_path / "a.sog")
+    assert len(read.gaussians) == 1 and "1 of 2 Gaussians with a zero quat" in read.problems[0]
+
+
+TWICE = {name: (0, 0, 0, 255) for name in "luscqi"}
+
+
+def test_a_scene_comes_back_upright(tmp_path: Path) -> None:
+    """The file's -y is up, the scene's z again, as the file says itself; so for its folder."""
+    before = some_gaussians(400, 4)
+    before.means[:, 1:] = torch.rand(400, 2, generator=torch.Generator().manual_seed(3)) * 20
+    scene = fitted_scene(
+        background=before, actors=(), has_known_gravity=True, has_metric_scale=True
+    )
+    export_sog(scene, tmp_path / "street.sog", START_NS)
+    with zipfile.ZipFile(tmp_path / "street.sog") as archive:
+        archive.extractall(tmp_path / "folder")
+    assert recognised(tmp_path / "folder") == "gaussians"
+    for path in ("street.sog", "folder"):
+        opened = open_scene(f"gaussians:{tmp_path}/{path}")
+        assert opened.has_known_gravity and opened.has_metric_scale
+        after = opened.background.select(opened.background.means[:, 0].argsort())
+        # Half a step at 50 m, as above.
+        assert (after.means - before.means).abs().max() < 0.01
+        # Colours by direction are turned there and back, in 256 levels of -1 to 1.
+        assert (after.sh - before.sh).abs().max() < 2 / 256
+
+
+def test_refusals(tmp_path: Path) -> None:
+    meta, images = one_gaussian()
+    bad = dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]]
+    cases: bad = {
+        "version": (lambda m, f: m.update(version=3), "only version 2 of SOG is read; got 3"),
+        "no means": (lambda m, f: m.pop("means"), "does not describe splats"),
+        "a codebook": (lambda m, f: m["sh0"].update(codebook=[1.0]), "sh0.codebook: .* 256 items"),
+        "not a number": (lambda m, f: m["means"].update(mins=[0, 0, "x"]), "means.mins.2"),
+        "bands": (lambda m, f: m["shN"].update(bands=4), "shN.bands"),
+        "a bomb": (lambda m, f: m.update(count=10**9), "announces 1000000000 Gaussians"),
+        "too few pixels": (lambda m, f: m.update(count=2), "1 x 1 pixels for 2 Gaussians"),
+        "missing": (lambda m, f: f.pop("q"), "'q'"),
+        "outside": (lambda m, f: m["quats"].update(files=["../q"]), "names the file '../q'"),
+        "no image": (lambda m, f: f.update(q=b"x" * 99), "it is another format"),
+        "lossy": (lambda m, f: f.update(q=lossy()), "a lossy or other WebP"),
+        "damaged": (lambda m, f: f.update(p=f["p"][:60]), "p is damaged"),
+        "huge": (lambda m, f: f.update(q=webp(wide=70000, suffix=".png")), "70000 x 1 pixels"),
+        "a label": (lambda m, f: f.update(i=webp((3, 0, 0, 255))), "entry 3 of a palette of 3"),
+        "width": (lambda m, f: f.update(p=webp(wide=200)), "192 pixels wide for 1 bands; got 200"),
+    }
+    path = tmp_path / "a.sog"
+    for name, (change, message) in cases.items():
+        changed, files = json.loads(json.dumps(meta)), dict(images)
+        change(changed, files)
+        path.write_bytes(zipped(changed, files))
+        with pytest.raises(SceneError, match=message):
+            read_splats(path)
+            pytest.fail(name)
+    whole = zipped(meta, images)
+    for data, message in ((whole[:-40], "not a zip file"), (b"PK\3\4", "not a whole .sog file")):
+        path.write_bytes(data)
+        with pytest.raises(SceneError, match=message):
+            read_splats(path)
+    at = folder_of(tmp_path / "folder", meta, {n: d for n, d in images.items() if n != "q"})
+    with pytest.raises(SceneError, match="folder/q, which is missing"):
+        read_splats(at)
+    (tmp_path / "elsewhere").write_bytes(images["q"])
+    (tmp_path / "folder/q").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SceneError, match="a link out of its folder"):
+        read_splats(at)
+
+
+def lossy() -> bytes:
+    image = np.zeros((4, 4, 3), np.uint8)
+    return cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 80])[1].tobytes()
