@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from adapters.plain_files import LARGEST, checked_pose
 from adapters.raw_drive import some
 from adapters.scene_cache import image_folder
-from adapters.uri import WAYMO_SPLITS
+from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
 from augment.files.packed_images import Lens, PackedImages, reading
 from augment.jobs.manifest import MAX_SIDE_PX
@@ -42,7 +42,6 @@ COMPONENTS = {
     "camera_segmentation": "CameraSegmentationLabelComponent",
     "lidar_camera_projection": "LiDARCameraProjectionComponent",
 }
-_REQUIRED = tuple(COMPONENTS)[:6]
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # numbered from 1
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")  # numbered from 1
 TOP = 1
@@ -79,8 +78,8 @@ class SegmentFiles:
 def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
     """The segment at a path: the only one, or the one of that name or first part of a name."""
     alone = SegmentFiles("", path, is_alone=True)
-    if alone.has(_REQUIRED[0]):
-        file = alone.path(_REQUIRED[0])
+    if alone.has(WAYMO_REQUIRED[0]):
+        file = alone.path(WAYMO_REQUIRED[0])
         with reading(file):
             names = set(read_table(file, str(file), [SEGMENT]).column(SEGMENT).to_pylist())
         found = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
@@ -88,12 +87,12 @@ def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
         found = {
             file.stem: SegmentFiles(file.stem, folder)
             for folder in (path, *(path / split for split in WAYMO_SPLITS))
-            for file in sorted((folder / _REQUIRED[0]).glob("*.parquet"))
+            for file in sorted((folder / WAYMO_REQUIRED[0]).glob("*.parquet"))
         }
     if not found:
         raise AdapterError(
             f"{path} holds no segment of the Waymo Open Dataset v2; expected "
-            f"{_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
+            f"{WAYMO_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
         )
     names = sorted(found)
     if wanted is not None:
@@ -337,10 +336,10 @@ class Segment:
 
 def read_segment(files: SegmentFiles) -> Segment:
     """All but images, range images and labels."""
-    if missing := [name for name in _REQUIRED if not files.has(name)]:
+    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
         raise AdapterError(
             f"segment {files.name} lacks {', '.join(str(files.path(name)) for name in missing)}; a "
-            f"scene needs the components {', '.join(_REQUIRED)}, download them too"
+            f"scene needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
         )
     rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
     stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
