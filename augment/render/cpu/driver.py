@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ from augment.render.constants import (
 from augment.render.cpu import blend as blend_kernels
 from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
-from augment.render.cpu.order import order_of
+from augment.render.cpu.order import cut_in_fog, order_of
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
@@ -109,10 +109,12 @@ def gather_inputs(
     arrays, addresses, orders, blocks = [], [], [], []
     for number, part in enumerate(parts):
         g, count = part.gaussians, len(part.gaussians)
-        order = order_of(g) if culled else None
+        order = order_of(g) if culled and part.rows is None else None
         if order is None:
             firsts = range(0, count, layout.BLOCK)
             kept = [(first, min(first + layout.BLOCK, count)) for first in firsts]
+            if part.rows is not None:
+                kept = _blocks(part.rows).tolist()
             tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
             own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
         else:
@@ -139,6 +141,14 @@ def gather_inputs(
         arrays=arrays,
         orders=np.array(orders, np.uint64),
     )
+
+
+def _blocks(rows: np.ndarray) -> np.ndarray:
+    """int64 [B, 2]: runs of rows (first, last + 1) in pieces of at most a block."""
+    counts = -(-(rows[:, 1] - rows[:, 0]) // layout.BLOCK)
+    run = np.repeat(np.arange(len(rows)), counts)
+    first = rows[run, 0] + layout.BLOCK * (np.arange(len(run)) - (counts.cumsum() - counts)[run])
+    return np.stack([first, np.minimum(first + layout.BLOCK, rows[run, 1])], 1)
 
 
 def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -232,9 +242,7 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     timer = StageTimer(stage_times)
-    is_hidden = fog is not None and fog.sigma_per_m > 0
-    if not is_hidden or clip is not None or not buffers <= {RGB, ALPHA}:
-        settings = replace(settings, fog_cut=0.0)
+    settings = cut_in_fog(settings, fog, clip, buffers)
     inputs = gather_inputs(
         parts, camera, settings, fog, clip, with_color=RGB in buffers, culled=True
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from torch import Tensor
 from augment.bounds import Bounds, may_show
 from augment.cameras import Camera
 from augment.render import layout
+from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
@@ -86,15 +88,8 @@ class Order(NamedTuple):
         bounds = Bounds(self.lows + halves, halves, longest, owners)
         pose = None if part.world_from_part is None else part.world_from_part.numpy()
         # Where nothing is known, of NaN, no comparison holds, and the cell stays.
-        seen = may_show(bounds, pose, camera, settings.near_m)
+        seen = may_be_drawn(bounds, pose, camera, settings, fog, clip)
         seen &= ~(self.sorted(g.opacities).largest < np.float32(ALPHA_MIN))
-        if clip is not None:
-            low, high = (z - clip.z_m for z in _heights(bounds, pose, np.array(clip.up)))
-            near, far = (low, high) if clip.sign > 0 else (-high, -low)
-            seen &= ~((far < 0) | (near > clip.reach_m))
-        if fog is not None and settings.fog_cut > 0:
-            depths = _least_optical_depth(bounds, pose, camera, fog)
-            seen &= ~(depths > -math.log(settings.fog_cut))
         return _blocks_of(seen, len(g))
 
     def sorted(self, tensor: Tensor) -> Sorted:
@@ -166,6 +161,36 @@ def _spread(bits: np.ndarray) -> np.ndarray:
 
 
 # ---- What a view leaves out ----------------------------------------------------------------------
+
+
+def cut_in_fog(
+    settings: RasterSettings, fog: Fog | None, clip: HeightClip | None, buffers: frozenset[str]
+) -> RasterSettings:
+    """The settings, whose fog_cut counts where a whole picture alone is wanted."""
+    is_hidden = fog is not None and fog.sigma_per_m > 0
+    if is_hidden and clip is None and buffers <= {RGB, ALPHA}:
+        return settings
+    return replace(settings, fog_cut=0.0)
+
+
+def may_be_drawn(
+    bounds: Bounds,
+    pose: np.ndarray | None,
+    camera: Camera,
+    settings: RasterSettings,
+    fog: Fog | None,
+    clip: HeightClip | None,
+) -> np.ndarray:
+    """bool [B]: boxes in which a splat may be drawn. pose: world_from_part; None: the identity."""
+    seen = may_show(bounds, pose, camera, settings.near_m)
+    if clip is not None:
+        low, high = (z - clip.z_m for z in _heights(bounds, pose, np.array(clip.up)))
+        near, far = (low, high) if clip.sign > 0 else (-high, -low)
+        seen &= ~((far < 0) | (near > clip.reach_m))
+    if fog is not None and settings.fog_cut > 0:
+        depths = _least_optical_depth(bounds, pose, camera, fog)
+        seen &= ~(depths > -math.log(settings.fog_cut))
+    return seen
 
 
 def _heights(
