@@ -35,6 +35,7 @@ MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatev
 _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
+_MAX_COLOUR_IMAGES = 150  # of a whole drive: an image every few metres shows all there is
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
 _MAX_FAULTS = 3  # sentences about one camera's images; more become one
 _MAX_NAMED = 3  # frames that a message lists
@@ -431,6 +432,11 @@ def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
 
 
 # ---- The drive, and the scene that is made of it -------------------------------------------------
+
+
+def colour_every(images: int) -> int:
+    """Of the frames of a drive with so many images, every such one gives colours."""
+    return max(1, -(-images // _MAX_COLOUR_IMAGES))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import cv2
 import numba
 import pytest
 import torch
+from batch_scenes import FakeLabels
 from fitted_scenes import assert_same, fitted_scene
 from streets import open_street
 
@@ -306,6 +308,19 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
     monkeypatch.setattr(explain, "measure_passes", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
+
+
+def test_labels_for_trainers_are_explained(scene, monkeypatch, tmp_path):
+    recipe = "output: {depth: none, labels: [coco], min_visibility: 0.2}\n"
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert facts["labels"]["files"] == ["labels/coco/instances_train.json"]
+    assert "labels/coco/instances_train.json" in page and "none: the scene has no boxes" in page
+    boxed = dataclasses.replace(scene, labels=FakeLabels())
+    _, page = explained(monkeypatch, tmp_path, boxed, recipe, times=False)
+    assert re.search(r"\n  \w+: \d+ boxes of \d+ objects, of which images get those that", page)
+    assert "where the weather leaves less than 0.2 of an object, it is left out" in page
+    facts, page = explained(monkeypatch, tmp_path, scene, "{}\n", times=False)
+    assert facts["labels"] is None and "for trainers" not in page
 
 
 def test_compiling_is_said_before_it_is_done(capsys):
