@@ -159,14 +159,14 @@ def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
 def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
     import augment.views
 
-    real = augment.views.render_view
+    real = augment.views.begin_view
 
     def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
         if camera.timestamp_ns > 0:
             raise RuntimeError("no light")
         return real(scene, camera, recipe, backend=backend)
 
-    monkeypatch.setattr(augment.views, "render_view", breaks_on_the_second_frame)
+    monkeypatch.setattr(augment.views, "begin_view", breaks_on_the_second_frame)
     out = tmp_path / "out"
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
     streams = capsys.readouterr()
