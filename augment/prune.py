@@ -81,10 +81,10 @@ def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
 
 
 def _pruned(part: PosedGaussians, scene: Scene, millionths: float) -> PosedGaussians:
-    own = part.gaussians.opacities
+    own, changes = part.gaussians.opacities, changes_of(scene)
 
     def prune() -> torch.Tensor:
-        is_missed = torch.from_numpy(changes_of(scene) > 1e-6 * millionths).to(own.device)
+        is_missed = torch.from_numpy(changes > 1e-6 * millionths).to(own.device)
         return torch.where(is_missed, own, 0.0)
 
     # Of the same tensor as long as that lives, so that the rasteriser knows it again.
