@@ -83,12 +83,14 @@ def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
 def _pruned(part: PosedGaussians, scene: Scene, millionths: float) -> PosedGaussians:
     own, changes = part.gaussians.opacities, changes_of(scene)
 
-    def prune() -> torch.Tensor:
+    def prune() -> tuple[np.ndarray, torch.Tensor]:
         is_missed = torch.from_numpy(changes > 1e-6 * millionths).to(own.device)
-        return torch.where(is_missed, own, 0.0)
+        return changes, torch.where(is_missed, own, 0.0)
 
     # Of the same tensor as long as that lives, so that the rasteriser knows it again.
-    opacities = known_of(own, f"pruned at {millionths}", prune)
+    by, opacities = known_of(own, f"pruned at {millionths}", prune)
+    if by is not changes:  # the same tensor in a scene of other views
+        opacities = prune()[1]
     return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
 
 
