@@ -224,6 +224,11 @@ def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
     memo_of(gaussians).put(_STORED, levels, shared=True)
 
 
+def keeps_levels(gaussians: Gaussians) -> bool:
+    """Whether levels lie in a file with these Gaussians."""
+    return memo_of(gaussians).known(_STORED)
+
+
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
     """All pieces in memory."""
     gaussians, stands_for, keys = zip(*pieces, strict=True)
