@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_SPLITS, parse_uri
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, WAYMO_REQUIRED, WAYMO_SPLITS, parse_uri
 from augment.errors import AdapterError
 from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.scene_file import is_scene_file, is_scene_folder
@@ -164,6 +164,10 @@ _PARTS: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
         ("velodyne/", ("velodyne", "training/velodyne")),
         ("calib/", ("calib", "training/calib")),
     ),
+    "a segment of the Waymo Open Dataset v2": tuple(
+        (f"{name}/", (name, f"{name}.parquet", *(f"{split}/{name}" for split in WAYMO_SPLITS)))
+        for name in WAYMO_REQUIRED
+    ),
     "an Argoverse 2 log": (
         ("city_SE3_egovehicle.feather", ("city_SE3_egovehicle.feather",)),
         ("calibration/intrinsics.feather", ("calibration/intrinsics.feather",)),
@@ -200,7 +204,7 @@ def _advice(folder: Path) -> str:
     for what, parts in _PARTS.items():
         there = [n for n, patterns in parts if any(any(folder.glob(p)) for p in patterns)]
         missing = [name for name, _ in parts if name not in there]
-        if there and missing:
+        if missing and len(there) > len(parts) // 5:  # of many, one alone is anybody's name
             is_are = "is" if len(there) == 1 else "are"
             said.append(
                 f"It is nearly {what}: {', '.join(there)} {is_are} there, {', '.join(missing)} not"

@@ -40,6 +40,7 @@ from llvmlite.binding import get_host_cpu_name
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri
 from augment.errors import AdapterError, ClimateGSError, SceneError
+from augment.files.recorded_images import has_image
 from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
 from augment.jobs.atomic import remove_temporaries
 from augment.labels import LabelSource
@@ -118,7 +119,7 @@ def _has_images(scene: Scene, folder: Path) -> bool:
     """Whether those of the scene's images are there that lie beside the cache's folder."""
     own = str(folder.with_name(_IMAGES)) + os.sep
     paths = (path for frame in scene.frames for path in frame.image_paths.values())
-    return all(os.path.exists(path) for path in paths if path.startswith(own))
+    return all(has_image(Path(path)) for path in paths if path.startswith(own))
 
 
 def leave_out_cache() -> None:

@@ -26,6 +26,10 @@ if TYPE_CHECKING:  # torch would be loaded with them
 CAMERA_PATH_KEY = "camera_path"
 GROUND_KEY = "ground_z"
 WAYMO_SPLITS = ("training", "validation", "testing")
+WAYMO_REQUIRED = (
+    *("vehicle_pose", "camera_calibration", "camera_image"),
+    *("lidar_calibration", "lidar", "lidar_pose"),
+)
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 

@@ -36,7 +36,7 @@ from torch import Tensor
 from augment.cameras import Camera, Frame
 from augment.cast_shadows import FadedShadows
 from augment.errors import SceneError
-from augment.files.recorded_images import ImageFault, read_scaled
+from augment.files.recorded_images import ImageFault, has_image, read_scaled
 from augment.memo import memo_of
 from augment.render import photo_kernels as kernels
 from augment.render.buffers import (
@@ -107,7 +107,7 @@ def check_photos(
             f"render it with base: splats"
         )
     views = [(frame, name) for frame, cameras in selection for name in cameras]
-    missing = [v for v in views if not Path(v[0].image_paths.get(v[1], "")).is_file()]
+    missing = [v for v in views if not has_image(Path(v[0].image_paths.get(v[1], "")))]
     if missing:
         frame, name = missing[0]
         path = frame.image_paths.get(name)

@@ -13,8 +13,9 @@ transmittances, which multiply, stay those of one level. Distances are Euclidean
 never below that of the square that holds it: shares add up to 1, follow the camera's place without
 a step, and stay as they are when it turns.
 
-Merging keeps the moments of the mixture (weights: opacity times surface; splats that are larger
-than the cell stay as they are), its mean colour,
+Splats whose colours differ by less than ALIKE are merged in cells of 2 c_k. Merging keeps the
+moments of the mixture (weights: opacity times surface; splats that are larger than the cell stay as
+they are), its mean colour,
 
     mu = sum w_i mu_i,    Sigma = sum w_i (Sigma_i + (mu_i - mu)(mu_i - mu)^T),
 
@@ -26,6 +27,7 @@ Real-Time Rendering of Very Large Datasets", section 4.1, weighs so, and has suc
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,36 +35,47 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from augment import kernels
-from augment.bounds import Bounds, may_show
+from augment.bounds import Bounds
 from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.memo import memo_of
 from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
+from augment.render.cpu.order import CELL, may_be_drawn
+from augment.render.fog import Fog
+from augment.render.layout import HeightClip
+from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians, is_drawable
 from augment.semantics import SemanticClass
 
 MIN_SPLATS = 20_000  # a part with fewer is drawn as it is
-CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # c_1: the first whose cells are a third of the splats
+CELLS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # c_1: the first whose cells leave at most
+MOST_LEFT = 0.6  # of the splats
 CELLS_ACROSS = 64  # of c_1 along a square of level 0
 MAX_LEVELS, FEW_SQUARES = 12, 4  # no further level where so few are left
-BAND = 0.25
+BAND = 0.12
+ALIKE = 0.03  # of 1, in each channel of the encoded colours
 # A pixel is 1 to 2 cells where a level serves with lod_px = 1. The blur's deviation, in cells:
 BLUR_CELLS = math.sqrt(2 * COV2D_BLUR)
 FLAT_TOP = 2.0  # a flat top covers this many times what the deviations say; beyond it they grow
 MAX_OPACITY = math.exp(FLAT_TOP - 1)
 THINNEST_M = 1e-4
+FEW_TESTED = 64  # squares whose splats are tested as quickly as they are
 BATCH = 1 << 18  # splats merged at once
+OFF_GRID = (0.37, 0.37, 0.5)  # of a cell: walls and ground at round numbers lie within one
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 _BIAS = 1 << 21  # half the squares that keys can tell apart along an axis
 _SPREAD = ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
            (2, 0x3333333333333333), (1, 0x5555555555555555))  # fmt: skip
+_SPREAD_BY_TWO = (
+    (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))  # fmt: skip
 _LEVELS = ("levels of detail",)  # where a memo has them
 _STORED = (*_LEVELS, False)
 _COLUMNS = ("means", "quats", "scales", "opacities", "sh")
@@ -90,35 +103,59 @@ class Squares:
         return len(self.keys)
 
 
+class Boxes(NamedTuple):
+    """Around the means of every CELL splats of a level, [C, 3], and their largest standard
+    deviations [C].
+    """
+
+    lows: Float[np.ndarray, "C 3"]
+    highs: Float[np.ndarray, "C 3"]
+    longest: Float[np.ndarray, "C"]
+
+    @staticmethod
+    def around(g: Gaussians, starts: np.ndarray) -> Boxes:
+        """Of the splats from each start to the next."""
+        means, longest = g.means.numpy(), g.scales.numpy().max(1)
+        lows, highs = (f.reduceat(means, starts) for f in (np.minimum, np.maximum))
+        return Boxes(lows, highs, np.maximum.reduceat(longest, starts))
+
+    def bounds(self, rows: np.ndarray) -> Bounds:
+        lows, highs = self.lows[rows].astype(np.float64), self.highs[rows].astype(np.float64)
+        owners = np.zeros(len(rows), np.int64)
+        return Bounds((lows + highs) / 2, (highs - lows) / 2, self.longest[rows], owners)
+
+
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Splats, square after square. stands_for [N]: the part's own splat whose number and class each
-    has. unchecked: the file that they come from, whose numbers are looked at when they are taken.
-    splats: of the part, where it is unchecked.
+    """Splats, square after square, neighbours together. stands_for [N]: the part's own splat whose
+    number and class each has. unchecked: the file that they come from, whose numbers are looked at
+    when they are taken. splats: of the part, where it is unchecked.
     """
 
     gaussians: Gaussians
     stands_for: Int32[np.ndarray, "N"]
     squares: Squares
+    boxes: Boxes
     unchecked: str | None = None
     splats: int = 0
-    _taken: dict[int, Gaussians] = field(default_factory=dict)
+    _checked: Bool[np.ndarray, "C"] = field(init=False)
 
-    def take(self, square: int) -> Gaussians:
-        """The splats of a square: one object as long as there is the level."""
-        if square not in self._taken:
-            rows = self.rows(square)
-            found = rows_of(self.gaussians, rows)
-            if self.unchecked is not None and len(found):
-                numbers = self.stands_for[rows]
-                is_own = numbers.min() >= 0 and numbers.max() < self.splats
-                _check(found, bool(is_own), f"{self.unchecked}: square {square}")
-            self._taken[square] = found
-        return self._taken[square]
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_checked", np.zeros(len(self.boxes.longest), bool))
 
-    def rows(self, square: int) -> slice:
-        first, end = self.squares.starts[square : square + 2].tolist()
-        return slice(first, end)
+    def check(self, cells: Int64[np.ndarray, "_"]) -> None:
+        """Look at the numbers of these CELLs of splats, once."""
+        if self.unchecked is None:
+            return
+        cells = np.unique(cells[~self._checked[cells]])
+        ends = (np.diff(cells) != 1) | (cells[1:] % (BATCH // CELL) == 0)
+        for run in np.split(cells, np.flatnonzero(ends) + 1) if len(cells) else []:
+            rows = slice(int(run[0]) * CELL, min(int(run[-1] + 1) * CELL, len(self.gaussians)))
+            numbers = self.stands_for[rows]
+            is_own = numbers.min() >= 0 and numbers.max() < self.splats
+            where = f"{self.unchecked}: splats {rows.start} to {rows.stop}"
+            _check(rows_of(self.gaussians, rows), bool(is_own), where)
+        self._checked[cells] = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,14 +196,9 @@ def check_background(gaussians: Gaussians) -> None:
     Raises:
         SceneError: some cannot be drawn.
     """
-    memo = memo_of(gaussians)
-    if memo.known(_STORED):
-
-        def look() -> bool:
-            level = levels_of(gaussians).levels[0]
-            return all(len(level.take(square)) >= 0 for square in range(len(level.squares)))
-
-        memo.get(("looked at",), look)
+    if memo_of(gaussians).known(_STORED):
+        level = levels_of(gaussians).levels[0]
+        level.check(np.arange(len(level.boxes.longest)))
 
 
 # ---- Merging -------------------------------------------------------------------------------------
@@ -190,6 +222,12 @@ def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
 def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
     """Let `levels_of` know levels that lie in a file. levels: must not hold this object."""
     memo_of(gaussians).put(_STORED, levels, shared=True)
+
+
+def keeps_levels(gaussians: Gaussians) -> bool:
+    """Whether levels lie in a file with these Gaussians."""
+    is_known = memo_of(gaussians).known(_STORED)
+    return is_known and levels_of(gaussians).levels[0].unchecked is not None
 
 
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
@@ -220,21 +258,24 @@ def build_levels(
             Piece(own.select(torch.from_numpy(order[rows])), *(v[rows] for v in found[1:]))
             for rows in batches(len(order))
         )
-    levels = [Level(found.gaussians, found.stands_for, squares_of(found.gaussians, found.keys))]
+    levels = [level_of(found)]
     while len(levels[-1].squares) > FEW_SQUARES and len(levels) <= MAX_LEVELS:
         cell_m = finest_m * 2.0 ** (len(levels) - 1)
         found = keep(coarser(levels[-1], cell_m, antialiased=antialiased))
-        squares = squares_of(found.gaussians, found.keys, levels[-1].squares)
-        levels.append(Level(found.gaussians, found.stands_for, squares))
+        levels.append(level_of(found, levels[-1].squares))
     return Levels(finest_m, tuple(levels))
 
 
 def square_order(g: Gaussians) -> tuple[float, Int64[np.ndarray, "N"], Int64[np.ndarray, "N"]]:
-    """c_1; the splats square after square of level 0, each one's in their order; their squares."""
+    """c_1; the splats square after square of level 0, neighbours together; their squares."""
     finest_m = finest_cell_m(g.means)
-    keys = square_keys(g.means, finest_m * CELLS_ACROSS)
+    side_m = finest_m * CELLS_ACROSS
+    keys = square_keys(g.means, side_m)
+    for rows in batches(len(keys)):
+        within = np.floor(g.means[rows].double().numpy() / (side_m / 32)).astype(np.int64) & 31
+        keys[rows] = (keys[rows] << 15) | _along_curve(within)
     order = np.argsort(keys, kind="stable")
-    return finest_m, order, keys[order]
+    return finest_m, order, keys[order] >> 15
 
 
 def batches(count: int) -> Iterator[slice]:
@@ -246,11 +287,10 @@ def finest_cell_m(means: Float[Tensor, "N 3"]) -> float:
     for cell_m in CELLS_M:
         sampled = []
         for rows in batches(len(means)):
-            cells = np.floor(means[rows].double().numpy() / cell_m).astype(np.int64) & (_BIAS - 1)
-            numbers = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]  # 63 bits
+            numbers = _cells(means[rows], cell_m)
             sampled.append(numbers[(numbers.astype(np.uint64) * _ODD) >> np.uint64(60) == 0])
         numbers = np.concatenate(sampled)
-        if 3 * len(np.unique(numbers)) <= len(numbers):
+        if len(np.unique(numbers)) <= MOST_LEFT * len(numbers):
             return cell_m
     return CELLS_M[-1]
 
@@ -267,16 +307,33 @@ def square_keys(means: Float[Tensor, "N 3"], side_m: float) -> Int64[np.ndarray,
     return keys
 
 
-def squares_of(g: Gaussians, keys: np.ndarray, finer: Squares | None = None) -> Squares:
-    """keys [N]: each splat's square, increasing. finer: of the level before; None for level 0."""
-    firsts = np.flatnonzero(np.diff(keys, prepend=-1))
-    own, starts = keys[firsts], np.append(firsts, len(keys))
-    longest = np.maximum.reduceat(g.scales.numpy().max(1), firsts)
-    lows = highs = g.means.numpy()
+def _cells(means: Float[Tensor, "N 3"], cell_m: float) -> Int64[np.ndarray, "N"]:
+    """The cell of each mean, along a Morton curve."""
+    places = np.floor(means.double().numpy() / cell_m + OFF_GRID).astype(np.int64)
+    return _along_curve(places & (_BIAS - 1))
+
+
+def _along_curve(places: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N"]:
+    """Places of 21 bits along a Morton curve."""
+    bits = places.astype(np.uint64)
+    for shift, mask in _SPREAD_BY_TWO:
+        bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+    x, y, z = bits.T
+    return (x | (y << np.uint64(1)) | (z << np.uint64(2))).astype(np.int64)
+
+
+def level_of(found: Piece, finer: Squares | None = None) -> Level:
+    """found: square after square. finer: of the level before; None for level 0."""
+    g = found.gaussians
+    firsts = np.flatnonzero(np.diff(found.keys, prepend=-1))
+    own, starts = found.keys[firsts], np.append(firsts, len(found.keys))
+    lows, highs, longest = Boxes.around(g, firsts)
     if finer is not None:
-        lows, highs, firsts = finer.lows, finer.highs, np.searchsorted(finer.keys >> 2, own)
-    lows, highs = np.minimum.reduceat(lows, firsts), np.maximum.reduceat(highs, firsts)
-    return Squares(own, starts, lows, highs, longest)
+        firsts = np.searchsorted(finer.keys >> 2, own)
+        lows = np.minimum.reduceat(finer.lows, firsts)
+        highs = np.maximum.reduceat(finer.highs, firsts)
+    boxes = Boxes.around(g, np.arange(0, len(g), CELL))
+    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes)
 
 
 def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
@@ -305,14 +362,13 @@ def merge_cells(
     that stands for each merged one: the heaviest of the class that weighs most.
     """
     kept = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
-    cells = np.floor(g.means.double().numpy()[kept] / cell_m)
-    is_large = g.scales.numpy().max(1)[kept] > cell_m
-    columns = (is_large, *cells.T, squares[kept])
-    order = np.lexsort(columns)
-    begins = is_large[order]
-    begins |= np.append(True, is_large[order][:-1])[: len(order)]
-    for column in columns[1:]:
-        begins[1:] |= np.diff(column[order]) != 0
+    longest, squares = g.scales.numpy().max(1)[kept], squares[kept]
+    cells, is_large = _cells(g.means, cell_m)[kept], longest > cell_m
+    wide = _cells(g.means, 2 * cell_m)[kept]
+    alike = _alike(g.sh.numpy()[kept, 0], longest > 2 * cell_m, wide, squares)
+    cells, is_large = np.where(alike, ~wide, cells), is_large & ~alike
+    order, begins = _grouped(is_large, cells, squares)
+    begins |= is_large[order]
     order, starts = kept[order], np.flatnonzero(begins)
     counts = np.diff(starts, append=len(order))
     leads, several = order[starts], counts > 1
@@ -327,6 +383,32 @@ def merge_cells(
     for name in _COLUMNS:
         getattr(out, name)[torch.from_numpy(at)] = getattr(merged, name).to(g.means.dtype)
     return out, leads
+
+
+def _grouped(is_apart: np.ndarray, cells: np.ndarray, squares: np.ndarray) -> tuple:
+    """An order in which the splats of a square's cell stand together, and where such groups begin;
+    those that stand apart are not among them.
+    """
+    order = np.lexsort((is_apart, cells, squares))
+    begins = np.ones(len(order), bool)
+    begins[1:] = np.diff(is_apart[order]) != 0
+    for column in (cells, squares):
+        begins[1:] |= np.diff(column[order]) != 0
+    return order, begins
+
+
+def _alike(
+    sh: Float[np.ndarray, "N 3"], is_large: np.ndarray, cells: np.ndarray, squares: np.ndarray
+) -> Bool[np.ndarray, "N"]:
+    """Which splats share a cell with others, all of nearly one colour. sh: of degree 0."""
+    order, begins = _grouped(is_large, cells, squares)
+    starts = np.flatnonzero(begins)
+    counts = np.diff(starts, append=len(order))
+    lows, highs = (f.reduceat(sh[order], starts) for f in (np.minimum, np.maximum))
+    is_one = (SH_C0 * (highs - lows).max(1) <= ALIKE) & (counts > 1)
+    found = np.zeros(len(order), bool)
+    found[order] = np.repeat(is_one, counts)
+    return found & ~is_large
 
 
 def merge_groups(
@@ -401,25 +483,39 @@ class Chosen:
 
     def restore_ids(self, drawn: RenderOutput) -> RenderOutput:
         """The buffers with splat_ids that count through the parts which these stand for."""
-        ids = drawn.splat_ids
-        if ids is None:
+        if drawn.splat_ids is None:
             return drawn
-        counts = [len(part.gaussians) for part in self.parts]
-        table = np.concatenate([
-            first + (np.arange(count, dtype=np.int32) if own is None else own)
-            for (first, own), count in zip(self.pieces, counts, strict=True)
-        ])  # fmt: skip
-        found = torch.from_numpy(np.append(table, 0)).to(ids)[ids]  # -1, for none, is the last
-        return replace(drawn, **{SPLAT_IDS: torch.where(ids < 0, ids, found)})
+        ids = drawn.splat_ids.cpu().numpy()
+        starts = np.cumsum([0, *(len(part.gaussians) for part in self.parts)])
+        pieces, found = np.searchsorted(starts, ids, "right") - 1, np.full_like(ids, -1)
+        for number, (first, stands_for) in enumerate(self.pieces):
+            shown = pieces == number
+            own = ids[shown] - starts[number]
+            found[shown] = first + (own if stands_for is None else stands_for[own])
+        return replace(drawn, **{SPLAT_IDS: torch.from_numpy(found).to(drawn.splat_ids)})
 
 
 def choose_parts(
-    parts: Sequence[PosedGaussians], camera: Camera, settings: RasterSettings
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings,
+    fog: Fog | None = None,
+    clip: HeightClip | None = None,
+    *,
+    whole: bool = True,
 ) -> Chosen:
-    """What the camera takes of large backgrounds at settings.lod_px, and all other parts."""
+    """What the camera takes of large backgrounds at settings.lod_px, and all other parts.
+
+    whole: take levels whole, and say which rows are drawn; else a part for every run of rows.
+    """
     chosen, pieces, first = list[PosedGaussians](), list[tuple[int, np.ndarray | None]](), 0
     for part in parts:
-        own = [(part, None)] if not has_levels(part) else _pieces(part, camera, settings)
+        own = [(part, None)]
+        if has_levels(part):
+            levels = levels_of(part.gaussians, antialiased=settings.antialiased)
+            taken = [*_taken(levels, part, camera, settings, fog, clip)]
+            if _is_merged(levels, taken):
+                own = (piece for t in taken for piece in _pieces(t, part, whole=whole))
         for piece, stands_for in own:
             chosen.append(piece)
             pieces.append((first, stands_for))
@@ -438,20 +534,46 @@ def has_levels(part: PosedGaussians) -> bool:
     return is_plain and len(g) >= MIN_SPLATS and g.means.device.type == "cpu"
 
 
+class _Taken(NamedTuple):
+    """Runs of a level's splats, [R, 2], and the share of each, [R]."""
+
+    level: Level
+    rows: Int64[np.ndarray, "R 2"]
+    shares: Float[np.ndarray, "R"]
+
+
+def _is_merged(levels: Levels, taken: Sequence[_Taken]) -> bool:
+    """Whether levels are drawn: where all splats are those of level 0, the part is as it is."""
+    is_open = levels.levels[0].unchecked is None
+    return not is_open or any(t.level is not levels.levels[0] for t in taken)
+
+
 def _pieces(
-    part: PosedGaussians, camera: Camera, settings: RasterSettings
+    taken: _Taken, part: PosedGaussians, *, whole: bool
 ) -> Iterator[tuple[PosedGaussians, np.ndarray]]:
-    levels = levels_of(part.gaussians, antialiased=settings.antialiased)
-    for number, squares, shares in _squares_taken(levels, part, camera, settings):
-        level = levels.levels[number]
-        for square, share in zip(squares.tolist(), shares.tolist(), strict=True):
-            g, stands_for = level.take(square), level.stands_for[level.rows(square)]
-            if share < 1:
-                g = replace(g, opacities=faded(g.opacities, share))
-            rows = part.color_rows
-            if rows is not None:
-                rows = rows[torch.from_numpy(stands_for).to(rows.device).long()]
-            yield replace(part, gaussians=g, color_rows=rows), stands_for
+    level, is_faded = taken.level, taken.shares < 1
+    for chosen in (~is_faded, is_faded):
+        rows, g = taken.rows[chosen], level.gaussians
+        if not len(rows):
+            continue
+        if chosen is is_faded:
+            opacities = torch.empty(len(g))
+            for (first, last), share in zip(rows.tolist(), taken.shares[chosen], strict=True):
+                opacities[first:last] = faded(g.opacities[first:last], share)
+            g = replace(g, opacities=opacities)
+        color_rows = None
+        if part.color_rows is not None:
+            color_rows = torch.empty(len(g), dtype=torch.int16)
+            for own in itertools.starmap(slice, rows.tolist()):
+                color_rows[own] = part.color_rows[torch.from_numpy(level.stands_for[own]).long()]
+        piece = replace(part, gaussians=g, color_rows=color_rows, rows=rows)
+        if whole:
+            yield piece, level.stands_for
+            continue
+        for own in itertools.starmap(slice, rows.tolist()):
+            of_run = None if color_rows is None else color_rows[own]
+            run = replace(piece, gaussians=rows_of(g, own), color_rows=of_run, rows=None)
+            yield run, level.stands_for[own]
 
 
 def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
@@ -461,10 +583,64 @@ def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
     return torch.from_numpy(own * (-np.expm1(share * np.log1p(-low)) / low))
 
 
-def _squares_taken(
-    levels: Levels, part: PosedGaussians, camera: Camera, settings: RasterSettings
+def _taken(
+    levels: Levels,
+    part: PosedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    fog: Fog | None,
+    clip: HeightClip | None,
+) -> Iterator[_Taken]:
+    """Of each level, what may be seen of the squares that the camera takes."""
+    pose = None if part.world_from_part is None else part.world_from_part.numpy()
+    pieces = [
+        _in_cells(levels.levels[number], squares, shares)
+        for number, squares, shares in squares_taken(levels, part, camera, settings, fog, clip)
+    ]
+    each = [piece.level.boxes.bounds(piece.cells) for piece in pieces]
+    seen = may_be_drawn(Bounds.join(each), pose, camera, settings, fog, clip)
+    for own, piece in zip(np.split(seen, np.cumsum([*map(len, each)])), pieces, strict=False):
+        if not own.any():
+            continue
+        cells, first, end, shares = (values[own] for values in piece[1:])
+        piece.level.check(cells)
+        begins = np.ones(len(first), bool)
+        begins[1:] = (first[1:] != end[:-1]) | (shares[1:] != shares[:-1])
+        heads = np.flatnonzero(begins)
+        lasts = np.append(heads[1:], len(first)) - 1
+        yield _Taken(piece.level, np.stack([first[heads], end[lasts]], 1), shares[heads])
+
+
+class _InCells(NamedTuple):
+    """Pieces [P] of squares: the CELL of each, its first splat and last + 1, its share."""
+
+    level: Level
+    cells: Int64[np.ndarray, "P"]
+    first: Int64[np.ndarray, "P"]
+    end: Int64[np.ndarray, "P"]
+    shares: Float[np.ndarray, "P"]
+
+
+def _in_cells(level: Level, squares: np.ndarray, shares: np.ndarray) -> _InCells:
+    firsts, ends = level.squares.starts[squares], level.squares.starts[squares + 1]
+    low = firsts // CELL
+    counts = -(-ends // CELL) - low
+    square = np.repeat(np.arange(len(squares)), counts)
+    cells = np.arange(len(square)) + (low - counts.cumsum() + counts)[square]
+    first = np.maximum(firsts[square], cells * CELL)
+    end = np.minimum(ends[square], (cells + 1) * CELL)
+    return _InCells(level, cells, first, end, shares[square])
+
+
+def squares_taken(
+    levels: Levels,
+    part: PosedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    fog: Fog | None = None,
+    clip: HeightClip | None = None,
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Of each level, the squares that the camera sees and takes, and their shares."""
+    """Of each level, the squares that the camera may see and takes, and their shares."""
     pose = None if part.world_from_part is None else part.world_from_part.numpy()
     eye_m = camera.centre.numpy()
     if pose is not None:
@@ -475,10 +651,11 @@ def _squares_taken(
     left = np.ones(len(rows))  # of each, what the squares that hold it leave to it
     while True:
         squares = levels.levels[number].squares
+        if len(rows) > FEW_TESTED:
+            boxes = Boxes(squares.lows, squares.highs, squares.longest)
+            seen = may_be_drawn(boxes.bounds(rows), pose, camera, settings, fog, clip)
+            rows, left = rows[seen], left[seen]
         lows, highs = squares.lows[rows], squares.highs[rows]
-        box = Bounds((lows + highs) / 2.0, (highs - lows) / 2.0, squares.longest[rows], rows)
-        seen = may_show(box, pose, camera, settings.near_m)
-        rows, left, lows, highs = rows[seen], left[seen], lows[seen], highs[seen]
         refined = np.zeros(len(rows))
         if number > 0:
             cell_px = focal * levels.cell_m(number) / settings.lod_px
@@ -490,7 +667,8 @@ def _squares_taken(
                 )
                 refined = np.clip((1 + BAND - away_m / cell_px) / BAND, 0, 1)
         taken = left * (1 - refined)
-        yield number, rows[taken > 0], taken[taken > 0]
+        if taken.any():
+            yield number, rows[taken > 0], taken[taken > 0]
         if number == 0:
             return
         number -= 1

@@ -385,6 +385,7 @@ class PosedGaussians:
     world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
     1 + the actor's index otherwise. is_overlay: whether they lie on
     the scene, as snow does: the buffer "overlay" counts them, and styles leave their colours.
+    rows int64 [R, 2]: the runs (first, last + 1) that are drawn, None for all: of the backend cpu.
     shading: None for splats of one colour each. color_maps [C, 3, 4]: of what every splat shows,
     c' = max(M[:, :3] @ c + M[:, 3], 0): the map in the row of color_rows int16 [N], without them of
     its class, the first where there is none such; None leaves the colours. A part has either
@@ -398,6 +399,7 @@ class PosedGaussians:
     shading: SplatShading | None = None
     color_maps: Float[Tensor, "C 3 4"] | None = None
     color_rows: Int16[Tensor, "N"] | None = None
+    rows: Int64[np.ndarray, "R 2"] | None = None
 
     @property
     def map_rows(self) -> Int16[Tensor, "N"] | None:

@@ -162,9 +162,9 @@ class Flood(EffectModel):
     """What is reflected: the sky alone; what the image shows, the rest from a coarse mirrored view;
     or a second view from the camera mirrored in the water."""
     bed_cut: Number = Field(default=0.006, ge=0.001, le=0.1)
-    """Bed of which no more than this share comes up through the water is left out: at 0.006 one and a
-    half levels of 255, of a bed as far from the water's colour as white from black. Where depth or
-    classes are wanted, too, it is drawn for them."""
+    """Bed of which no more than this share comes up through the water is left out: at 0.006 one and
+    a half levels of 255, of a bed as far from the water's colour as white from black. Depth and
+    classes show it."""
     layers_px: Number = Field(default=1.0, ge=1, le=8)
     """Width of the pixels that the bed and the mirrored view are drawn in, of the picture's; the
     bed's only where the picture alone is wanted."""

@@ -17,6 +17,7 @@ import torch
 from adapters.base import open_scene
 from augment import effects
 from augment.cameras import Camera
+from augment.dataset.label_files import planned_labels
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of, ground_sentence
 from augment.jobs.quality import resolve_quality, resolved_recipe
@@ -203,6 +204,7 @@ def explain_recipe(
             "frames": len(scene.frames),
         },
         "plan": plan.as_dict(),
+        "labels": planned_labels(scene, resolved.output),
         "times": None,
     }
     if times and any(frame.cameras for frame in scene.frames):

@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from augment.dataset.label_files import LABELS, RECORD, LabelsRecord
 from augment.effects.lidar import codes
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
@@ -161,6 +162,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
         "charts": [chart(spread) for spread in found if not spread.is_constant],
         "constant": [spread for spread in found if spread.is_constant],
         "classes": count_classes(finished, files),
+        "trainers": read_trainers(files),
         "visible": share_visible(finished, some, files),
         "codes": share_codes(finished, some, files),
         "buffers": gallery.buffers(with_images),
@@ -305,6 +307,12 @@ def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
     order = sorted(boxes, key=lambda label: (-boxes[label], label))
     counted = [(label, boxes[label], tracked[label]) for label in order]
     return {"rows": counted, "sample": _sample_text(read, len(rows))} if counted else None
+
+
+def read_trainers(files: ReportFiles) -> LabelsRecord | None:
+    """What the labels in formats for trainers say of themselves; None where there are none."""
+    path = f"{LABELS}/{RECORD}"
+    return files.read(path, LabelsRecord.model_validate_json) if path in files.listing else None
 
 
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:

@@ -8,9 +8,11 @@ own time. Images are undistorted as published: the coefficients k1, k2, k3 descr
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -46,6 +48,7 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    colour_every,
     drive_origin,
     find_objects,
     is_usable,
@@ -333,8 +336,8 @@ _LIDAR_TOP_DEG = 25.0  # down_lidar's uppermost laser: it hangs upside down
 _NEAR_NS = 25_000_000  # images come every 50 ms
 # The car (4.9 m by 1.9 m, origin at the rear axle). Published sweeps hold no return in it.
 _EGO_M = np.array([[-1.3, -1.1, -0.5], [4.0, 1.1, 1.9]])
-# Of a whole log: an image every few metres shows all there is, and a voxel is hit more than once.
-_MAX_COLOUR_IMAGES, _MAX_RETURNS = 150, 8_000_000
+_MAX_RETURNS = 8_000_000  # of a whole log: a voxel is hit more than once
+_THREADS = 4  # NumPy and Arrow release the interpreter
 _GREY_LEVELS = 6  # apart, colours of a grey image are the JPEG's rounding
 
 
@@ -392,7 +395,7 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
             *box_problems,
         ),
         grey_cameras=grey,
-        colour_every=max(1, -(-coloured // _MAX_COLOUR_IMAGES)),
+        colour_every=colour_every(coloured),
     )
 
 
@@ -474,18 +477,14 @@ def _read_sweeps(
     log: Av2Log, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], Spin, tuple[str, ...]]:
     """The usable returns of the frames in the scene's world, and how the first sweep turned."""
-    sweeps, spin, problems = [], Spin(), []
-    middle = np.mean([pose[:3, 3] for pose in log.ego_from_sensor.values()], axis=0)
-    for number in tqdm(numbers, desc="LiDAR", unit="sweep", disable=None):
+    spin = _first_spin(log, numbers)
+
+    def read(number: int) -> Sweep | str:
         stamp = log.stamps_ns[number]
         try:
             returns = log.returns(stamp)
         except AdapterError as error:
-            problems.append(f"frame {number}: {error}")
-            continue
-        if spin.begin_rad is None:
-            finite = np.isfinite(returns.points).all(axis=1)
-            spin = Spin.of_returns(returns.points[finite] - middle, returns.offsets_ns[finite])
+            return f"frame {number}: {error}"
         city = log.in_city(returns.points, stamp)
         classes = np.full(len(city), SemanticClass.UNKNOWN, np.int16)
         if log.ground is not None:
@@ -494,12 +493,32 @@ def _read_sweeps(
             points = (city - origin).astype(np.float32)
         sweep = Sweep(points, stamp + returns.offsets_ns, classes)
         pose = log.city.at(np.array([stamp]))[0]
-        sweeps.append(sweep.select(is_usable(sweep, city, pose, _EGO_M)))
+        return sweep.select(is_usable(sweep, city, pose, _EGO_M))
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        read_on = tqdm(pool.map(read, numbers), "LiDAR", len(numbers), unit="sweep", disable=None)
+        found = list(read_on)
+    problems = [sweep for sweep in found if isinstance(sweep, str)]
+    sweeps = [sweep for sweep in found if isinstance(sweep, Sweep)]
     part = _MAX_RETURNS / max(_MAX_RETURNS, sum(map(len, sweeps)))
     if part < 1:  # rows go by lasers in turn: every other one would be half of the lasers
         rng = np.random.default_rng(len(sweeps))
         sweeps = [sweep.select(rng.random(len(sweep)) < part) for sweep in sweeps]
     return tuple(sweeps), spin, tuple(problems)
+
+
+def _first_spin(log: Av2Log, numbers: Sequence[int]) -> Spin:
+    """How the first sweep turned of which it can be told."""
+    middle = np.mean([pose[:3, 3] for pose in log.ego_from_sensor.values()], axis=0)
+    spin = Spin()
+    for number in numbers:
+        with contextlib.suppress(AdapterError):
+            returns = log.returns(log.stamps_ns[number])
+            finite = np.isfinite(returns.points).all(axis=1)
+            spin = Spin.of_returns(returns.points[finite] - middle, returns.offsets_ns[finite])
+        if spin.begin_rad is not None:
+            break
+    return spin
 
 
 def _moving_boxes(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +14,12 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.lidar_scene import kernels
-from adapters.lidar_scene.kernels import SkyGatherer
+from adapters.lidar_scene.kernels import SkyGatherer, parts_of
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import Surfels
 from adapters.plain_files import decode_image
 from augment.cameras import Camera
+from augment.jobs.processes import available_cores
 
 DEPTH_WIDTH = 480  # columns of the z-buffers
 DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap
@@ -24,6 +27,7 @@ _LEVELS = 5
 _KEEP_SCORE = 0.5  # part of a camera's best score from which its observations count
 _CAMERA_POWER = 2.0  # of that best score, as the camera's weight
 _COVER_MARGIN_M = 0.15
+_AHEAD = 2  # images that are decoded before their turn
 _REDUCED = {
     1.0: cv2.IMREAD_COLOR,
     0.5: cv2.IMREAD_REDUCED_COLOR_2,
@@ -94,25 +98,53 @@ def observe_views(
         for shape in ((len(body.surfels), kernels.KEPT) for body in bodies)
     ]
     problems: list[str] = []
-    for view in tqdm(views, desc="colours from images", unit="image", disable=None):
-        image = read_image(view.path, image_scale)
-        where = f"camera {view.camera.name}, frame {view.frame}: image {view.path}"
-        if image is None:
-            problems.append(f"{where} cannot be decoded")
-        elif abs(image.shape[1] - view.camera.width * image_scale) > 1:
-            width = round(image.shape[1] / image_scale)
-            problems.append(f"{where} is {width} px wide, not {view.camera.width}; left out")
-        else:
-            _observe_one(bodies, stores, view, names.index(view.camera.name), image, sky)
+    with ThreadPoolExecutor(available_cores()) as pool:
+        images = read_ahead(pool, views, image_scale)
+        bar = tqdm(views, desc="colours from images", unit="image", disable=None)
+        for view, image in zip(bar, images, strict=True):
+            where = f"camera {view.camera.name}, frame {view.frame}: image {view.path}"
+            if image is None:
+                problems.append(f"{where} cannot be decoded")
+            elif abs(image.shape[1] - view.camera.width * image_scale) > 1:
+                width = round(image.shape[1] / image_scale)
+                problems.append(f"{where} is {width} px wide, not {view.camera.width}; left out")
+            else:
+                number = names.index(view.camera.name)
+                _observe_one(bodies, stores, view, number, image, sky, pool)
     # A camera's observations by their median, cameras averaged.
     blended = (kernels.blended_colours(*store, _KEEP_SCORE, _CAMERA_POWER) for store in stores)
     return tuple(Seen(*found) for found in blended), tuple(problems)
+
+
+def read_ahead(
+    pool: Executor, views: Sequence[View], image_scale: float
+) -> Iterator[np.ndarray | None]:
+    """`read_image` of each view, decoded while what came before is worked on."""
+    waiting: deque[Future[np.ndarray | None]] = deque()
+    for view in views:
+        waiting.append(pool.submit(read_image, view.path, image_scale))
+        if len(waiting) > _AHEAD:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 def read_image(path: Path, image_scale: float) -> np.ndarray | None:
     """RGB uint8 [H, W, 3] at a fraction (1, 1/2, 1/4, 1/8) of its size; None if not decodable."""
     image = decode_image(path, _REDUCED[image_scale])
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+class _Part(NamedTuple):
+    """Some surfels of a body, where it stood in one image. extent: float32 [N, 2], half axes.
+    pose: of the body in the camera's frame. moves: it is no part of the world."""
+
+    surfels: Surfels
+    store: _Observations
+    extent: np.ndarray
+    pose: tuple[np.ndarray, np.ndarray]
+    moves: bool
+    own: slice
 
 
 def _observe_one(
@@ -122,12 +154,14 @@ def _observe_one(
     camera_number: int,
     image: np.ndarray,
     sky: SkyGatherer,
+    pool: Executor,
 ) -> None:
+    """Surfels are taken in parts, by threads, which gives the same bits as in one."""
     camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     cover, nothing = depth.copy(), depth.copy()
-    posed = []
+    parts = []
     for body, store in zip(bodies, stores, strict=True):
         transform = camera.camera_from_world.numpy()
         if body.track is not None:
@@ -137,21 +171,37 @@ def _observe_one(
             transform = transform @ pose
             draw_cover(cover, camera, transform, body.track.size_m)
         extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
-        posed.append((body, store, extent, transform[:3, :3].copy(), transform[:3, 3].copy()))
-    for body, _, extent, *pose in posed:
-        s = body.surfels
-        kernels.draw_depth(s.centres, s.normals, s.major, extent, *pose, *intrinsics, depth)
+        placed = transform[:3, :3].copy(), transform[:3, 3].copy()
+        parts += [
+            _Part(body.surfels, store, extent, placed, body.track is not None, own)
+            for own in parts_of(len(body.surfels))
+        ]
+
+    def draw(part: _Part) -> np.ndarray:
+        s, own, nearest = part.surfels, part.own, np.full_like(depth, np.inf)
+        kernels.draw_depth(
+            s.centres[own], s.normals[own], s.major[own], part.extent[own], *part.pose,
+            *intrinsics, nearest,
+        )  # fmt: skip
+        return nearest
+
+    def observe(part: _Part) -> None:
+        s, own = part.surfels, part.own
+        kernels.observe(
+            s.centres[own], s.normals[own], part.extent[own], *part.pose, *intrinsics,
+            depth, nothing if part.moves else cover, levels, sizes, view.used_rows,
+            camera_number, *(column[own] for column in part.store),
+        )  # fmt: skip
+
+    drawn = pool.map(draw, parts)
     levels, sizes = _pyramid(image)
+    for nearest in drawn:
+        np.minimum(depth, nearest, out=depth)
     car = view.shows_car(camera.width, camera.height)
     cover[car] = nothing[car] = 0  # it stands before all else
-    for body, store, extent, *pose in posed:
-        kernels.observe(
-            body.surfels.centres, body.surfels.normals, extent, *pose, *intrinsics,
-            depth, cover if body.track is None else nothing, levels, sizes, view.used_rows,
-            camera_number, *store,
-        )  # fmt: skip
-    free = np.isinf(depth) & np.isinf(cover)
-    sky.add(camera, free, levels, sizes)
+    observed = pool.map(observe, parts)
+    sky.add(camera, np.isinf(depth) & np.isinf(cover), levels, sizes, pool)
+    list(observed)
 
 
 def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,8 @@ Directions that no image shows are filled smoothly from the sky around them.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 
 import cv2
 import numba
@@ -17,6 +19,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
+from augment.jobs.processes import available_cores
 from augment.sky import CubemapSky, directions_of_cubemap
 
 _FEATHER = 0.12  # images fade over this part of their width, so that exposures meet softly
@@ -24,9 +27,22 @@ _UNSURE = 0.02  # weight of pixels that may be a wall above the LiDAR's view
 _TOP_MARGIN_RAD = math.radians(4.0)  # the camera is not where the LiDAR is
 _FILL_ROWS = 64  # of the lat-long image that unseen directions are filled from
 _DEFAULT_SKY = (0.7, 0.75, 0.8)  # where no image shows any sky
+_PART = 1 << 17  # rows; small ones cost a z-buffer each
 KEPT = 12  # observations remembered of each surfel
 _NEAR_M = 0.3
 _SCORE_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
+
+
+def parts_of(count: int) -> list[slice]:
+    """Rows in parts of _PART, for threads to take."""
+    return [slice(start, start + _PART) for start in range(0, count, _PART)]
+
+
+def in_parts(function: Callable[[slice], object], count: int) -> None:
+    """Call it with all parts of so many rows, on all cores; what it calls leaves the interpreter
+    to others."""
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(function, parts_of(count)))
 
 
 class SkyGatherer:
@@ -42,7 +58,12 @@ class SkyGatherer:
         self._sure = np.zeros(len(self._directions), np.bool_)
 
     def add(
-        self, camera: Camera, free: np.ndarray, levels: np.ndarray, level_sizes: np.ndarray
+        self,
+        camera: Camera,
+        free: np.ndarray,
+        levels: np.ndarray,
+        level_sizes: np.ndarray,
+        pool: Executor,
     ) -> None:
         """Add one image. free: bool [h, w] at the camera's size, True where nothing was drawn.
         levels: uint8 [L, H, W, 3], the image halved again and again; level_sizes: int [L, 2]."""
@@ -50,19 +71,18 @@ class SkyGatherer:
         texel = 2.0 / self._size * camera.fx * level_sizes[0, 1] / camera.width
         level = int(np.clip(round(np.log2(max(texel, 1.0))), 0, len(levels) - 1))
         rows, columns = level_sizes[level]
-        _gather(
-            self._directions,
-            camera.camera_from_world[:3, :3].numpy().astype(np.float32),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
-            free,
-            self._sure_columns(camera, free),
-            levels[level, :rows, :columns],
-            np.float32(_FEATHER),
-            np.float32(_UNSURE),
-            self._sums,
-            self._weights,
-            self._sure,
-        )
+        rotation = camera.camera_from_world[:3, :3].numpy().astype(np.float32)
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        sure, image = self._sure_columns(camera, free), levels[level, :rows, :columns]
+
+        def gather(own: slice) -> None:
+            _gather(
+                self._directions[own], rotation, lens, free, sure, image,
+                np.float32(_FEATHER), np.float32(_UNSURE),
+                self._sums[own], self._weights[own], self._sure[own],
+            )  # fmt: skip
+
+        list(pool.map(gather, parts_of(len(self._directions))))
 
     def _sure_columns(self, camera: Camera, free: np.ndarray) -> np.ndarray:
         """Columns of the image whose free top is sky: what is drawn in them ends below the LiDAR's

@@ -29,6 +29,7 @@ from adapters.lidar_scene.surfels import (
     fill_ground,
     fill_walls,
     gaussians_from_surfels,
+    levels_at,
     surfels_from_points,
     thin_points,
 )
@@ -202,10 +203,12 @@ def _sample_all(
     that gives so many points at most. things: the world first. paths: the driven path in each
     one's frame."""
 
+    levels = [levels_at(thing.points, path) for thing, path in zip(things, paths, strict=True)]
+
     def sample(voxel_m: float) -> tuple[list[tuple[PointSet, np.ndarray]], int]:
         sampled = [
-            _sample(thing, path, voxel_m, is_world=i == 0)
-            for i, (thing, path) in enumerate(zip(things, paths, strict=True))
+            _sample(thing, path, level, voxel_m, is_world=i == 0)
+            for i, (thing, path, level) in enumerate(zip(things, paths, levels, strict=True))
         ]
         count = sum(len(points) for points, _ in sampled)
         logger.info("%d surfels at a voxel of %.3f m", count, voxel_m)
@@ -223,9 +226,9 @@ def _sample_all(
 
 
 def _sample(
-    thing: PointSet, path: np.ndarray, voxel_m: float, *, is_world: bool
+    thing: PointSet, path: np.ndarray, level: np.ndarray, voxel_m: float, *, is_world: bool
 ) -> tuple[PointSet, np.ndarray]:
-    thin, edges = thin_points(thing, path, voxel_m=voxel_m)
+    thin, edges = thin_points(thing, path, voxel_m=voxel_m, level=level)
     if len(thin) < _MIN_POINTS:
         return thin, edges
     surfels = surfels_from_points(thin.points, edges, semantic=thin.semantic)

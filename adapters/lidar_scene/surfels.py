@@ -18,6 +18,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from adapters.lidar_scene.kernels import in_parts
 from adapters.lidar_scene.split import PointSet, is_flat
 from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
@@ -41,28 +42,32 @@ _MIN_THICKNESS_M = 0.005
 
 
 def thin_points(
-    points: PointSet, path: np.ndarray, *, voxel_m: float
+    points: PointSet, path: np.ndarray, *, voxel_m: float, level: np.ndarray | None = None
 ) -> tuple[PointSet, np.ndarray]:
     """The mean point and commonest class of every occupied voxel, and the voxels' edges in metres:
     voxel_m within NEAR_M of the path (float [P, 3]), beyond it growing with the power GROWTH of the
-    distance."""
+    distance. level: `levels_at` the points, where it is known."""
     if len(points) == 0:
         return points, np.zeros(0, np.float32)
-    level = _levels(points.points, np.ascontiguousarray(path, np.float32))
+    level = levels_at(points.points, path) if level is None else level
     edges = _edges(voxel_m)
     keys = _keys(points.points, level, edges)
     order = np.argsort(keys, kind="stable")
-    means, classes, levels = _reduce(
-        points.points[order], points.semantic[order], keys[order], level[order]
-    )
+    means, classes, levels = _reduce(points.points, points.semantic, keys, level, order)
     return PointSet(means, classes), edges[levels].astype(np.float32)
+
+
+def levels_at(points: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """How far each position is from the path, in steps of voxels' sizes, uint8 [N]."""
+    points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
+    out = np.empty(len(points), np.uint8)
+    in_parts(lambda own: _levels(points[own], path, out[own]), len(points))
+    return out
 
 
 def edges_at(points: np.ndarray, path: np.ndarray, *, voxel_m: float) -> np.ndarray:
     """The edge that `thin_points` uses at each position, metres, float32 [N]."""
-    points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
-    level = _levels(points, path)
-    return _edges(voxel_m)[level].astype(np.float32)
+    return _edges(voxel_m)[levels_at(points, path)].astype(np.float32)
 
 
 def coarse_sample(points: np.ndarray, cell_m: np.ndarray) -> np.ndarray:
@@ -77,9 +82,8 @@ def _edges(voxel_m: float) -> np.ndarray:
     return voxel_m * 2.0 ** (_STEP * GROWTH * np.arange(_MAX_LEVEL + 1))
 
 
-@numba.njit(cache=True)
-def _levels(points, path):  # pragma: no cover - compiled
-    out = np.empty(len(points), np.uint8)
+@numba.njit(cache=True, nogil=True)
+def _levels(points, path, out):  # pragma: no cover - compiled
     for i in range(len(points)):
         best = np.inf
         for j in range(len(path)):
@@ -89,35 +93,42 @@ def _levels(points, path):  # pragma: no cover - compiled
             best = min(best, dx * dx + dy * dy + dz * dz)
         level = np.ceil(0.5 * np.log2(max(best, 1e-12) / (NEAR_M * NEAR_M)) / _STEP)
         out[i] = np.uint8(min(max(level, 0.0), _MAX_LEVEL))
-    return out
 
 
 def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """4 bits of level, then 20 a coordinate: 20 km each way at the finest edge."""
-    keys = level.astype(np.uint64)
-    for axis in range(3):
-        cells = np.floor(points[:, axis] / edges[level]).astype(np.int64) + (1 << 19)
-        keys = keys << np.uint64(20) | cells.astype(np.uint64) & np.uint64((1 << 20) - 1)
-    return keys
+    out = np.empty(len(points), np.uint64)
+    in_parts(lambda own: _fill_keys(points[own], level[own], edges, out[own]), len(points))
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_keys(points, level, edges, out):  # pragma: no cover - compiled
+    for i in range(len(points)):
+        key = np.uint64(level[i])
+        for axis in range(3):
+            cell = np.int64(np.floor(points[i, axis] / edges[level[i]])) + (1 << 19)
+            key = key << np.uint64(20) | np.uint64(cell) & np.uint64((1 << 20) - 1)
+        out[i] = key
 
 
 @numba.njit(cache=True)
-def _reduce(points, semantic, keys, level):  # pragma: no cover - compiled
+def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compiled
     """Runs of equal keys to their mean, commonest class (the lower of equals) and level."""
     runs = 1
     for i in range(1, len(keys)):
-        runs += keys[i] != keys[i - 1]
+        runs += keys[order[i]] != keys[order[i - 1]]
     means = np.empty((runs, 3), np.float32)
     classes = np.empty(runs, np.int16)
     levels = np.empty(runs, np.uint8)
     votes = np.zeros(64, np.int64)
     start, run = 0, 0
     for end in range(1, len(keys) + 1):
-        if end < len(keys) and keys[end] == keys[start]:
+        if end < len(keys) and keys[order[end]] == keys[order[start]]:
             continue
         sums = np.zeros(3)
         votes[:] = 0
-        for i in range(start, end):
+        for i in order[start:end]:
             for axis in range(3):
                 sums[axis] += points[i, axis]
             votes[semantic[i]] += 1
@@ -129,7 +140,7 @@ def _reduce(points, semantic, keys, level):  # pragma: no cover - compiled
             if votes[c] > 0 and (best == 0 or votes[c] > votes[best]):
                 best = c
         classes[run] = best
-        levels[run] = level[start]
+        levels[run] = level[order[start]]
         start, run = end, run + 1
     return means, classes, levels
 

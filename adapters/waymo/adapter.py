@@ -11,7 +11,9 @@ what the car drove meanwhile.
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +30,7 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    colour_every,
     drive_origin,
     find_objects,
     is_usable,
@@ -44,7 +47,6 @@ from adapters.waymo.tables import (
     MAX_SIDE,
     STAMP,
     TOP,
-    RowReader,
     Rows,
     Segment,
     extract_images,
@@ -56,6 +58,7 @@ from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
 from augment.files.image_size import image_header
+from augment.files.packed_images import RowReader
 from augment.geometry import invert_rigid
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
@@ -67,6 +70,7 @@ _SPIN_NS = 100_000_000  # the TOP laser turns ten times a second
 EGO_M = np.array([[-1.15, -1.1, -0.5], [4.1, 1.1, 2.3]])
 _MAX_FAULTS = 3  # sweeps with a sentence of their own
 _MAX_RETURNS = 12_000_000  # that a scene is built from; each takes 50 bytes on the way
+_THREADS = 4  # NumPy releases the interpreter
 
 # ---- Range images --------------------------------------------------------------------------------
 # A laser's range image holds range (metres, none where it is not > 0), intensity, elongation, and
@@ -98,30 +102,54 @@ class Returns(NamedTuple):
     camera_classes: np.ndarray | None
 
 
-def frame_returns(segment: Segment, frame: int, every: int = 1) -> Returns | None:
+def frame_returns(segment: Segment, frame: int) -> Returns | None:
     """The returns of a frame, lasers in their order, each laser's first returns first; None where
-    the table has no row of it. every: take one return in so many, other ones in the next frame."""
-    scans = _range_images(segment, "lidar", frame, 4)
-    if not scans:
+    the table has no row of it."""
+    scans = _read_scans(segment, frame)
+    return None if scans is None else scans.returns()
+
+
+class _Scans(NamedTuple):
+    """What the tables have of a frame. images: range images by laser, of both returns. poses: of
+    the TOP laser's car at each pixel. labels, seen: as images, by laser. pictures: classes [h, w]
+    by camera."""
+
+    segment: Segment
+    frame: int
+    images: Mapping[int, tuple[np.ndarray | None, ...]]
+    poses: np.ndarray | None
+    labels: Mapping[int, tuple[np.ndarray | None, ...]]
+    seen: Mapping[int, tuple[np.ndarray | None, ...]]
+    pictures: Mapping[int, np.ndarray]
+
+    def returns(self, every: int = 1) -> Returns | None:
+        """every: take one return in so many, other ones in the next frame."""
+        nothing, parts = (None, None), []
+        for laser, images in sorted(self.images.items()):
+            beams = _Beams(self.segment, self.frame, laser, self.poses if laser == TOP else None)
+            labels, seen = self.labels.get(laser, nothing), self.seen.get(laser, nothing)
+            own = zip(images, labels, seen, strict=True)
+            for number, (image, classes, pixels) in enumerate(own, start=1):
+                if image is not None:
+                    found = beams.returns(image, number, classes, pixels, self.pictures, every)
+                    parts.append(found)
+        if not parts:
+            return None
+        found = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        if not self.labels:
+            found = found._replace(classes=None, objects=None)
+        return found if self.seen else found._replace(camera_classes=None)
+
+
+def _read_scans(segment: Segment, frame: int) -> _Scans | None:
+    images = _range_images(segment, "lidar", frame, 4)
+    if not images:
         return None
     (poses,) = _range_images(segment, "lidar_pose", frame, 6, returns=(1,)).get(TOP, (None,))
     labels = _range_images(segment, "lidar_segmentation", frame, 2)
     pictures = _label_images(segment, frame)
     seen = _range_images(segment, "lidar_camera_projection", frame, 6) if pictures else {}
-    nothing = (None, None)
-    parts = []
-    for laser, images in sorted(scans.items()):
-        beams = _Beams(segment, frame, laser, poses if laser == TOP else None)
-        own = zip(images, labels.get(laser, nothing), seen.get(laser, nothing), strict=True)
-        for number, (image, classes, pixels) in enumerate(own, start=1):
-            if image is not None:
-                parts.append(beams.returns(image, number, classes, pixels, pictures, every))
-    if not parts:
-        return None
-    found = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if not labels:
-        found = found._replace(classes=None, objects=None)
-    return found if seen else found._replace(camera_classes=None)
+    return _Scans(segment, frame, images, poses, labels, seen, pictures)
 
 
 class _Beams(NamedTuple):
@@ -528,10 +556,14 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
     where = f"waymo:{path}, segment {segment.files.name}"
     chosen = options.select(range(len(segment.stamps_us)), where=where)
     origin = drive_origin(segment.world_from_vehicle[:, :3, 3])
-    paths, image_problems = extract_images(segment, chosen.numbers)
+    step = colour_every(sum(len(segment.shots.get(n, {})) for n in chosen.used))
+    with ThreadPoolExecutor(1) as pool:  # both are decoders' work, without the interpreter
+        coloured = set(chosen.used[::step])
+        images = pool.submit(extract_images, segment, chosen.numbers, coloured)
+        sweeps, sweep_problems = read_sweeps(segment, chosen.used, origin)
+        paths, image_problems = images.result()
     frames = tuple(_frame(segment, n, origin, paths[n]) for n in chosen.numbers)
     boxes, box_problems = moving_boxes(segment, chosen.numbers, origin)
-    sweeps, sweep_problems = read_sweeps(segment, chosen.used, origin)
     labels = WaymoLabels(segment)
     return RawDrive(
         name=segment.files.name,
@@ -551,6 +583,7 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
             *box_problems,
             *_notes(segment, chosen.numbers),
         ),
+        colour_every=step,
     )
 
 
@@ -621,33 +654,59 @@ def read_sweeps(
     every second return is taken, or every third, and so on, so that there are at most
     _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
-    missing, problems, step = [], [], 0
+    missing, faults, step = [], {}, 0
     rows = _index(segment, "lidar", "key.laser_name", LASERS)
     in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
-    for n in tqdm(in_file, desc="LiDAR", unit="sweep", disable=None):
+    waiting: deque[tuple[int, Future[Sweep | None]]] = deque()
+
+    def finish(n: int, sweep: Future[Sweep | None]) -> None:
         try:
-            returns = frame_returns(segment, n, step or 1)
+            found = sweep.result()
         except AdapterError as error:
-            problems.append(f"frame {n}: its LiDAR returns are left out: {error}")
-            continue
-        if returns is None:
-            missing.append(n)
-            continue
-        if not step:  # as if all frames had as many as the first
-            step = max(1, -(-len(returns.points_m) * len(numbers) // _MAX_RETURNS))
-            returns = frame_returns(segment, n, step) if step > 1 else returns
-        points = returns.points_m
-        semantic = _semantic(returns.classes, returns.camera_classes, len(points))
-        sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns, semantic)
-        keep = is_usable(sweep, points, segment.world_from_vehicle[n], EGO_M)
-        sweeps[n] = sweep.select(keep)
+            faults[n] = error
+        else:
+            missing.extend([n] if found is None else [])
+            sweeps.update({} if found is None else {n: found})
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        for n in tqdm(in_file, desc="LiDAR", unit="sweep", disable=None):
+            try:  # in the file's order; only what is made of it is made in turns
+                scans = _read_scans(segment, n)
+                first = None if scans is None or step else scans.returns()
+                if first is not None:  # as if all frames had as many as the first
+                    step = max(1, -(-len(first.points_m) * len(numbers) // _MAX_RETURNS))
+            except AdapterError as error:
+                faults[n] = error
+                continue
+            if scans is None:
+                missing.append(n)
+                continue
+            waiting.append((n, pool.submit(_usable_sweep, scans, step or 1, origin)))
+            if len(waiting) > _THREADS:
+                finish(*waiting.popleft())
+        while waiting:
+            finish(*waiting.popleft())
+    problems = [
+        f"frame {n}: its LiDAR returns are left out: {faults[n]}" for n in in_file if n in faults
+    ]
     if len(problems) > _MAX_FAULTS:
         problems[_MAX_FAULTS:] = [f"so are those of {len(problems) - _MAX_FAULTS} more frames"]
     if missing:
-        problems.append(f"the LiDAR has no row of {some(missing)}")
+        problems.append(f"the LiDAR has no row of {some(sorted(missing))}")
     if step > 1:
         problems.append(
             f"the scene is built from one return in {step}, of {len(numbers)} frames; fewer "
             f"(frames=) use all"
         )
     return tuple(sweeps[n] for n in sorted(sweeps)), tuple(problems)
+
+
+def _usable_sweep(scans: _Scans, every: int, origin: np.ndarray) -> Sweep | None:
+    returns = scans.returns(every)
+    if returns is None:
+        return None
+    points = returns.points_m
+    semantic = _semantic(returns.classes, returns.camera_classes, len(points))
+    sweep = Sweep((points - origin).astype(np.float32), returns.timestamps_ns, semantic)
+    pose = scans.segment.world_from_vehicle[scans.frame]
+    return sweep.select(is_usable(sweep, points, pose, EGO_M))

@@ -11,31 +11,24 @@ forward); pixel centres are at +0.5 already. Errors are AdapterErrors that name 
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from adapters.plain_files import LARGEST, ImageFault, checked_pose, is_whole_jpeg
+from adapters.plain_files import LARGEST, checked_pose
 from adapters.raw_drive import some
 from adapters.scene_cache import image_folder
-from adapters.uri import WAYMO_SPLITS
-from augment.errors import AdapterError, OutputError
-from augment.files.image_size import image_header
-from augment.jobs.atomic import temporary_beside
+from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
+from augment.errors import AdapterError
+from augment.files.packed_images import Lens, PackedImages, reading
 from augment.jobs.manifest import MAX_SIDE_PX
-from augment.jobs.tables import opened_parquet, read_table
+from augment.jobs.tables import read_table
 
 COMPONENTS = {
     "vehicle_pose": "VehiclePoseComponent",
@@ -49,7 +42,6 @@ COMPONENTS = {
     "camera_segmentation": "CameraSegmentationLabelComponent",
     "lidar_camera_projection": "LiDARCameraProjectionComponent",
 }
-_REQUIRED = tuple(COMPONENTS)[:6]
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # numbered from 1
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")  # numbered from 1
 TOP = 1
@@ -60,7 +52,6 @@ _CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0
 _LATEST_S = 9e9  # nanoseconds in int64 reach 9.2e18
 _NEAR_S = 0.25  # an image is taken this close to its frame's time
 _SPIN_NS = 100_000_000  # one turn of the TOP laser, from the frame's time on
-_DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError)
 _ADVICE = "copy it again from the dataset"
 
 
@@ -87,8 +78,8 @@ class SegmentFiles:
 def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
     """The segment at a path: the only one, or the one of that name or first part of a name."""
     alone = SegmentFiles("", path, is_alone=True)
-    if alone.has(_REQUIRED[0]):
-        file = alone.path(_REQUIRED[0])
+    if alone.has(WAYMO_REQUIRED[0]):
+        file = alone.path(WAYMO_REQUIRED[0])
         with reading(file):
             names = set(read_table(file, str(file), [SEGMENT]).column(SEGMENT).to_pylist())
         found = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
@@ -96,12 +87,12 @@ def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
         found = {
             file.stem: SegmentFiles(file.stem, folder)
             for folder in (path, *(path / split for split in WAYMO_SPLITS))
-            for file in sorted((folder / _REQUIRED[0]).glob("*.parquet"))
+            for file in sorted((folder / WAYMO_REQUIRED[0]).glob("*.parquet"))
         }
     if not found:
         raise AdapterError(
             f"{path} holds no segment of the Waymo Open Dataset v2; expected "
-            f"{_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
+            f"{WAYMO_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
         )
     names = sorted(found)
     if wanted is not None:
@@ -120,15 +111,6 @@ def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
         f"{path} has {len(names)} segments; a scene is one of them, give ?segment={names[0]} "
         f"(there are {first})"
     )
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Errors of Arrow and the system become AdapterErrors that name the file."""
-    try:
-        yield
-    except _DAMAGED as error:
-        raise AdapterError(f"{path} cannot be read as Parquet ({error}); {_ADVICE}") from error
 
 
 # ---- Columns -------------------------------------------------------------------------------------
@@ -269,128 +251,7 @@ def _flat(cell: Any) -> np.ndarray:
     return cell.values.to_numpy(zero_copy_only=False).astype(np.float64)
 
 
-class RowReader:
-    """Rows of a large file by number. Cheapest in ascending order: a row group is decoded from its
-    start on, in pieces, and goes on from where it was left. Thread-safe."""
-
-    def __init__(self, path: Path, columns: Sequence[str], rows_at_once: int) -> None:
-        self._path, self._columns, self._rows_at_once = path, list(columns), rows_at_once
-        self._stack, self._lock = ExitStack(), threading.Lock()
-        with reading(path):
-            self._file = self._stack.enter_context(opened_parquet(path, str(path)))
-            metadata = self._file.metadata
-            sizes = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
-        missing = [name for name in columns if name not in self._file.schema_arrow.names]
-        if missing:
-            raise AdapterError(f"{path}: column {missing[0]} is missing; {_ADVICE}")
-        self._starts = np.cumsum([0, *sizes])
-        self._batches: Iterator[pa.RecordBatch] = iter(())
-        self._batch: pa.RecordBatch | None = None
-        self._first = self._group = -1
-
-    def __del__(self) -> None:
-        self._stack.close()
-
-    def read(self, rows: Sequence[int]) -> dict[int, dict[str, Any]]:
-        """By row number, its cells by column, Arrow's scalars."""
-        found = {}
-        with self._lock, reading(self._path):
-            for row in sorted(map(int, rows)):
-                batch = self._batch_of(row)
-                at = row - self._first
-                found[row] = {name: batch[name][at] for name in self._columns}
-        return found
-
-    def _batch_of(self, row: int) -> pa.RecordBatch:
-        group = int(np.searchsorted(self._starts, row, side="right")) - 1
-        if self._batch is None or group != self._group or row < self._first:
-            self._batches = self._file.iter_batches(
-                self._rows_at_once, row_groups=[group], columns=self._columns
-            )
-            self._group, self._first, self._batch = group, int(self._starts[group]), None
-        while self._batch is None or row >= self._first + len(self._batch):
-            if self._batch is not None:
-                self._first += len(self._batch)
-            batch = self._batch = next(self._batches, None)
-            if batch is None:
-                raise AdapterError(f"{self._path} ends before row {row}; {_ADVICE}")
-            batch.validate(full=True)
-        return self._batch
-
-
 # ---- Calibration ---------------------------------------------------------------------------------
-
-_RADIAL = (0.8, 1.2)  # beyond, the polynomial is no lens any more
-_MAX_ZOOM = 2.0
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A camera's image as recorded. Size and f, c: pixels; OpenCV's five coefficients."""
-
-    width: int
-    height: int
-    f_u: float
-    f_v: float
-    c_u: float
-    c_v: float
-    k1: float
-    k2: float
-    p1: float
-    p2: float
-    k3: float
-
-    @property
-    def is_pinhole(self) -> bool:
-        return not any((self.k1, self.k2, self.p1, self.p2, self.k3))
-
-    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Recorded pixels of rays (x, y, 1), OpenCV axes, and where the lens model holds."""
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
-        valid = (radial >= _RADIAL[0]) & (radial <= _RADIAL[1])
-        return self.f_u * u + self.c_u, self.f_v * v + self.c_v, valid
-
-    @cached_property
-    def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy of the image without distortion, of the same size: the recorded ones, or
-        a longer focal length where its border would show what was not recorded."""
-
-        def fits(zoom: float) -> bool:
-            columns = np.arange(self.width) + 0.5
-            rows = np.arange(self.height) + 0.5
-            u = np.concatenate([columns, columns, 0 * rows + 0.5, 0 * rows + self.width - 0.5])
-            v = np.concatenate([0 * columns + 0.5, 0 * columns + self.height - 0.5, rows, rows])
-            u, v, valid = self.project(*self._rays(u, v, zoom))
-            inside = (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
-            return bool((inside & valid).all())
-
-        low, high = 1.0, _MAX_ZOOM
-        if fits(low):
-            high = low
-        elif not fits(high):
-            raise ValueError("its distortion leaves no picture")
-        while high - low > 1e-6:
-            middle = (low + high) / 2
-            low, high = (low, middle) if fits(middle) else (middle, high)
-        return high * self.f_u, high * self.f_v, self.c_u, self.c_v
-
-    @cached_property
-    def maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each undistorted pixel lies in the recorded image, for cv2.remap, whose pixel
-        centres are whole numbers."""
-        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        u, v, _ = self.project(*self._rays(u, v, self.pinhole[0] / self.f_u))
-        u, v = (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32)
-        return cv2.convertMaps(u, v, cv2.CV_16SC2)
-
-    def undistorted(self, image: np.ndarray) -> np.ndarray:
-        return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-    def _rays(self, u: np.ndarray, v: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
-        return (u - self.c_u) / (zoom * self.f_u), (v - self.c_v) / (zoom * self.f_v)
 
 
 class Mount(NamedTuple):
@@ -475,10 +336,10 @@ class Segment:
 
 def read_segment(files: SegmentFiles) -> Segment:
     """All but images, range images and labels."""
-    if missing := [name for name in _REQUIRED if not files.has(name)]:
+    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
         raise AdapterError(
             f"segment {files.name} lacks {', '.join(str(files.path(name)) for name in missing)}; a "
-            f"scene needs the components {', '.join(_REQUIRED)}, download them too"
+            f"scene needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
         )
     rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
     stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
@@ -588,92 +449,45 @@ def _read_shots(segment: Segment) -> tuple[dict[int, dict[str, Shot]], tuple[str
 
 # ---- Images --------------------------------------------------------------------------------------
 
-_IMAGES_AT_ONCE = 16  # some 6 MB of JPEGs, decoded 0.1 GB
-_JPEG_QUALITY = 95
-_THREADS = 4  # decoders and encoders release the interpreter
 _MAX_FAULTS = 3  # images with a sentence of their own
 
 
 def extract_images(
-    segment: Segment, numbers: Sequence[int]
+    segment: Segment, numbers: Sequence[int], now: Collection[int]
 ) -> tuple[dict[int, dict[str, str]], tuple[str, ...]]:
     """Paths of the frames' images without lens distortion, by frame and camera, and a sentence for
-    what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`), where
-    those that are there already are left as they are."""
+    what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`): those
+    of the frames in `now` at once, the others from when they are read on."""
     files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
     folder = image_folder(segment.files.name, files)
-    wanted = {
-        shot.row: (n, name, folder / name / f"{segment.stamps_us[n]}.jpg")
-        for n in numbers
-        for name, shot in segment.shots.get(n, {}).items()
+    shots = {
+        f"{name}/{segment.stamps_us[n]}.jpg": (n, name, shot.row)
+        for n, own in segment.shots.items()
+        for name, shot in own.items()
     }
+    packed = PackedImages(
+        table=os.path.abspath(files[0]),
+        column=f"[{COMPONENTS['camera_image']}].image",
+        lenses={name: mount.lens for name, mount in segment.cameras.items()},
+        rows={file: row for file, (_, _, row) in shots.items()},
+    )
+    wanted = set(numbers)
+    asked = {file: shot for file, shot in shots.items() if shot[0] in wanted}
+    faults = packed.put(folder, list(asked), [f for f, shot in asked.items() if shot[0] in now])
+    said = [
+        f"camera {name}, frame {n}: its image {faults[file]}; left out"
+        for file, (n, name, _) in asked.items()
+        if file in faults
+    ]
+    problems = said[:_MAX_FAULTS]
+    if len(said) > _MAX_FAULTS:
+        problems.append(f"{len(said) - _MAX_FAULTS} more images cannot be used")
     found: dict[int, dict[str, str]] = {n: {} for n in numbers}
-    faults, missing = [], []
-    for row, (n, name, path) in wanted.items():
-        if _is_there(path):
-            found[n][name] = str(path)
-        else:
-            missing.append(row)
-    column = f"[{COMPONENTS['camera_image']}].image"
-    reader = RowReader(files[0], [column], _IMAGES_AT_ONCE)
-    missing.sort()
-    bar = tqdm(total=len(missing), desc="images", unit="image", disable=None)
-    with ThreadPoolExecutor(_THREADS) as pool, bar:
-        for start in range(0, len(missing), _IMAGES_AT_ONCE):
-            rows = missing[start : start + _IMAGES_AT_ONCE]
-            cells = reader.read(rows)
-            jobs = [
-                (cells[r][column], segment.cameras[wanted[r][1]].lens, wanted[r][2]) for r in rows
-            ]
-            for row, fault in zip(rows, pool.map(_extract, jobs), strict=True):
-                n, name, path = wanted[row]
-                if fault:
-                    faults.append(f"camera {name}, frame {n}: its image {fault}; left out")
-                else:
-                    found[n][name] = str(path)
-            bar.update(len(rows))
-    problems = faults[:_MAX_FAULTS]
-    if len(faults) > _MAX_FAULTS:
-        problems.append(f"{len(faults) - _MAX_FAULTS} more images cannot be used")
+    for file, (n, name, _) in asked.items():
+        if file not in faults:
+            found[n][name] = str(folder / file)
     for name in segment.cameras:
         if without := [n for n in numbers if name not in segment.shots.get(n, {})]:
             problems.append(f"camera {name}: no image of {some(without)}")
     ordered = {n: {name: own[name] for name in CAMERAS if name in own} for n, own in found.items()}
     return ordered, tuple(problems)
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return is_whole_jpeg(path)
-    except ImageFault:
-        return False
-
-
-def _extract(job: tuple[Any, Lens, Path]) -> str:
-    """Write an image without distortion. Returns what is wrong with it, or nothing."""
-    cell, lens, path = job
-    data = b"" if cell.as_buffer() is None else cell.as_buffer().to_pybytes()
-    header = image_header(data)
-    if header is None or header.format != "JPEG" or b"\xff\xd9" not in data[-64:]:
-        return f"of {len(data)} bytes is no whole JPEG"
-    if (header.width, header.height) != (lens.width, lens.height):
-        size = f"{header.width}x{header.height}"
-        return f"is of {size} pixels, its camera of {lens.width}x{lens.height}"
-    if not lens.is_pinhole:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        if image is None:
-            return "cannot be decoded"
-        quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        data = cv2.imencode(".jpg", lens.undistorted(image), quality)[1].tobytes()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        new = temporary_beside(path)
-        new.write_bytes(data)
-        os.replace(new, path)
-    except OSError as error:
-        raise AdapterError(
-            f"{path} cannot be written ({error.strerror or error}); images without distortion are "
-            f"kept there, set XDG_CACHE_HOME to a folder with room for them"
-        ) from error
-    return ""

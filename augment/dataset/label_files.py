@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 import torch
-from pydantic import BaseModel
+from pydantic import BaseModel, NonNegativeInt
 
 from augment.dataset.clips_pairs import split_by_scene
 from augment.dataset.samples import moved_points
@@ -40,6 +40,7 @@ from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import MANIFEST, OK, read_finished
 from augment.jobs.store import open_store
 from augment.jobs.tables import read_boxes
+from augment.scene import Scene
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Category, LabelFormat, Output
 
@@ -47,6 +48,11 @@ LABELS = "labels"  # the folder
 RECORD, INDEX = "labels.json", "index.csv"
 FORMATS: tuple[LabelFormat, ...] = ("coco", "kitti", "yolo")
 WHOLE = {"train": 1.0}  # the only part where nothing is said
+FILES: dict[LabelFormat, tuple[str, ...]] = {
+    "coco": ("coco/instances_train.json",),
+    "kitti": ("kitti/training/{image_2,label_2,calib}/*", "kitti/ImageSets/train.txt"),
+    "yolo": ("yolo/data.yaml", "yolo/{images,labels}/train/*"),
+}
 # KITTI's states of occlusion, by how much of an object nothing before it hides.
 FULLY, PARTLY, LARGELY, UNKNOWN = 0, 1, 2, 3
 FULLY_VISIBLE, PARTLY_VISIBLE = 0.9, 0.5
@@ -65,6 +71,17 @@ class LabelsAsked(BaseModel, frozen=True, extra="forbid"):
     split: dict[str, float] = WHOLE
     seed: int = 0
     changes: tuple[str, ...] = ()
+
+
+class LabelsRecord(BaseModel, frozen=True, extra="forbid"):
+    """What RECORD says of labels that are written; see LabelsAsked and LabelsWritten."""
+
+    asked: LabelsAsked
+    categories: tuple[str, ...]
+    images: dict[LabelFormat, NonNegativeInt]
+    objects: dict[LabelFormat, NonNegativeInt]
+    hidden: dict[LabelFormat, NonNegativeInt]
+    unmapped: dict[str, NonNegativeInt]
 
 
 @dataclass(frozen=True)
@@ -153,6 +170,36 @@ def category_of(label: str, table: Sequence[Category] | None) -> str | None:
     if table is None:
         return label
     return next((row.name for row in table if row.takes(label)), None)
+
+
+def planned_labels(scene: Scene, output: Output) -> dict[str, Any] | None:
+    """What a job will write of a scene for trainers; None where the recipe asks for no format.
+    files: in LABELS of the output. categories: how many boxes in the scene's frames, and of how
+    many objects, by name, of which images get those that a pixel of them shows. unmapped: boxes by
+    labels of no category.
+    """
+    if not output.label_formats:
+        return None
+    boxes, unmapped = Counter[str](), Counter[str]()
+    tracks: dict[str, set[str]] = {}
+    for frame in scene.frames:
+        own = scene.boxes(frame.index)
+        for label, track in zip(own.labels, own.track_ids, strict=True):
+            if (name := category_of(label, output.categories)) is None:
+                unmapped[label] += 1
+            else:
+                boxes[name] += 1
+                tracks.setdefault(name, set()).add(track)
+    return {
+        "files": [f"{LABELS}/{name}" for kind in output.label_formats for name in FILES[kind]],
+        "categories": {
+            name: {"boxes": count, "objects": len(tracks[name])}
+            for name, count in sorted(boxes.items())
+        },
+        "unmapped": dict(sorted(unmapped.items())),
+        "min_visibility": output.min_visibility,
+        "on_hidden": output.on_hidden,
+    }
 
 
 class _Categories(NamedTuple):
@@ -411,7 +458,7 @@ class _Writing:
             unused=self.categories.unused,
         )
 
-    def _counted(self, asked: set[str]) -> dict[str, dict[str, int]]:
+    def _counted(self, asked: set[str]) -> dict[str, Any]:
         kinds = ("images", "objects", "hidden")
         return {kind: {f: self.counts[kind, f] for f in sorted(asked)} for kind in kinds}
 
@@ -467,13 +514,13 @@ class _Writing:
             names = enumerate(self.categories.names)
             lines += ["names:", *(f"  {k}: {json.dumps(name)}" for k, name in names)]
             _put_lines(new / "yolo/data.yaml", lines)
-        record = {
-            "asked": self.asked.model_dump(mode="json"),
-            "categories": list(self.categories.names),
+        record = LabelsRecord(
+            asked=self.asked,
+            categories=self.categories.names,
+            unmapped=dict(self.categories.unmapped),
             **self._counted(asked),
-            "unmapped": self.categories.unmapped,
-        }
-        (new / RECORD).write_text(json.dumps(record, indent=1) + "\n")
+        )
+        (new / RECORD).write_text(record.model_dump_json(indent=1) + "\n")
 
 
 class _CocoFiles:

@@ -26,10 +26,10 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, ValidationError
 
 from augment.errors import SceneError
-from augment.files.ply import SplatFile, recentring_origin
+from augment.files.ply import SplatFile, join_placed
 from augment.geometry import rotmat_from_quat
 from augment.jobs.atomic import replaced_file
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians
+from augment.scene import SH_COUNTS, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 GLB = b"glTF"
@@ -208,21 +208,7 @@ class _File:
                 f"{self.path}: negative scales are taken as logarithms, as an earlier draft of "
                 f"{EXTENSION} stored all scales"
             )
-        means = np.concatenate([part[0] for part in parts])
-        origin = recentring_origin(means)
-        bands = max(part[1].sh.shape[1] for part in parts)
-        sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for _, p in parts]
-        with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
-            near = (means - origin).astype(np.float32)
-        raw = Gaussians(
-            means=torch.from_numpy(near),
-            quats=torch.cat([part.quats for _, part in parts]),
-            scales=torch.cat([part.scales for _, part in parts]),
-            opacities=torch.cat([part.opacities for _, part in parts]),
-            sh=torch.cat(sh),
-        )
-        gaussians, problems = check_gaussians(raw, where=str(self.path))
-        return SplatFile(gaussians, origin, NOTES, (*self.problems, *problems))
+        return join_placed(parts, self.path, NOTES, self.problems)
 
     def placed_primitives(self) -> Iterator[tuple[_Primitive, np.ndarray]]:
         """Primitives of Gaussians with world_from_node, in the order of the scene's nodes."""

@@ -2,8 +2,9 @@
 
 Beside the files of a scene folder, whose background then lies square after square (augment.lod),
 
-    levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares);
-                          from level 1 on also k.means, k.quats, ..., k.stands_for
+    levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares),
+                          k.boxes.lows, k.boxes.highs, k.boxes.longest (Boxes); from level 1 on also
+                          k.means, k.quats, ..., k.stands_for
 
 holds its levels of detail, and the metadata `finest_m`. All arrays are mapped: a view reads the
 squares that it takes. Their numbers are looked at then, and the whole background's before an effect
@@ -28,6 +29,7 @@ from augment.files.scene_file import read_tensors, save_scene
 from augment.lod import (
     CELLS_M,
     MAX_LEVELS,
+    Boxes,
     Level,
     Levels,
     Piece,
@@ -37,6 +39,7 @@ from augment.lod import (
     rows_of,
     square_order,
 )
+from augment.render.cpu.order import CELL
 from augment.scene import SH_COUNTS, Gaussians, Scene
 
 _COLUMNS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
@@ -102,6 +105,7 @@ def _arrays(levels: Levels) -> dict[str, np.ndarray]:
     arrays = dict[str, np.ndarray]()
     for number, level in enumerate(levels.levels):
         own = {f.name: getattr(level.squares, f.name) for f in fields(Squares)}
+        own |= {f"boxes.{name}": box for name, box in level.boxes._asdict().items()}
         if number > 0:  # the background is level 0
             g = level.gaussians
             values = {f.name: getattr(g, f.name) for f in fields(g)}
@@ -121,6 +125,10 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
     finest_m = metadata.get("finest_m", "")
     if finest_m not in map(repr, CELLS_M):
         raise SceneError(f"{path}: finest_m must be one of {CELLS_M}; got {finest_m!r}")
+    if "0.boxes.lows" not in tensors:
+        raise SceneError(
+            f"{path} has no boxes: another version of this package wrote it; write the scene again"
+        )
     levels = list[Level]()
     while f"{len(levels)}.keys" in tensors and len(levels) <= MAX_LEVELS:
         number, count = len(levels), len(background)
@@ -128,7 +136,10 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
         if number > 0:
             own, stands_for = _splats(tensors, number, background, str(path))
         squares = _squares(tensors, number, len(own), levels[-1].squares if levels else None, path)
-        levels.append(Level(own, stands_for, squares, unchecked=str(path), splats=count))
+        cells = (-(-len(own) // CELL),)
+        found = _boxes(tensors, f"{number}.boxes.", cells, str(path))
+        boxes = Boxes(*(found[name] for name in Boxes._fields))
+        levels.append(Level(own, stands_for, squares, boxes, unchecked=str(path), splats=count))
     if tensors or not levels:
         raise SceneError(f"{path} must hold levels 0, 1, ... alone; got {sorted(tensors)[:5]}")
     return Levels(float(finest_m), tuple(levels))
@@ -162,20 +173,31 @@ def _squares(
     where = str(path)
     keys = _take(tensors, f"{number}.keys", (None,), where, torch.int64).numpy()
     starts = _take(tensors, f"{number}.starts", (len(keys) + 1,), where, torch.int64).numpy()
-    boxes = {
-        name: _take(tensors, f"{number}.{name}", (len(keys), *shape), where, torch.float32).numpy()
-        for name, shape in _BOXES.items()
-    }
-    squares = Squares(keys, starts, **boxes)
+    squares = Squares(keys, starts, **_boxes(tensors, f"{number}.", (len(keys),), where))
     ends = (int(starts[0]), int(starts[-1]))
     known = finer is None or bool(np.isin(keys, finer.keys >> 2).all())
     is_good = len(keys) > 0 and keys[0] >= 0 and (np.diff(keys) > 0).all() and known
     is_good &= ends == (0, splats) and (np.diff(starts) >= 0).all()
-    is_good &= all(np.isfinite(box).all() for box in boxes.values())
-    if not (is_good and (squares.lows <= squares.highs).all() and (squares.longest > 0).all()):
+    if not is_good:
         raise SceneError(
             f"{path}: the squares of level {number} must have increasing keys, those of the level "
-            f"before without their last two bits, boxes, and starts from 0 to {splats}; got keys "
+            f"before without their last two bits, and starts from 0 to {splats}; got keys "
             f"{keys[:3]}..., starts {starts[:2]}...{starts[-1:]}; write the scene again"
         )
     return squares
+
+
+def _boxes(
+    tensors: dict[str, Tensor], prefix: str, shape: tuple[int], where: str
+) -> dict[str, np.ndarray]:
+    found = {
+        name: _take(tensors, prefix + name, (*shape, *own), where, torch.float32).numpy()
+        for name, own in _BOXES.items()
+    }
+    is_good = all(np.isfinite(box).all() for box in found.values())
+    if not (is_good and (found["lows"] <= found["highs"]).all() and (found["longest"] > 0).all()):
+        raise SceneError(
+            f"{where}: {prefix}lows, highs and longest must be boxes of positive standard "
+            f"deviations; write the scene again"
+        )
+    return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -515,3 +515,30 @@ def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
         return np.zeros(3)
     median = np.median(finite, axis=0).astype(np.float64)
     return np.round(median) if np.linalg.norm(median) > RECENTRE_BEYOND_M else np.zeros(3)
+
+
+def join_placed(
+    parts: Sequence[tuple[np.ndarray, Gaussians]],
+    path: Path,
+    notes: Mapping[str, str],
+    problems: Sequence[str],
+) -> SplatFile:
+    """What a file of several parts holds. parts: of each the places of its Gaussians in the file's
+    axes, float64 [N, 3], and all else of them; their own means do not count. Raises SceneError: no
+    Gaussian can be drawn.
+    """
+    means = np.concatenate([places for places, _ in parts])
+    origin = recentring_origin(means)
+    bands = max(part.sh.shape[1] for _, part in parts)
+    sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for _, p in parts]
+    with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
+        near = (means - origin).astype(np.float32)
+    raw = Gaussians(
+        means=torch.from_numpy(near),
+        quats=torch.cat([part.quats for _, part in parts]),
+        scales=torch.cat([part.scales for _, part in parts]),
+        opacities=torch.cat([part.opacities for _, part in parts]),
+        sh=torch.cat(sh),
+    )
+    gaussians, left_out = check_gaussians(raw, where=str(path))
+    return SplatFile(gaussians, origin, notes, (*problems, *left_out))

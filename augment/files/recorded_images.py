@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -22,12 +23,32 @@ _REDUCED = {
 
 def decode_image(path: Path, flags: int) -> np.ndarray | None:
     """As cv2.imread, but of regular files only: a pipe would keep it waiting."""
+    if _unpacked(path):
+        return None
     try:
         with open_file(path) as file:
             data = np.frombuffer(file.read(_MAX_BYTES), np.uint8)
     except OSError:
         return None
     return cv2.imdecode(data, flags) if len(data) else None
+
+
+def has_image(path: Path) -> bool:
+    """Whether the image is there, or can be had from a table (see packed_images)."""
+    if path.is_file():
+        return True
+    from augment.files.packed_images import is_packed  # pyarrow would be loaded with it
+
+    return is_packed(path)
+
+
+def _unpacked(path: Path) -> str:
+    """Have the image written if it is missing and a table has it; what is wrong with it there."""
+    if os.path.lexists(path):
+        return ""
+    from augment.files.packed_images import unpack_image
+
+    return unpack_image(path)
 
 
 class ImageFault(Exception):
@@ -40,6 +61,8 @@ def is_whole_jpeg(path: Path) -> bool:
     Raises:
         ImageFault: missing, unreadable, or a JPEG that is cut short: decoders fill that with grey.
     """
+    if fault := _unpacked(path):
+        raise ImageFault(fault)
     try:
         with open_file(path) as file:
             head = file.read(2)

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 
 from augment.errors import SceneError
-from augment.files.ply import SplatFile, recentring_origin
+from augment.files.ply import SplatFile, join_placed
 from augment.jobs.atomic import replaced_file
-from augment.scene import SH_COUNTS, Gaussians, check_gaussians
+from augment.scene import SH_COUNTS, Gaussians
 
 _LEAST_ROW = 6  # bytes of a place, in halves
 _MAX_COPIES = 16  # of all Gaussians that the file has room for
@@ -128,21 +128,7 @@ def _read(pxr: Any, path: Path, stage: Any) -> SplatFile:
         raise SceneError(
             f"{path}: no visible ParticleField3DGaussianSplat with positions; splats are needed"
         )
-    means = np.concatenate([places for places, _ in parts])
-    origin = recentring_origin(means)
-    bands = max(part.sh.shape[1] for _, part in parts)
-    sh = [torch.nn.functional.pad(p.sh, (0, 0, 0, bands - p.sh.shape[1])) for _, p in parts]
-    with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
-        near = (means - origin).astype(np.float32)
-    raw = Gaussians(
-        means=torch.from_numpy(near),
-        quats=torch.cat([part.quats for _, part in parts]),
-        scales=torch.cat([part.scales for _, part in parts]),
-        opacities=torch.cat([part.opacities for _, part in parts]),
-        sh=torch.cat(sh),
-    )
-    gaussians, left_out = check_gaussians(raw, where=str(path))
-    return SplatFile(gaussians, origin, notes, (*problems, *left_out))
+    return join_placed(parts, path, notes, problems)
 
 
 def _column(prim: Any, name: str, time: Any) -> np.ndarray | None:

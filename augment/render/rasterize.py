@@ -36,6 +36,7 @@ from augment.render.constants import (
     TRANSMITTANCE_STOP,
     RasterSettings,
 )
+from augment.render.cpu.order import cut_in_fog
 from augment.render.fog import Fog
 from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
 from augment.render.layout import HeightClip
@@ -130,7 +131,8 @@ def rasterize(
     image = _Image(parts, camera, frozenset(buffers), settings, fog, clip, pixel_mask)
     chosen = _choose(image, backend)
     if settings.lod_px > 0 and not _tracked(parts):
-        levels = choose_parts(parts, camera, settings)
+        seen_by = cut_in_fog(settings, fog, clip, image.buffers)
+        levels = choose_parts(parts, camera, seen_by, fog, clip, whole=chosen == CPU)
         return levels.restore_ids(_render(image._replace(parts=levels.parts), chosen))
     return _render(image, chosen)
 

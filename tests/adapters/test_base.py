@@ -77,6 +77,51 @@ def test_bad_uris(uri: str, message: str) -> None:
         parse_uri(uri)
 
 
+NEARLY = {
+    "a PandaSet sequence: lidar/ is there, camera/ not": ["lidar/00.pkl.gz"],
+    "a nuScenes dataset: samples/ is there, v1.0-*/scene.json not": ["samples/CAM_FRONT/a.jpg"],
+    "a KITTI drive: image_02/, velodyne_points/ are there, calib_cam_to_cam.txt not": [
+        "image_02/data/0000000000.png", "velodyne_points/data/0000000000.bin",
+    ],
+    "a KITTI object folder: velodyne/, calib/ are there, image_2/ not": [
+        "velodyne/000000.bin", "calib/000000.txt",
+    ],
+    "a segment of the Waymo Open Dataset v2: camera_image/, lidar/ are there, vehicle_pose/, "
+    "camera_calibration/, lidar_calibration/, lidar_pose/ not": [
+        "training/camera_image/a.parquet", "training/lidar/a.parquet",
+    ],
+    "an Argoverse 2 log: sensors/lidar/, sensors/cameras/ are there, "
+    "city_SE3_egovehicle.feather, calibration/intrinsics.feather not": [
+        "sensors/lidar/1.feather", "sensors/cameras/ring_front_center/1.jpg",
+    ],
+    "a recording: images/<camera>/000000.jpg is there, calibration.json not": [
+        "images/front/000000.jpg",
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", NEARLY)
+def test_an_unknown_folder_says_what_it_nearly_is(said: str, tmp_path: Path) -> None:
+    for name in NEARLY[said]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(AdapterError) as caught:
+        open_scene(str(tmp_path))
+    assert re.findall(r"It is nearly ([^.]*(?:\.[^ ][^.]*)*)\. ", str(caught.value)) == [said]
+
+
+def test_a_folder_of_pictures_says_how_it_becomes_a_recording(tmp_path: Path) -> None:
+    for name, words in {
+        "frames/000001.jpg": r"Its images make a recording with their poses: images/<camera>/",
+        "drive.mp4": r"Of a video's frames COLMAP and `climategs record` make a recording",
+    }.items():
+        folder = tmp_path / Path(name).stem
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).touch()
+        with pytest.raises(AdapterError, match=f"It holds 1 .*{words}"):
+            open_scene(str(folder))
+
+
 def test_names_with_special_characters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What exists as written is taken as written; the query starts after it."""
     monkeypatch.chdir(tmp_path)

@@ -23,6 +23,7 @@ from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import reflectances
 from augment.errors import AdapterError
+from augment.files.recorded_images import ImageFault, decode_image, has_image, is_whole_jpeg
 from augment.recorded_sky import lidar_top_rad
 from augment.semantics import SemanticClass
 
@@ -269,6 +270,31 @@ def test_a_scene_of_a_segment_looks_like_its_images(written: Path, cache: Path) 
     again = open_scene(uri)
     assert {p: p.read_bytes() for p in folder.rglob("*.jpg")} == before
     assert len(again.background) == len(scene.background)
+
+
+def test_images_that_give_no_colours_are_written_when_they_are_read(
+    copy: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = [Path(p) for frame in read(copy).frames for p in frame.image_paths.values()]
+    expected = {path: path.read_bytes() for path in whole}
+    (folder,) = (cache / "images").iterdir()
+    shutil.rmtree(folder)
+    monkeypatch.setattr("adapters.raw_drive._MAX_COLOUR_IMAGES", 5)
+    drive = read(copy)
+    assert drive.colour_every == 3 and not any("left out" in said for said in drive.problems)
+    later = [Path(p) for frame in drive.frames[1:] for p in frame.image_paths.values()]
+    assert len(list(folder.rglob("*.jpg"))) == 5 and not any(path.exists() for path in later)
+    assert all(map(has_image, later)) and not has_image(folder / "FRONT/1.jpg")
+    assert decode_image(later[0], cv2.IMREAD_COLOR) is not None
+    assert {path: path.read_bytes() for path in expected} == expected
+    assert decode_image(folder / "FRONT/1.jpg", cv2.IMREAD_COLOR) is None
+    for path in later:
+        path.unlink()
+    files.table_path(copy, "camera_image").write_bytes(b"no Parquet")
+    with pytest.raises(ImageFault, match=r"cannot be had from its table: .*camera_image.* as Parq"):
+        is_whole_jpeg(later[3])
+    (folder / "packed.json").write_text("{}")
+    assert not has_image(later[3])
 
 
 def test_frames_that_are_held_out_give_no_returns(written: Path) -> None:

@@ -247,6 +247,8 @@ BESIDE: dict[str, dict[str, Any]] = {
     "weather.flood": {"level_m": 0.1},
     "weather.flood.waves.components[]": {"amplitude_m": 0.0, "wavelength_m": 1.0},
     "weather.snow": {"depth_m": 0.1, "cell_m": CELL_M},
+    "weather.rain": {"rate_mm_h": 10.0},
+    "weather.snowfall": {"rate_mm_h": 1.0},
     "style": {"preset": "dusk"},
 }
 INSTEAD = {

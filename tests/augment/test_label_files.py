@@ -17,7 +17,7 @@ from test_boxes_2d import open_street, street
 
 from augment.boxes import PlacedBoxes, encode_masks, find_occlusion
 from augment.dataset import LabelsAsked, write_labels
-from augment.dataset.label_files import NothingLabelled, category_of
+from augment.dataset.label_files import NothingLabelled, category_of, planned_labels
 from augment.errors import OutputError
 from augment.jobs.generate import run_generate
 from augment.jobs.manifest import read_manifest
@@ -296,6 +296,35 @@ def test_the_first_row_that_takes_a_label_names_its_category() -> None:
     cases = {"vehicle.bus.rigid": "bus", "vehicle.car": "car", "a.rider": "person", "vehicle": None}
     assert {label: category_of(label, table) for label in cases} == cases
     assert category_of("anything", None) == "anything"
+
+
+def test_what_will_be_written_is_known_before(output: Path) -> None:
+    table = "categories: [{label: Car, name: vehicle}], min_visibility: 0.4"
+    planned = planned_labels(street(), recipe(f"{ALL}, {table}").output)
+    assert planned is not None and planned["min_visibility"] == 0.4
+    asked = [name.replace("*", "000000*") for name in planned["files"]]
+    both = [name for text in asked for name in _expanded(text)]
+    assert len(both) == 8 and all(any(output.glob(name)) for name in both)
+    boxes = [street().boxes(frame.index) for frame in street().frames]
+    labels = [label for own in boxes for label in own.labels]
+    tracks = {
+        track
+        for own in boxes
+        for track, lb in zip(own.track_ids, own.labels, strict=True)
+        if lb == "Car"
+    }
+    known = {"vehicle": {"boxes": labels.count("Car"), "objects": len(tracks)}}
+    assert planned["categories"] == known
+    assert sum(planned["unmapped"].values()) == len(labels) - labels.count("Car")
+    assert planned_labels(street(), recipe("labels: true").output) is None
+
+
+def _expanded(pattern: str) -> list[str]:
+    before, brace, rest = pattern.partition("{")
+    if not brace:
+        return [pattern]
+    names, _, after = rest.partition("}")
+    return [before + name + after for name in names.split(",")]
 
 
 def test_categories_can_be_changed_without_rendering(output: Path, tmp_path: Path) -> None:

@@ -45,8 +45,8 @@ def folder(written, tmp_path):
     return Path(shutil.copytree(written, tmp_path / "road"))
 
 
-def draw(background, settings=SETTINGS):
-    return rasterize([PosedGaussians(background)], eye(-7.0), settings=settings).rgb
+def draw(background, x_m=-30.0):
+    return rasterize([PosedGaussians(background)], eye(x_m), settings=SETTINGS).rgb
 
 
 def test_a_large_scene_is_drawn_as_the_same_scene_in_memory(scene, folder):
@@ -76,13 +76,13 @@ def set_first(value):
 
 
 def test_numbers_are_looked_at_when_they_are_drawn_and_before_an_effect_works_on_them(folder):
-    """The first square, along the Z-curve, lies where the road begins."""
+    """The first splats, along the Z-curve, lie where the road begins."""
     damage(folder, "background.scales", set_first(float("nan")))
     opened = load_scene_parts(folder)  # nothing is read
-    with pytest.raises(SceneError, match=r"levels.safetensors: square 0 holds .* cannot be drawn"):
-        draw(opened.background)
+    with pytest.raises(SceneError, match=r"levels.safetensors: splats 0 to .* cannot be drawn"):
+        draw(opened.background, -7.0)
     make_plan(Recipe(), opened)
-    with pytest.raises(SceneError, match="square 0"):
+    with pytest.raises(SceneError, match="splats 0 to"):
         make_plan(Recipe(weather=Weather(smog=Smog(visibility_m=100.0))), opened)
 
 
@@ -91,8 +91,9 @@ def test_numbers_are_looked_at_when_they_are_drawn_and_before_an_effect_works_on
     [
         ("1.keys", -1, "the squares of level 1 must have increasing keys"),
         ("0.starts", 1, "the squares of level 0 must .* starts from 0 to 28800"),
-        ("1.lows", float("nan"), "the squares of level 1"),
-        ("1.longest", -1.0, "the squares of level 1"),
+        ("1.lows", float("nan"), "1.lows, highs and longest must be boxes"),
+        ("1.longest", -1.0, "1.lows, highs and longest must be boxes"),
+        ("1.boxes.highs", -1e9, "1.boxes.lows, highs and longest must be boxes"),
     ],
 )
 def test_damaged_squares_are_refused_on_opening(folder, name, value, said):
@@ -107,8 +108,8 @@ def test_damaged_splats_of_a_level_are_refused_when_they_are_drawn(folder, name,
     number = len(levels.levels) - 1
     damage(folder, f"{number}.{name}", set_first(value), LEVELS)
     damaged = lod.levels_of(load_scene_parts(folder).background).levels[number]
-    with pytest.raises(SceneError, match="square 0 holds"):
-        damaged.take(0)
+    with pytest.raises(SceneError, match=r"splats 0 to .* cannot be drawn"):
+        damaged.check(np.array([0]))
 
 
 def test_levels_of_another_background_are_refused(scene, folder):

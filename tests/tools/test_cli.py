@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numba
+import numpy as np
 import pytest
 import torch
 from fitted_scenes import assert_same, fitted_scene
@@ -23,6 +24,7 @@ from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.files.ply import write_ply
 from augment.files.scene_file import load_scene_parts, save_scene
 from augment.jobs.manifest import read_manifest
+from augment.labels import Boxes
 from augment.scene import Gaussians, Scene
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
@@ -157,14 +159,14 @@ def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
 def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
     import augment.views
 
-    real = augment.views.render_view
+    real = augment.views.begin_view
 
     def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
         if camera.timestamp_ns > 0:
             raise RuntimeError("no light")
         return real(scene, camera, recipe, backend=backend)
 
-    monkeypatch.setattr(augment.views, "render_view", breaks_on_the_second_frame)
+    monkeypatch.setattr(augment.views, "begin_view", breaks_on_the_second_frame)
     out = tmp_path / "out"
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
     streams = capsys.readouterr()
@@ -240,6 +242,9 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
     ):
         assert main(arguments) == 2
         assert "is not on this machine" in capsys.readouterr().err
+    assert main(["labels", "s3://bucket/path"]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "copy the output here, images too (as by `aws s3 sync URI OUT`), then" in error
 
 
 def test_style_presets_are_listed_and_printed(capsys):
@@ -306,6 +311,20 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
     monkeypatch.setattr(explain, "measure_passes", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
+
+
+def test_labels_for_trainers_are_explained(scene, monkeypatch, tmp_path):
+    recipe = "output: {depth: none, labels: [coco], min_visibility: 0.2}\n"
+    facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert facts["labels"]["files"] == ["labels/coco/instances_train.json"]
+    assert "labels/coco/instances_train.json" in page and "none: the scene has no boxes" in page
+    box = Boxes(("a",), ("Car",), np.zeros((1, 3)), np.ones((1, 3)), np.eye(1, 4), {})
+    monkeypatch.setattr(Scene, "boxes", lambda _scene, _frame: box)
+    _, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert "\n  Car: 2 boxes of 1 objects, of which images get those that a pixel shows" in page
+    assert "where the weather leaves less than 0.2 of an object, it is left out" in page
+    facts, page = explained(monkeypatch, tmp_path, scene, "{}\n", times=False)
+    assert facts["labels"] is None and "for trainers" not in page
 
 
 def test_compiling_is_said_before_it_is_done(capsys):

@@ -115,6 +115,25 @@ def test_labels_and_lidar_are_counted(page) -> None:
     assert failures in page.text  # grouped by what went wrong
 
 
+def test_labels_for_trainers_are_on_the_page(tmp_path) -> None:
+    out = write_output(tmp_path, street_rows(scenes=1, frames=1))
+    record = {
+        "asked": {"split": {"train": 1.0}, "seed": 0, "changes": []},
+        "categories": ["Car", EVIL], "images": {"coco": 6, "yolo": 6},
+        "objects": {"coco": 12, "yolo": 9}, "hidden": {"coco": 3, "yolo": 3},
+        "unmapped": {"Tree": 4},
+    }  # fmt: skip
+    (out / "labels").mkdir()
+    (out / "labels/labels.json").write_text(json.dumps(record))
+    page = page_of(out)
+    assert "labels/coco 6 12 3 labels/yolo 6 9 3 Categories: Car, " in page.text
+    assert "Of no category, and left out: Tree (4 boxes)." in page.text
+    assert len(page.scripts) == 1 and not page.values("img", "onerror")
+    (out / "labels/labels.json").write_text(json.dumps(record | {"images": "six"}))
+    page = page_of(out)
+    assert "For trainers" not in page.text and "labels/labels.json 1 validation error" in page.text
+
+
 def test_nothing_is_fetched_and_links_stay_in_the_folder(page, street, tmp_path) -> None:
     sources = [v for _, name, v in page.attributes if name in ("src", "srcset", "data")]
     assert sources and all(v and v.startswith("data:image/jpeg;base64,") for v in sources)

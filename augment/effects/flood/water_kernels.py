@@ -2,8 +2,9 @@
 
 `shade` implements `water.shade_water`. It sorts a row's water pixels into a smooth and a rough list
 and works on eight pixels at a time: rough ones need three slopes and mip levels, smooth ones the
-image itself. Coordinates and colours are vectors of eight; pixels are fetched two by two. All is float32 but the rays' directions, whose sign decides where there is water and
-whose small downward part the distance to it is divided by. Indices are unsigned, so nothing wraps.
+image itself. Coordinates and colours are vectors of eight; colours are fetched for two pixels at a
+time. All is float32 but the rays' directions, whose sign decides where there is water and whose
+small downward part the distance to it is divided by. Indices are unsigned, so nothing wraps.
 """
 
 from __future__ import annotations
@@ -157,8 +158,8 @@ EIGHTS = ~U(7)  # a number's multiple of eight
 DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
 LIST = U(STRIP * 10)
 
-# Lines of the scratch memory. A colour; was the bed found and how deep; two mip levels; for each of three slopes the mirrored ray, its share of the light and its place in
-# the mirror.
+# Lines of the scratch memory. A colour; was the bed found and how deep; two mip levels; for each of
+# three slopes the mirrored ray, its share of the light and its place in the mirror.
 R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(7))
 LOW, WIDE, HIGH, SCALE = (U(56 + 16 * k) for k in range(4))
 RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(120 + 24 * k) for k in range(6))
@@ -746,9 +747,9 @@ class Normals(NamedTuple):
 
 
 class Image(NamedTuple):
-    """A layer, flat; empty where there is none. view [22]: focal length times the camera's right,
-    down (fx, fy) and forward axes; coefficients of column, row and 1 in the x, y, z of a pixel's
-    ray; cx, cy, width, height.
+    """A layer, flat, with a row and a pixel beyond it where a side is 1; empty where there is none.
+    view [22]: focal length times the camera's right, down (fx, fy) and forward axes; coefficients
+    of column, row and 1 in the x, y, z of a pixel's ray; cx, cy, width, height.
     """
 
     view: np.ndarray

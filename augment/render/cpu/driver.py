@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -46,11 +46,11 @@ from augment.render.constants import (
 from augment.render.cpu import blend as blend_kernels
 from augment.render.cpu import geometry
 from augment.render.cpu import project as project_kernels
-from augment.render.cpu.order import order_of
+from augment.render.cpu.order import cut_in_fog, order_of
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
-from augment.render.threads import kernel_threads, thread_count
+from augment.render.threads import kernel_threads, thread_count, usable_cores
 from augment.scene import Gaussians, PosedGaussians
 
 # ---- What the CPU kernels read: scene parts by address, and the numbers of a view ----------------
@@ -109,10 +109,12 @@ def gather_inputs(
     arrays, addresses, orders, blocks = [], [], [], []
     for number, part in enumerate(parts):
         g, count = part.gaussians, len(part.gaussians)
-        order = order_of(g) if culled else None
+        order = order_of(g) if culled and part.rows is None else None
         if order is None:
             firsts = range(0, count, layout.BLOCK)
             kept = [(first, min(first + layout.BLOCK, count)) for first in firsts]
+            if part.rows is not None:
+                kept = _blocks(part.rows).tolist()
             tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
             own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
         else:
@@ -141,6 +143,14 @@ def gather_inputs(
     )
 
 
+def _blocks(rows: np.ndarray) -> np.ndarray:
+    """int64 [B, 2]: runs of rows (first, last + 1) in pieces of at most a block."""
+    counts = -(-(rows[:, 1] - rows[:, 0]) // layout.BLOCK)
+    run = np.repeat(np.arange(len(rows)), counts)
+    first = rows[run, 0] + layout.BLOCK * (np.arange(len(run)) - (counts.cumsum() - counts)[run])
+    return np.stack([first, np.minimum(first + layout.BLOCK, rows[run, 1])], 1)
+
+
 def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Slopes of light float32 [N, 3], colour maps float32 [C, 3, 4] and their rows int16 [N]; [1]
     of what is not read.
@@ -159,8 +169,8 @@ def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # Every render takes a space of its own, so threads that render at once never share one.
 
 _LINE = 64  # bytes of a cache line
-_KEPT = 2  # spaces kept for later renders; a process rarely renders in more threads
-_SPACES: deque[Scratch] = deque(maxlen=_KEPT)  # append and pop are atomic
+# Kept for later renders, of which there are rarely more at once. Append and pop are atomic.
+_SPACES: deque[Scratch] = deque(maxlen=max(2, usable_cores()))
 
 
 class Scratch:
@@ -232,9 +242,7 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     timer = StageTimer(stage_times)
-    is_hidden = fog is not None and fog.sigma_per_m > 0
-    if not is_hidden or clip is not None or not buffers <= {RGB, ALPHA}:
-        settings = replace(settings, fog_cut=0.0)
+    settings = cut_in_fog(settings, fog, clip, buffers)
     inputs = gather_inputs(
         parts, camera, settings, fog, clip, with_color=RGB in buffers, culled=True
     )

@@ -9,8 +9,10 @@ Gaussians that change from view to view, would pay more for it than it saves.
 from __future__ import annotations
 
 import math
+import threading
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,6 +22,7 @@ from torch import Tensor
 from augment.bounds import Bounds, may_show
 from augment.cameras import Camera
 from augment.render import layout
+from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
@@ -36,18 +39,25 @@ _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
 
 Value = TypeVar("Value")
 _known: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]] = {}
+_making = threading.RLock()  # views drawn at once want the same
 
 
-def _known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
+def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
     """What `make` gave for the tensor under this name; made anew after a change in place."""
     key = (id(tensor), name)
-    known = _known.get(key)
-    if known is not None and known[0]() is tensor and known[1] == tensor._version:
-        return known[2]
-    value = make()
-    gone = weakref.ref(tensor, lambda _: _known.pop(key, None))
-    _known[key] = (gone, tensor._version, value)
-    return value
+
+    def find() -> tuple[weakref.ref[Tensor], int, Any] | None:
+        known = _known.get(key)
+        return known if known and known[0]() is tensor and known[1] == tensor._version else None
+
+    known = find()
+    if known is None:
+        with _making:
+            known = find()
+            if known is None:
+                gone = weakref.ref(tensor, lambda _: _known.pop(key, None))
+                known = _known[key] = (gone, tensor._version, make())
+    return known[2]
 
 
 class _Uses:
@@ -86,20 +96,13 @@ class Order(NamedTuple):
         bounds = Bounds(self.lows + halves, halves, longest, owners)
         pose = None if part.world_from_part is None else part.world_from_part.numpy()
         # Where nothing is known, of NaN, no comparison holds, and the cell stays.
-        seen = may_show(bounds, pose, camera, settings.near_m)
+        seen = may_be_drawn(bounds, pose, camera, settings, fog, clip)
         seen &= ~(self.sorted(g.opacities).largest < np.float32(ALPHA_MIN))
-        if clip is not None:
-            low, high = (z - clip.z_m for z in _heights(bounds, pose, np.array(clip.up)))
-            near, far = (low, high) if clip.sign > 0 else (-high, -low)
-            seen &= ~((far < 0) | (near > clip.reach_m))
-        if fog is not None and settings.fog_cut > 0:
-            depths = _least_optical_depth(bounds, pose, camera, fog)
-            seen &= ~(depths > -math.log(settings.fog_cut))
         return _blocks_of(seen, len(g))
 
     def sorted(self, tensor: Tensor) -> Sorted:
         """The tensor's rows in this order."""
-        known = _known_of(tensor, "sorted", lambda: self._sort(tensor))
+        known = known_of(tensor, "sorted", lambda: self._sort(tensor))
         if known.order is not self:  # the same tensor beside other means
             known = self._sort(tensor)
         return known
@@ -124,11 +127,12 @@ def order_of(gaussians: Gaussians) -> Order | None:
     g = gaussians
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
-    uses = _known_of(g.means, "order", _Uses)
-    uses.count += 1
-    if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
-        uses.order = _find_order(g.means.detach().numpy())
-    return uses.order
+    uses = known_of(g.means, "order", _Uses)
+    with _making:
+        uses.count += 1
+        if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
+            uses.order = _find_order(g.means.detach().numpy())
+        return uses.order
 
 
 def _is_plain(tensor: Tensor) -> bool:
@@ -166,6 +170,36 @@ def _spread(bits: np.ndarray) -> np.ndarray:
 
 
 # ---- What a view leaves out ----------------------------------------------------------------------
+
+
+def cut_in_fog(
+    settings: RasterSettings, fog: Fog | None, clip: HeightClip | None, buffers: frozenset[str]
+) -> RasterSettings:
+    """The settings, whose fog_cut counts where a whole picture alone is wanted."""
+    is_hidden = fog is not None and fog.sigma_per_m > 0
+    if is_hidden and clip is None and buffers <= {RGB, ALPHA}:
+        return settings
+    return replace(settings, fog_cut=0.0)
+
+
+def may_be_drawn(
+    bounds: Bounds,
+    pose: np.ndarray | None,
+    camera: Camera,
+    settings: RasterSettings,
+    fog: Fog | None,
+    clip: HeightClip | None,
+) -> np.ndarray:
+    """bool [B]: boxes in which a splat may be drawn. pose: world_from_part; None: the identity."""
+    seen = may_show(bounds, pose, camera, settings.near_m)
+    if clip is not None:
+        low, high = (z - clip.z_m for z in _heights(bounds, pose, np.array(clip.up)))
+        near, far = (low, high) if clip.sign > 0 else (-high, -low)
+        seen &= ~((far < 0) | (near > clip.reach_m))
+    if fog is not None and settings.fog_cut > 0:
+        depths = _least_optical_depth(bounds, pose, camera, fog)
+        seen &= ~(depths > -math.log(settings.fog_cut))
+    return seen
 
 
 def _heights(
