@@ -224,6 +224,12 @@ def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
     memo_of(gaussians).put(_STORED, levels, shared=True)
 
 
+def keeps_levels(gaussians: Gaussians) -> bool:
+    """Whether levels lie in a file with these Gaussians."""
+    is_known = memo_of(gaussians).known(_STORED)
+    return is_known and levels_of(gaussians).levels[0].unchecked is not None
+
+
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
     """All pieces in memory."""
     gaussians, stands_for, keys = zip(*pieces, strict=True)

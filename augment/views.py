@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from augment.effects.effect import Drawn, EffectView
 from augment.jobs.layout import TRUST
 from augment.jobs.processes import choose_backend, renders_on_gpu
 from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
+from augment.prune import prune_parts
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import map_colors
 from augment.render.rasterize import rasterize
@@ -76,6 +77,9 @@ def render_buffers(
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for own in view.effects:
         layers = own.effect.edit_scene(own, layers, camera)
+    if plan.prune > 0:
+        with timed("prune"):
+            layers = replace(layers, parts=prune_parts(layers.parts, scene, camera, plan.prune))
     drawn = _draw(view, layers, camera)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)
@@ -134,6 +138,8 @@ def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) ->
     z = getattr(raster, by or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:
         return None
+    if z.device.type == "cpu" and not (z.requires_grad or raster.alpha.requires_grad):
+        return torch.from_numpy(np.where(raster.alpha.numpy() >= SURFACE_ALPHA, z.numpy(), 0))
     return torch.where(raster.alpha >= SURFACE_ALPHA, z, 0.0)
 
 

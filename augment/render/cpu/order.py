@@ -42,7 +42,7 @@ _known: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]] = {}
 _making = threading.RLock()  # views drawn at once want the same
 
 
-def _known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
+def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
     """What `make` gave for the tensor under this name; made anew after a change in place."""
     key = (id(tensor), name)
 
@@ -102,7 +102,7 @@ class Order(NamedTuple):
 
     def sorted(self, tensor: Tensor) -> Sorted:
         """The tensor's rows in this order."""
-        known = _known_of(tensor, "sorted", lambda: self._sort(tensor))
+        known = known_of(tensor, "sorted", lambda: self._sort(tensor))
         if known.order is not self:  # the same tensor beside other means
             known = self._sort(tensor)
         return known
@@ -127,7 +127,7 @@ def order_of(gaussians: Gaussians) -> Order | None:
     g = gaussians
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
-    uses = _known_of(g.means, "order", _Uses)
+    uses = known_of(g.means, "order", _Uses)
     with _making:
         uses.count += 1
         if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
