@@ -46,7 +46,7 @@ from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.memo import memo_of
 from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
-from augment.render.cpu.order import CELL, may_be_drawn
+from augment.render.cpu.order import CELL, known_of, may_be_drawn
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.sh import SH_C0
@@ -129,13 +129,15 @@ class Boxes(NamedTuple):
 class Level:
     """Splats, square after square, neighbours together. stands_for [N]: the part's own splat whose
     number and class each has. unchecked: the file that they come from, whose numbers are looked at
-    when they are taken. splats: of the part, where it is unchecked.
+    when they are taken. splats: of the part, where it is unchecked. parents [N]: the splat of the
+    next level that each is merged into, -1 for none.
     """
 
     gaussians: Gaussians
     stands_for: Int32[np.ndarray, "N"]
     squares: Squares
     boxes: Boxes
+    parents: Int32[np.ndarray, "N"]
     unchecked: str | None = None
     splats: int = 0
     _checked: Bool[np.ndarray, "C"] = field(init=False)
@@ -214,14 +216,75 @@ class Piece(NamedTuple):
 
 def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
     """The levels of a part, made once for these Gaussians."""
-    return memo_of(gaussians).get(
-        (*_LEVELS, antialiased), lambda: build_levels(gaussians, antialiased=antialiased)
-    )
+
+    def make() -> Levels:
+        stored = known_of(gaussians.means, "levels", lambda: None)
+        if stored is None or antialiased or not _has_shapes(gaussians, stored.levels[0].gaussians):
+            return build_levels(gaussians, antialiased=antialiased)
+        return edited_levels(stored, gaussians)
+
+    return memo_of(gaussians).get((*_LEVELS, antialiased), make)
 
 
 def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
-    """Let `levels_of` know levels that lie in a file. levels: must not hold this object."""
+    """Let `levels_of` know levels that lie in a file. levels: must not hold this object, or its
+    means.
+    """
     memo_of(gaussians).put(_STORED, levels, shared=True)
+    known_of(gaussians.means, "levels", lambda: levels)
+
+
+def _has_shapes(g: Gaussians, other: Gaussians) -> bool:
+    return all(getattr(g, n).data_ptr() == getattr(other, n).data_ptr() for n in _COLUMNS[:3])
+
+
+def edited_levels(levels: Levels, g: Gaussians) -> Levels:
+    """The levels of Gaussians that have other colours, or let more through: mean colours and sums
+    of opacities are taken anew, where nothing moves.
+
+    Raises:
+        SceneError: the levels' file is damaged.
+    """
+    edited = [replace(levels.levels[0], gaussians=rows_of(g, slice(None)), unchecked=None)]
+    for finer, own in itertools.pairwise(levels.levels):
+        if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(
+            own.gaussians
+        ):
+            raise SceneError(f"{own.unchecked}: parents must be splats of the next level")
+        edited.append(replace(own, gaussians=_reweighed(finer, edited[-1].gaussians, own)))
+    return replace(levels, levels=tuple(edited))
+
+
+def _reweighed(finer: Level, g: Gaussians, own: Level) -> Gaussians:
+    """The splats of a level as the finer ones' new opacities and colours make them."""
+    count, functions = len(own.gaussians), g.sh.shape[1]
+    before, after, sh = np.zeros(count), np.zeros(count), np.zeros((count, functions * 3))
+    for rows in batches(len(g)):
+        into = finer.parents[rows]
+        merged = np.flatnonzero(into >= 0)
+        if not len(merged):
+            continue
+        into = into[merged]
+        first, end = int(into.min()), int(into.max()) + 1
+        a, b, c = g.scales[rows].double().numpy()[merged].T
+        area, size = a * b + b * c + c * a, end - first
+        weights = area * g.opacities[rows].numpy()[merged]
+        whole = area * finer.gaussians.opacities[rows].numpy()[merged]
+        before[first:end] += np.bincount(into - first, whole, size)
+        after[first:end] += np.bincount(into - first, weights, size)
+        values = g.sh[rows].reshape(-1, functions * 3).numpy()[merged]
+        for column in range(functions * 3):
+            own_sum = np.bincount(into - first, weights * values[:, column], size)
+            sh[first:end, column] += own_sum
+    is_left = (after > 0) & (before > 0)
+    left = np.where(is_left, after / np.where(is_left, before, 1), 0)
+    known = np.where(is_left, after, 1)[:, None]
+    mean = np.where(is_left[:, None], sh / known, own.gaussians.sh.reshape(count, -1).numpy())
+    return replace(
+        own.gaussians,
+        opacities=own.gaussians.opacities * torch.from_numpy(left).clamp(max=1).float(),
+        sh=torch.from_numpy(mean.astype(np.float32)).reshape(own.gaussians.sh.shape),
+    )
 
 
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
@@ -327,33 +390,37 @@ def level_of(found: Piece, finer: Squares | None = None) -> Level:
         lows = np.minimum.reduceat(finer.lows, firsts)
         highs = np.maximum.reduceat(finer.highs, firsts)
     boxes = Boxes.around(g, np.arange(0, len(g), CELL))
-    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes)
+    parents = np.full(len(g), -1, np.int32)
+    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes, parents)
 
 
 def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
-    """The next level, a few squares at a time. cell_m: its cells."""
+    """The next level, a few squares at a time; `finer` learns its parents. cell_m: its cells."""
     keys = finer.squares.keys >> 2
     firsts = np.append(np.flatnonzero(np.diff(keys, prepend=-1)), len(keys))
     starts = finer.squares.starts[firsts]
     blur_m = 0.0 if antialiased else BLUR_CELLS * cell_m
-    first = 0
+    first, count = 0, 0
     while first < len(starts) - 1:
         end = max(int(np.searchsorted(starts, starts[first] + BATCH, "right")) - 1, first + 1)
         rows = slice(int(starts[first]), int(starts[end]))
         squares = np.repeat(keys[firsts[first:end]], np.diff(starts[first : end + 1]))
-        merged, leads = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
+        merged, leads, into = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
+        finer.parents[rows] = np.where(into < 0, -1, into + count)
+        count += len(leads)
         yield Piece(merged, finer.stands_for[rows][leads], squares[leads])
         first = end
 
 
 def merge_cells(
     g: Gaussians, squares: Int64[np.ndarray, "N"], cell_m: float, blur_m: float
-) -> tuple[Gaussians, Int64[np.ndarray, "M"]]:
+) -> tuple[Gaussians, Int64[np.ndarray, "M"], Int64[np.ndarray, "N"]]:
     """The splats of each cell merged into one, square after square.
 
     squares [N]: the number of each splat's square, increasing. blur_m: standard deviation of the
     rasteriser's blur. Splats that are too clear to be drawn are left out. Returns also the splat
-    that stands for each merged one: the heaviest of the class that weighs most.
+    that stands for each merged one, the heaviest of the class that weighs most; and which one each
+    is merged into, -1 for none.
     """
     kept = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
     longest, squares = g.scales.numpy().max(1)[kept], squares[kept]
@@ -366,9 +433,11 @@ def merge_cells(
     order, starts = kept[order], np.flatnonzero(begins)
     counts = np.diff(starts, append=len(order))
     leads, several = order[starts], counts > 1
+    into = np.full(len(g), -1)
+    into[order] = np.repeat(np.arange(len(starts)), counts)
     at = np.flatnonzero(several)
     if not len(at):
-        return g.select(torch.from_numpy(leads)), leads
+        return g.select(torch.from_numpy(leads)), leads, into
     rows = order[np.repeat(several, counts)]
     firsts = np.cumsum(counts[at]) - counts[at]
     merged, heaviest = merge_groups(g.select(torch.from_numpy(rows)), firsts, blur_m)
@@ -376,7 +445,7 @@ def merge_cells(
     out = g.select(torch.from_numpy(leads))
     for name in _COLUMNS:
         getattr(out, name)[torch.from_numpy(at)] = getattr(merged, name).to(g.means.dtype)
-    return out, leads
+    return out, leads, into
 
 
 def _grouped(is_apart: np.ndarray, cells: np.ndarray, squares: np.ndarray) -> tuple:

@@ -98,8 +98,9 @@ def test_large_splats_stay_as_they_are_and_clear_ones_are_left_out():
         lod.Piece(each, np.zeros(1, np.int32), np.zeros(1, np.int64))
         for each in (small, large, small, dataclasses.replace(small, opacities=torch.zeros(1)))
     ).gaussians
-    merged, leads = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
+    merged, leads, into = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
     assert sorted(leads.tolist()) == [0, 1]
+    assert into[0] == into[2] != into[1] and into[3] == -1
     kept = int(np.flatnonzero(leads == 1)[0])
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(merged, name)[kept], getattr(g, name)[1])

@@ -40,7 +40,7 @@ Value = TypeVar("Value")
 _known: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]] = {}
 
 
-def _known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
+def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
     """What `make` gave for the tensor under this name; made anew after a change in place."""
     key = (id(tensor), name)
     known = _known.get(key)
@@ -94,7 +94,7 @@ class Order(NamedTuple):
 
     def sorted(self, tensor: Tensor) -> Sorted:
         """The tensor's rows in this order."""
-        known = _known_of(tensor, "sorted", lambda: self._sort(tensor))
+        known = known_of(tensor, "sorted", lambda: self._sort(tensor))
         if known.order is not self:  # the same tensor beside other means
             known = self._sort(tensor)
         return known
@@ -119,7 +119,7 @@ def order_of(gaussians: Gaussians) -> Order | None:
     g = gaussians
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
-    uses = _known_of(g.means, "order", _Uses)
+    uses = known_of(g.means, "order", _Uses)
     uses.count += 1
     if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
         uses.order = _find_order(g.means.detach().numpy())
