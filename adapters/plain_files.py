@@ -147,23 +147,29 @@ def array_of(value: object) -> np.ndarray | None:
 
 
 _IMAGE_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
+_MOST_HEADER = 1 << 18  # bytes, with previews and profiles
 MISSING = "does not exist"
 
 
-def read_image_size(path: Path) -> tuple[int, int] | str:
+def read_image_size(path: Path, *, decode: bool = True) -> tuple[int, int] | str:
     """Width and height of a PNG or JPEG, decoded once to be sure of it (a JPEG at an eighth of its
-    size), or what is wrong with it as the end of a sentence."""
+    size), or what is wrong with it as the end of a sentence. Without decoding its header counts."""
     try:
         with open_file(path) as file:
-            data = file.read()
+            data = file.read(-1 if decode else _MOST_HEADER)
+            size = file.seek(0, 2)
+            file.seek(max(0, size - 64))
+            tail = file.read()
     except FileNotFoundError:
         return MISSING
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     # Decoders fill what is cut off with grey.
-    if not any(data.startswith(start) and end in data[-64:] for start, end in _IMAGE_ENDS):
+    if not any(data.startswith(start) and end in tail for start, end in _IMAGE_ENDS):
         return "is cut short, or neither PNG nor JPEG"
     header = image_header(data)
+    if not decode:
+        return "cannot be decoded" if header is None else (header.width, header.height)
     is_jpeg = header is not None and header.format == "JPEG"
     flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if is_jpeg else cv2.IMREAD_COLOR
     try:

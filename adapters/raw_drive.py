@@ -12,6 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -36,6 +37,7 @@ _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
 _MAX_COLOUR_IMAGES = 150  # of a whole drive: an image every few metres shows all there is
+_MAX_DECODED = 600  # images of a drive that are decoded to check them, some 5 ms each
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
 _MAX_FAULTS = 3  # sentences about one camera's images; more become one
 _MAX_NAMED = 3  # frames that a message lists
@@ -172,13 +174,15 @@ class DriveImages:
 
 
 def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> DriveImages:
-    """The images that are whole and of their camera's size, each decoded once to be sure of it.
+    """The images that are whole and of their camera's size. Up to _MAX_DECODED are decoded once to
+    be sure of it; of more, headers and ends are looked at.
 
     Raises:
         AdapterError: a camera's size is known from no calibration and no image; or, for
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
-        seen = dict(zip(pictures, pool.map(_size_or_fault, pictures), strict=True))
+        look = partial(_size_or_fault, decode=len(pictures) <= _MAX_DECODED)
+        seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
         by_camera[picture.camera].append(picture)
@@ -208,8 +212,8 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
     return DriveImages(paths, sizes, tuple(problems))
 
 
-def _size_or_fault(picture: Picture) -> tuple[int, int] | str:
-    return _NO_FILE if picture.path is None else read_image_size(picture.path)
+def _size_or_fault(picture: Picture, *, decode: bool) -> tuple[int, int] | str:
+    return _NO_FILE if picture.path is None else read_image_size(picture.path, decode=decode)
 
 
 def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:

@@ -9,7 +9,7 @@ from importlib import import_module
 __version__ = "0.5.0"
 
 _PUBLIC = {
-    "augment.views": ("WeatheredView", "render_buffers", "render_view"),
+    "augment.views": ("WeatheredView", "render_buffers", "render_view", "render_views"),
     "augment.jobs.render_job": ("JobResult", "RenderJob", "run_job"),
     "augment.jobs.manifest": ("read_manifest",),
     "augment.cameras": ("Camera", "Frame"),

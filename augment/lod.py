@@ -287,6 +287,11 @@ def _reweighed(finer: Level, g: Gaussians, own: Level) -> Gaussians:
     )
 
 
+def keeps_levels(gaussians: Gaussians) -> bool:
+    """Whether levels lie in a file with these Gaussians."""
+    return memo_of(gaussians).known(_STORED)
+
+
 def join_pieces(pieces: Iterable[Piece]) -> Piece:
     """All pieces in memory."""
     gaussians, stands_for, keys = zip(*pieces, strict=True)

@@ -43,6 +43,7 @@ class Plan:
 
     placed: Mapping[str, Placed]
     settings: RasterSettings
+    prune: float
     buffers: frozenset[str]
     image_buffers: frozenset[str]
     bare_buffers: frozenset[str]
@@ -134,6 +135,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             fog_cut=render.fog_cut,
             lod_px=render.lod_px,
         ),
+        prune=0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune,
         buffers=buffers,
         image_buffers=frozenset(image_buffers),
         bare_buffers=frozenset(bare_buffers),

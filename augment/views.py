@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,12 +18,14 @@ from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
 from augment.jobs.layout import TRUST
-from augment.jobs.processes import choose_backend
+from augment.jobs.processes import choose_backend, renders_on_gpu
 from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
-from augment.render.buffers import AUTO, EXPECTED_DEPTH, RenderOutput
+from augment.prune import prune_parts
+from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
+from augment.render.threads import divided_threads, serves_several, thread_count
 from augment.scene import PosedGaussians, Scene
 from augment.timing import timed
 from augment.trust import trust_mask
@@ -73,6 +77,9 @@ def render_buffers(
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     for own in view.effects:
         layers = own.effect.edit_scene(own, layers, camera)
+    if plan.prune > 0:
+        with timed("prune"):
+            layers = replace(layers, parts=prune_parts(layers.parts, scene, camera, plan.prune))
     drawn = _draw(view, layers, camera)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)
@@ -131,6 +138,8 @@ def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) ->
     z = getattr(raster, by or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:
         return None
+    if z.device.type == "cpu" and not (z.requires_grad or raster.alpha.requires_grad):
+        return torch.from_numpy(np.where(raster.alpha.numpy() >= SURFACE_ALPHA, z.numpy(), 0))
     return torch.where(raster.alpha >= SURFACE_ALPHA, z, 0.0)
 
 
@@ -278,3 +287,73 @@ class PendingView:
             self._view, self._finish = self._finish(), None
         assert self._view is not None
         return self._view
+
+
+# ---- Several views at once -----------------------------------------------------------------------
+# On the CPU some work of a view cannot be divided, and threads that share a view wait for each
+# other: where each has a view of its own, all cores are busy. Every thread has its work space then.
+
+SPACE_OF_SPLAT = 110  # bytes of it
+MAX_SPACE = 1 << 29  # bytes of all beyond the first
+
+
+class ViewPool:
+    """Begins views of a scene, several at once on threads of their own; on a GPU, or where there is
+    one thread, one after the other. ahead: how many may be in flight while more are begun.
+    views: how many there will be at most. Close it, or use it as a context manager.
+    """
+
+    def __init__(self, scene: Scene, backend: str = AUTO, views: int = sys.maxsize) -> None:
+        backend = choose_backend(backend, scene) if backend == AUTO else backend
+        self.ahead, self._threads = int(renders_on_gpu(backend)), None
+        if backend == CPU and serves_several():
+            space = SPACE_OF_SPLAT * sum(map(len, scene.all_gaussians))
+            count = min(views, thread_count(), 1 + MAX_SPACE // space)
+            if count > 1:
+                self.ahead, self._threads = count, divided_threads(count)
+
+    def begin(
+        self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
+    ) -> PendingView:
+        """As the function `begin_view`."""
+        if self._threads is None:
+            return begin_view(scene, camera, recipe, backend=backend)
+        drawn = self._threads.submit(
+            lambda: begin_view(scene, camera, recipe, backend=backend).result()
+        )
+        return PendingView(drawn.result)
+
+    def close(self) -> None:
+        """Begin nothing more; what is being drawn is finished without being waited for."""
+        if self._threads is not None:
+            self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> ViewPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def render_views(
+    scene: Scene, cameras: Sequence[Camera], recipe: Recipe, *, backend: str = AUTO
+) -> Iterator[WeatheredView]:
+    """`render_view` of each of the cameras, in their order and to the same bits; several are drawn
+    at once. The error of a view has a note that names its camera.
+    """
+    with ViewPool(scene, backend, len(cameras)) as pool:
+        begun = deque[tuple[Camera, PendingView]]()
+        for camera in cameras:
+            begun.append((camera, pool.begin(scene, camera, recipe, backend=backend)))
+            if len(begun) > pool.ahead:
+                yield _finished(*begun.popleft())
+        for one in begun:
+            yield _finished(*one)
+
+
+def _finished(camera: Camera, begun: PendingView) -> WeatheredView:
+    try:
+        return begun.result()
+    except Exception as error:
+        error.add_note(f"in the view of camera {camera.name!r} at {camera.timestamp_ns} ns")
+        raise

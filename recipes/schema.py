@@ -169,7 +169,15 @@ class Weather(Closed):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("base", "exposure", "transmittance_stop", "radius_clip_px", "fog_cut", "lod_px")
+    later_fields = (
+        "base",
+        "exposure",
+        "transmittance_stop",
+        "radius_clip_px",
+        "fog_cut",
+        "lod_px",
+        "prune",
+    )
     knobs = (
         Knob(
             "scale",
@@ -188,6 +196,7 @@ class Render(Section):
             tiers={"draft": 0.01, "balanced": 0.01},
         ),
         Knob("fog_cut", (0.02, 0.002, 0.0), "splats behind so much fog are left out", 5.5),
+        Knob("prune", (0.25, 0.15, 0.05, 0.0), "splats that no view would miss are left out", 1.5),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
 
@@ -221,7 +230,12 @@ class Render(Section):
     picture alone is wanted: depth, classes, snow and water are drawn through any smog."""
     lod_px: Number = Field(default=0.0, ge=0, le=64)
     """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
-    this in the picture, pixels; 0 draws all as they are. For scenes of many millions."""
+    this in the picture, pixels, or twice that where they are of one colour; 0 draws all as they
+    are. For scenes of many millions."""
+    prune: Number = Field(default=0.0, ge=0, le=100)
+    """Splats of the background without which no recorded view's mean would change by more than this
+    share of white, in millionths, are left out of views from within 2 m of a recorded one; 0 leaves
+    out none. Found once a scene; of no effect with lod_px or on recorded images."""
 
 
 class Sensor(Section):

@@ -27,7 +27,7 @@ from tools.options import (
     SceneCommand,
     StyleTrainOptions,
 )
-from tools.output import JsonFile, check_local, write_json
+from tools.output import LABELS_OF_STORES, JsonFile, check_local, write_json
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -514,7 +514,7 @@ class LabelsOptions(Command):
         overrides: Change output.labels, categories, min_visibility or on_hidden, as for render.
     """
 
-    out: Positional[Annotated[Path, _local("copy the output here")]]
+    out: Positional[Annotated[Path, _local(LABELS_OF_STORES)]]
     split: tuple[str, ...] = ()
     seed: int = 0
     overrides: Overrides = ()

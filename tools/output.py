@@ -109,6 +109,11 @@ def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) ->
         print_note(f"wrote {path}")
 
 
+LABELS_OF_STORES = (
+    "copy the output here, images too (as by `aws s3 sync URI OUT`), then `climategs labels OUT`"
+)
+
+
 def check_local(out: Path, instead: str) -> Path:
     """Refuse `s3://bucket/path` where a folder is meant: as a path it would be a folder `s3:` here.
 

@@ -52,7 +52,7 @@ from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video, write_rgb
 from tools.export import label_files, mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
-from tools.output import compiling_noted, fill, print_images, print_note
+from tools.output import LABELS_OF_STORES, compiling_noted, fill, print_images, print_note
 
 if TYPE_CHECKING:
     from tools.cli import GenerateOptions, RenderOptions
@@ -233,9 +233,11 @@ def generate_dataset(options: GenerateOptions) -> int:
         print(shares.sentence)
     for uri, why in result.unusable.items():
         print_note(f"cannot be used: {uri}: {why}")
+    firsts = [template.resolve(0) for template in recipes.templates.values()]
     if store.local_dir is not None:
-        firsts = [template.resolve(0) for template in recipes.templates.values()]
         _write_labels(store.local_dir, firsts, result.written + result.skipped)
+    elif any(recipe.output.label_formats for recipe in firsts):
+        print_note(f"note: labels for trainers need the images on this machine; {LABELS_OF_STORES}")
     print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
     return 1 if result.failed or result.unusable else 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from augment.jobs.files import (
 from augment.jobs.layout import path_kinds, variant_name
 from augment.jobs.processes import choose_backend
 from augment.jobs.quality import resolve_quality
-from augment.jobs.worker import Renderer, default_renderer
+from augment.jobs.worker import Renderer
 from augment.memo import memo_of
 from augment.render.buffers import CUDA
 from augment.scene import Scene
@@ -101,7 +101,7 @@ class SceneDataset(Dataset):
             with_digest(recipe), scene, backend=self._backend, renderer=renderer
         )
         self.recipe = chosen.recipe
-        self._renderer = renderer or default_renderer()
+        self._renderer = renderer
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)
         check_photos([self.recipe], scene.name, selection)
@@ -119,14 +119,30 @@ class SceneDataset(Dataset):
         return len(self._items)
 
     def __getitem__(self, index: int) -> Any:
-        sample = self._render(*self._items[check_index(index, len(self))])
-        return sample if self.transform is None else self.transform(sample)
+        return self.__getitems__([index])[0]
 
-    def _render(self, frame: Frame, name: str) -> Sample:
-        recipe, origin_m = self.recipe, self._index.world_origin_m
+    def __getitems__(self, indices: Sequence[int]) -> list[Any]:
+        """The samples of a batch, as a DataLoader asks for them; their views are drawn at once."""
+        items = [self._items[check_index(index, len(self))] for index in indices]
+        views = self._views([frame.cameras[name] for frame, name in items])
+        transform = self.transform or (lambda sample: sample)
+        return [
+            transform(self._sample(frame, name, view))
+            for (frame, name), view in zip(items, views, strict=True)
+        ]
+
+    def _views(self, cameras: Sequence[Camera]) -> Iterator[Any]:
         if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
             raise BackendUnavailable(_FORKED)
-        view = self._renderer(self.scene, frame.cameras[name], recipe, backend=self._backend)
+        if self._renderer is None:
+            from augment.views import render_views  # which brings the rasteriser
+
+            return render_views(self.scene, cameras, self.recipe, backend=self._backend)
+        own = {"backend": self._backend}
+        return (self._renderer(self.scene, camera, self.recipe, **own) for camera in cameras)
+
+    def _sample(self, frame: Frame, name: str, view: View) -> Sample:
+        recipe, origin_m = self.recipe, self._index.world_origin_m
         camera = frame.cameras[name].scaled(recipe.render.scale)
         check_view(view, camera, recipe)
         view, labels = self._label(frame, camera, view)

@@ -11,6 +11,7 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
+from augment.prune import share_changes
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
@@ -38,6 +39,8 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
     for effect in EFFECTS:
         if effect.shares_files or not only_files:
             effect.share(job)
+    if not only_files and any(recipe.render.prune > 0 for recipe in job.recipes):
+        share_changes(job.scene)
 
 
 def add_effect(effect: Effect) -> None:

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -258,15 +258,6 @@ def default_renderer() -> Renderer:
     return render_view
 
 
-def job_renderer(backend: str) -> Renderer:
-    """The library's own for a job: on a GPU it begins views and does not wait for them. On the CPU
-    a begun view would be a finished one, whose files would come a view too late.
-    """
-    from augment.views import begin_view, render_view
-
-    return begin_view if renders_on_gpu(backend) else render_view
-
-
 @dataclass(frozen=True, eq=False)
 class _Drawn:
     """An image that is drawn, or begun. camera: as written. lidar: of `_pass_lidar`."""
@@ -278,8 +269,9 @@ class _Drawn:
 
 
 class FrameRunner:
-    """Renders chunks in this thread, writes on others, and gives `deliver` each image from the
-    writing threads, once its files are on the disk. Where the renderer returns pending views, the
+    """Renders chunks, writes on other threads, and gives `deliver` each image from the writing
+    threads, once its files are on the disk. The library's own renderer draws several views at once
+    (`augment.views.ViewPool`), handed over in their order. Where another returns pending views, the
     next is begun before the last is waited for, so that a GPU has work while pictures come back. An
     error of the scene or the renderer concerns one image; an OutputError or GpuLost ends the run.
     """
@@ -295,41 +287,49 @@ class FrameRunner:
     ) -> None:
         self._cameras = {f.index: f.cameras for f in frames}
         self._scene, self._setup = scene, setup
-        self._renderer = renderer or job_renderer(setup.backend)
+        self._views = None
+        if renderer is None:
+            from augment.views import ViewPool  # which brings the rasteriser
+
+            self._views = ViewPool(scene, setup.backend)
+            renderer = self._views.begin
+        self._renderer: Renderer = renderer
+        self._ahead = 1 if self._views is None else self._views.ahead
         self._deliver, self._pump = deliver, pump
         self._boxes: dict[int, Boxes] = {}  # of the frames so far
         self._reading_boxes = threading.Lock()
         self._warned: set[str] = set()  # variants of which a sweep could not be weathered
-        self._in_flight: tuple[_Drawn, Pending] | None = None
+        self._in_flight: deque[tuple[_Drawn, Pending]] = deque()
         self._times, self._started = WorkTimes(), time.perf_counter()
 
     def run(self, chunk: Chunk) -> None:
-        """Render the chunk's images. The last may stay in flight until `land` or the next one."""
+        """Render the chunk's images. The last may stay in flight until `close` or later ones."""
         recipe = self._setup.recipes[chunk.variant]
         lidar = self._submit(lambda: self._pass_lidar(chunk, recipe))
         for name in chunk.cameras:
             self._render(chunk, recipe, name, lidar)
 
-    def land(self) -> None:
-        """Wait for the view in flight, if there is one, and hand it over."""
-        if self._in_flight is None:
-            return
-        drawn, pending = self._in_flight
+    def _land(self) -> None:
+        """Wait for the first view in flight and hand it over."""
+        drawn, pending = self._in_flight[0]
         try:
             with self._times.spent(RENDER, AWAIT):
                 view = pending.result()
         except Exception as error:
-            self._in_flight = None
+            self._in_flight.popleft()
             self._fail(drawn.chunk, drawn.camera.name, error)
             return
-        self._in_flight = None  # no sooner: what an interrupt finds in flight is left to `close`
+        self._in_flight.popleft()  # no sooner: what an interrupt finds in flight is left to `close`
         self._hand_over(drawn, view)
 
     def close(self) -> dict[str, float]:
         """Wait for the writes; raises what stopped them. Returns the seconds by `times`' kinds."""
         try:
-            self.land()
+            while self._in_flight:
+                self._land()
         finally:
+            if self._views is not None:
+                self._views.close()
             with self._times.spent(HELD):
                 self._pump.close()
         seconds = time.perf_counter() - self._started
@@ -347,8 +347,9 @@ class FrameRunner:
             return
         drawn = _Drawn(chunk, recipe, camera.scaled(recipe.render.scale), lidar)
         if isinstance(view, Pending):
-            self.land()
-            self._in_flight = drawn, view
+            self._in_flight.append((drawn, view))
+            while len(self._in_flight) > self._ahead:
+                self._land()
         else:
             self._hand_over(drawn, view)
 
@@ -365,6 +366,7 @@ class FrameRunner:
         _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=error)
         message = describe(error, "rendering")
         if gpu_is_lost(self._setup.backend):
+            self._in_flight.clear()
             raise GpuLost(
                 f"the GPU no longer answers this process since frame {chunk.frame}, camera {name} "
                 f"({message}); start the same again to go on from there"

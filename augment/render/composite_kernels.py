@@ -94,6 +94,11 @@ def composite_cubemap(
         bz = rotation[2, 1] * v + rotation[2, 2]
         colors, alphas, target = rgb[i], alpha[i], out[i]
         for first in range(U(0), U(width), U(_AHEAD)):
+            if not _shows_sky(alphas, first, min(first + U(_AHEAD), U(width))):
+                for j in range(first, min(first + U(_AHEAD), U(width))):
+                    for c in range(U(3)):
+                        target[j, c] = colors[j, c]
+                continue
             for k in range(U(0), U(_AHEAD), U(LANES)):
                 u = v8.splat(np.float32(first + k)) + v8.lane_numbers()
                 u = (u + v8.splat(half) - v8.splat(cx)) * v8.splat(ifx)
@@ -126,6 +131,15 @@ def composite_cubemap(
                         air = airlight[c] + gain * varying[c]
                         color = visible * color + (one - visible) * air
                     target[j, c] = colors[j, c] + transmittance * color
+
+
+@inner()
+def _shows_sky(alphas, first, end):
+    """Whether anything behind shines through one of the pixels, or might: alpha is NaN."""
+    shows = False
+    for j in range(first, end):
+        shows = shows or alphas[j] != np.float32(1)
+    return shows
 
 
 _AHEAD = 64  # pixels whose places in the cube map are found before they are read

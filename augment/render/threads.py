@@ -1,4 +1,5 @@
-"""The threads that numba's kernels run on: TBB, which survives fork and serves several callers.
+"""The threads that numba's kernels run on: TBB, which survives fork and serves several callers; and
+threads that draw one view each.
 
 numba's own choice is often OpenMP, which kills DataLoader workers forked after the parent has
 rendered. pip puts TBB's library where the loader does not look, so it is loaded by its path first.
@@ -18,10 +19,12 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numba
+import torch
 from torch.utils.data import get_worker_info
 
 logger = logging.getLogger(__name__)
@@ -106,6 +109,35 @@ def thread_count() -> int:
     if limit is None:
         limit = usable_cores() if get_worker_info() is None else 1
     return min(limit, numba.get_num_threads())
+
+
+def serves_several() -> bool:
+    """Whether several threads of this process can run kernels at the same time."""
+    return select_thread_pool() != _ONE_CALLER
+
+
+def divided_threads(count: int) -> ThreadPoolExecutor:
+    """`count` threads for whole tasks, that divide what `thread_count` gives to the calling one."""
+    total, torch_threads = thread_count(), torch.get_num_threads()
+    started = threading.Barrier(count + 1)
+
+    def start(number: int) -> None:
+        share = max(1, total // count + (number < total % count))
+        numba.set_num_threads(share)  # both are settings of this thread
+        torch.set_num_threads(min(share, torch_threads))
+        started.wait()
+
+    pool = ThreadPoolExecutor(count, thread_name_prefix="view")
+    try:
+        for number in range(count):  # each takes one: it holds its thread until all have
+            pool.submit(start, number)
+        started.wait()
+    except BaseException:
+        started.abort()
+        pool.shutdown(wait=False)
+        raise
+    torch.set_num_threads(torch_threads)  # torch gives new threads the number that was set last
+    return pool
 
 
 def limit_threads(count: int | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from adapters.recording.from_colmap import record_colmap
 from augment.errors import AdapterError
 
 pytest.importorskip("pycolmap")
+KITTI = Path(__file__).parents[2] / "../shared/data/kitti_raw_seq/2011_09_26/image_02/data"
 FRAMES, HEIGHT_M, STEP_M = 8, 1.5, 1.2
 WIDTH, HEIGHT, FOCAL, RADIAL = 160, 100, 110.0, -0.08
 # The model's world: another unit, turned and moved.
@@ -145,6 +147,47 @@ def test_images_lose_their_distortion_and_depth_lies_between_the_points(project,
     # A lane of points every half a metre, on a plane that is right to a centimetre.
     error = np.abs(depth[near] / ground[near] - 1)
     assert np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.05
+
+
+def test_a_radial_lens_without_distortion_keeps_its_images(tmp_path, monkeypatch):
+    """As COLMAP is told by the guide: SIMPLE_RADIAL with its last number 0, and not refined."""
+    monkeypatch.setattr(sys.modules[__name__], "RADIAL", 0.0)
+    write_model(tmp_path / "plain")
+    out = tmp_path / "out"
+    record(tmp_path / "plain", out, camera_height_m=HEIGHT_M)
+    for frame in range(FRAMES):
+        recorded = tmp_path / f"plain/frames/{frame:06d}.jpg"
+        assert (out / f"images/camera/{frame:06d}.jpg").read_bytes() == recorded.read_bytes()
+    camera = json.loads((out / "calibration.json").read_text())["frames"][0]["cameras"]["camera"]
+    expected = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL}
+    assert expected.items() <= camera.items()
+    assert (camera["cx"], camera["cy"]) == (WIDTH / 2, HEIGHT / 2)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not KITTI.is_dir(), reason="no KITTI frames here")
+def test_four_frames_of_a_queue_are_refused(tmp_path):
+    """0.6 m of KITTI, with poses as the guide has them made: the road has too few points."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="SIMPLE_RADIAL", camera_params="721.54,621,187.5,0"
+    )
+    database, images = tmp_path / "colmap.db", KITTI
+    pycolmap.extract_features(
+        database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
+    )
+    pycolmap.match_sequential(database)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.mapper.init_max_forward_motion = 1.0
+    options.mapper.init_min_tri_angle = 2.0
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    (tmp_path / "sparse").mkdir()
+    pycolmap.incremental_mapping(database, images, tmp_path / "sparse", options)
+    refused = "no road is seen|no road is clear|moved by|holds no COLMAP model"
+    with pytest.raises(AdapterError, match=refused):
+        record_colmap(tmp_path, images, tmp_path / "out", fps=10.0, camera_height_m=1.65)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("kind", ["metres", "degrees"])

@@ -28,6 +28,7 @@ from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
 from adapters.procedural import StreetLabels
+from adapters.raw_drive import Picture, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.uri import SCHEMES
@@ -91,6 +92,29 @@ CODES = np.array(
     [UNCHANGED, UNCHANGED, ATTENUATED, LOST, MOVED, SCATTERED, PRECIPITATION], np.uint8
 )
 PANOPTIC = "panoptic/v1.0-mini/0_panoptic.npz"
+
+
+def test_images_of_long_drives_are_checked_by_header_and_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (48, 64, 3)))[1]
+    whole, damaged = image.tobytes(), bytearray(image.tobytes())
+    del damaged[150:-2]  # in its tables: no decoder makes a picture of it
+    (tmp_path / "small.jpg").write_bytes(cv2.imencode(".jpg", np.zeros((9, 9, 3)))[1].tobytes())
+    for name, data in {"a": whole, "b": whole, "cut": whole[:-200], "torn": bytes(damaged)}.items():
+        (tmp_path / f"{name}.jpg").write_bytes(data)
+    names = ["a", "b", "cut", "small", "torn", "none"]
+    pictures = [Picture("front", i, tmp_path / f"{n}.jpg") for i, n in enumerate(names)]
+    sure = usable_images(pictures)
+    assert [n for n, own in sure.paths.items() if own] == [0, 1] and sure.sizes["front"] == (64, 48)
+    monkeypatch.setattr("adapters.raw_drive._MAX_DECODED", 5)
+    quick = usable_images(pictures)
+    assert quick.paths == sure.paths and quick.sizes == sure.sizes
+    damaged = bytearray(whole)
+    damaged[-400:-2] = b"\xff\xc4" * 199  # behind its header
+    (tmp_path / "torn.jpg").write_bytes(bytes(damaged))
+    assert quick.problems[0].startswith("camera front, frame 2: ")
+    assert 4 in [n for n, own in usable_images(pictures).paths.items() if own]
 
 
 def _pandaset(root: Path) -> PandaSetLabels:

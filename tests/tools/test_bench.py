@@ -166,10 +166,13 @@ def test_dataset_measures_reading_rendering_and_a_large_manifest():
 def test_jobs_measures_machinery_a_long_job_and_opening():
     scene = "procedural:street?seed=3&frames=2&gaussians=60000"
     size = {"variants": 2, "images": 8, "gaussians": 500, "workers": (), "memory": False}
-    result = jobs.measure(case=jobs.JobsCase(scene, 0.05, **size), repeats=1)
-    compared, long, opened = check_figures(result).values()
+    rig = {"rig": scene, "rig_scale": 0.05}
+    result = jobs.measure(case=jobs.JobsCase(scene, 0.05, **size, **rig), repeats=1)
+    compared, rigs, long, opened = check_figures(result).values()
     assert [name for name, *_ in compared] == [jobs.BARE, "generate, this process"]
     assert all(ms > 0 for _, ms, *_ in (*compared, *opened)) and compared[0][-1] == 1
+    assert [weather for weather, *_ in rigs] == [*jobs.RIG_WEATHERS]
+    assert all(value > 0 for _, *times, _, _ in rigs for value in times)
     assert dict(long)["images"] == 8 and dict(long)["blocks"] == 1
     assert len(opened) == 4 and all(mib > 0 for _, _, mib, _ in opened)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import shutil
 import signal
 import subprocess
@@ -13,9 +12,9 @@ from pathlib import Path
 
 import cv2
 import numba
+import numpy as np
 import pytest
 import torch
-from batch_scenes import FakeLabels
 from fitted_scenes import assert_same, fitted_scene
 from streets import open_street
 
@@ -25,6 +24,7 @@ from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.files.ply import write_ply
 from augment.files.scene_file import load_scene_parts, save_scene
 from augment.jobs.manifest import read_manifest
+from augment.labels import Boxes
 from augment.scene import Gaussians, Scene
 from recipes.schema import Output, Recipe
 from recipes.style import style_preset_names
@@ -159,14 +159,14 @@ def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
 def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
     import augment.views
 
-    real = augment.views.render_view
+    real = augment.views.begin_view
 
     def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
         if camera.timestamp_ns > 0:
             raise RuntimeError("no light")
         return real(scene, camera, recipe, backend=backend)
 
-    monkeypatch.setattr(augment.views, "render_view", breaks_on_the_second_frame)
+    monkeypatch.setattr(augment.views, "begin_view", breaks_on_the_second_frame)
     out = tmp_path / "out"
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
     streams = capsys.readouterr()
@@ -242,6 +242,9 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
     ):
         assert main(arguments) == 2
         assert "is not on this machine" in capsys.readouterr().err
+    assert main(["labels", "s3://bucket/path"]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "copy the output here, images too (as by `aws s3 sync URI OUT`), then" in error
 
 
 def test_style_presets_are_listed_and_printed(capsys):
@@ -315,9 +318,10 @@ def test_labels_for_trainers_are_explained(scene, monkeypatch, tmp_path):
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["labels"]["files"] == ["labels/coco/instances_train.json"]
     assert "labels/coco/instances_train.json" in page and "none: the scene has no boxes" in page
-    boxed = dataclasses.replace(scene, labels=FakeLabels())
-    _, page = explained(monkeypatch, tmp_path, boxed, recipe, times=False)
-    assert re.search(r"\n  \w+: \d+ boxes of \d+ objects, of which images get those that", page)
+    box = Boxes(("a",), ("Car",), np.zeros((1, 3)), np.ones((1, 3)), np.eye(1, 4), {})
+    monkeypatch.setattr(Scene, "boxes", lambda _scene, _frame: box)
+    _, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
+    assert "\n  Car: 2 boxes of 1 objects, of which images get those that a pixel shows" in page
     assert "where the weather leaves less than 0.2 of an object, it is left out" in page
     facts, page = explained(monkeypatch, tmp_path, scene, "{}\n", times=False)
     assert facts["labels"] is None and "for trainers" not in page

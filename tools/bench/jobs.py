@@ -1,4 +1,5 @@
-"""What jobs cost beside bare rendering, a job of 10,000 images, and opening scenes.
+"""What jobs cost beside bare rendering, a rig's views drawn at once, a job of 10,000 images, and
+opening scenes.
 
 Claims, progress logs, durable files, publishing and the manifest are compared with a loop that
 renders, encodes and writes the same images; the long job draws nothing, so that the rest is left.
@@ -34,7 +35,7 @@ from augment.jobs.manifest import compact
 from augment.jobs.store import open_store
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from augment.views import WeatheredView, render_view
+from augment.views import WeatheredView, render_view, render_views
 from recipes.job import Job, JobRecipes
 from recipes.load import load_recipe, parse_recipe
 from recipes.schema import Recipe
@@ -48,20 +49,29 @@ from tools.bench.harness import (
     median_ms,
     peak_mib_in_subprocess,
     rounds,
+    spread_ratio,
     status_mib,
 )
-from tools.bench.scenes import RasterCase, random_scene, street_uri
+from tools.bench.scenes import RasterCase, random_scene, recipe_of, street_uri
 
 # Labels and LiDAR are left out of the comparison: they are work that bare rendering does not do.
 PLAIN = {"output.labels": False, "output.lidar": False}
 BLOCK_IMAGES = 12  # several variants in small blocks: both workers have work to the end
 BARE = "a loop: render, encode, write"
+ONE_BY_ONE, AT_ONCE = "one by one", "at once"
+RIG_WEATHERS = {
+    "clean": {},
+    "smog, 50 m": {"smog": {"visibility_m": 50}},
+    "snow": {"snow": {"depth_m": 0.1}},
+    "flood": {"flood": {"level_m": 0.15}},
+}
 TINY_CAMERAS, TINY_PERIOD_NS = ("front", "rear"), 100_000_000
 
 
 @dataclass(frozen=True)
 class JobsCase:
-    """scene, scale, variants: of the images in fog that are compared. images: of the long job.
+    """scene, scale, variants: of the images in fog that are compared. rig: a scene whose frame has
+    several cameras; rig_scale: of their images. images: of the long job.
     gaussians: of the scene that is opened, SH of degree 3. workers: processes of the jobs that are
     compared. memory: whether it is measured.
     """
@@ -69,6 +79,8 @@ class JobsCase:
     scene: str = "procedural:street?seed=3&frames=4&width=1600&height=1066"
     scale: float = 1.0
     variants: int = 3
+    rig: str = street_uri()
+    rig_scale: float = 1.0
     images: int = 10_000
     gaussians: int = 1_000_000
     workers: tuple[int, ...] = (1, 2)
@@ -76,7 +88,9 @@ class JobsCase:
 
 
 WHOLE = JobsCase()
-QUICK = JobsCase("procedural:street?seed=3&frames=4", 0.1, images=500, gaussians=50_000)
+QUICK = JobsCase(
+    "procedural:street?seed=3&frames=4", 0.1, rig_scale=0.2, images=500, gaussians=50_000
+)
 
 
 def measure(
@@ -87,6 +101,7 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         folder = Path(name)
         compared = _compare(case, folder, repeats)
+        rig = _measure_rig(case, max(repeats, 5))
         long = _run_long_job(case.images, folder / "long")
         opened = _open_files(case, scene, folder, repeats)
     tables = [
@@ -95,6 +110,12 @@ def measure(
             ("what", "ms an image", "rounds differ by", "images/s", "to bare"),
             compared,
             "without starting workers, opening scenes and loading kernels",
+        ),
+        Table(
+            "A frame's cameras drawn at once",
+            ("weather", "ms one by one", "ms at once", "to one by one", "MiB one by one", "MiB"),
+            rig,
+            "8-bit images, one held at a time; MiB: at the highest moment, beyond the scene",
         ),
         Table("A long job of tiny images, one process", ("what", "value"), [*long.items()]),
         Table(
@@ -196,6 +217,44 @@ def _job(
     given = WorkSetup(str(out), None, "auto", **{"open_scene": open_scene, **setup})
     scenes = [job.scenes[0].model_copy(update={"uri": uri})]
     return GenerateJob(JobRecipes(job, {template.name: template}), scenes, given)
+
+
+# ---- a rig --------------------------------------------------------------------------------------
+
+
+def _measure_rig(case: JobsCase, repeats: int) -> list[tuple]:
+    rows, scene, both = [], open_scene(case.rig), (ONE_BY_ONE, AT_ONCE)
+    for weather in RIG_WEATHERS:
+        seconds = rounds({w: _rig_of(scene, case.rig_scale, weather, w) for w in both}, repeats)
+        single, together = (seconds[way] for way in both)
+        given = (case.rig, case.rig_scale, weather)
+        memory = [
+            peak_mib_in_subprocess(_opened_rig, (*given, way)) if case.memory else None
+            for way in both
+        ]
+        ratio = spread_ratio(together, single)["median"]
+        rows.append((weather, median_ms(single), median_ms(together), ratio, *memory))
+    return rows
+
+
+def _rig_of(scene: Scene, scale: float, weather: str, way: str) -> Action:
+    """Draws the cameras of the first frame."""
+    recipe = recipe_of(RIG_WEATHERS[weather])
+    cameras = [camera.scaled(scale) for camera in scene.frames[0].cameras.values()]
+
+    def draw() -> None:
+        views = (render_view(scene, camera, recipe) for camera in cameras)
+        for _ in render_views(scene, cameras, recipe) if way == AT_ONCE else views:
+            pass
+
+    return draw
+
+
+def _opened_rig(uri: str, scale: float, weather: str, way: str) -> Action:
+    """In a process that has drawn the cameras small, so that it holds kernels and the snow."""
+    scene = open_scene(uri)
+    _rig_of(scene, 0.1 * scale, weather, ONE_BY_ONE)()
+    return _rig_of(scene, scale, weather, way)
 
 
 # ---- a long job of tiny images ------------------------------------------------------------------

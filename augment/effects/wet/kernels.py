@@ -5,14 +5,16 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 
 from augment.kernels import mix
+from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner, kernel
-from augment.render.layout import U
+from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
+from augment.render.layout import LANES, U
 from augment.rng import STEP_X, STEP_Y
 
 # Channels of the ground's map.
@@ -87,88 +89,187 @@ def rings_at(x, y, footprint, rings, seed, timestamp_ns, drops):
     return sx * shown, sy * shown, variance
 
 
-# ---- Which pixels show open ground ---------------------------------------------------------------
-
-NEAR_OFF, NEAR_PER_M = 0.08, 0.003  # metres off the ground's height that a pixel surely may be
-FAR_OFF, FAR_PER_M = 0.2, 0.008  # and where it is something else
-FAINT = 0.004  # shares below this are none
+# ---- Eight pixels at a time ----------------------------------------------------------------------
 
 
-class View(NamedTuple):
-    """lens: fx, fy, cx, cy. pose: world_from_camera [3, 4]. corner: of the map, x and y. cell_m."""
+@inner()
+def _splat(number):
+    return v8.splat(np.float32(number))
 
-    lens: np.ndarray
-    pose: np.ndarray
-    corner: np.ndarray
-    cell_m: float
+
+@inner()
+def _clamp(value, low, high):
+    """low where it is NaN."""
+    return v8.minimum(v8.maximum(value, _splat(low)), _splat(high))
+
+
+@inner()
+def _line(value, slope, offset):
+    return v8.fmuladd(value, _splat(slope), _splat(offset))
 
 
 @inner()
 def _smoothstep(t):
     """From 0 at t = 0 to 1 at 1."""
-    t = min(max(t, 0.0), 1.0)
-    return t * t * (3.0 - 2.0 * t)
+    t = _clamp(t, 0.0, 1.0)
+    return t * t * _line(t, -2.0, 3.0)
 
 
 @inner()
-def _place(x, y, corner, per_cell, rows, columns):
-    """(is it in the map, index of the texel below left, shares to the right and up)."""
-    u, v = (x - corner[0]) * per_cell - 0.5, (y - corner[1]) * per_cell - 0.5
-    inside = u >= 0.0 and v >= 0.0 and u <= columns - 1 and v <= rows - 1
-    if not inside:
-        return False, U(0), 0.0, 0.0
-    i, j = min(np.int64(u), columns - 2), min(np.int64(v), rows - 2)
-    return True, U(j * columns + i), u - i, v - j
+def _dot(x, y, z, a, b, c):
+    return v8.fmuladd(x, a, v8.fmuladd(y, b, z * c))
 
 
 @inner()
-def _between(flat, at, columns, channel, u, v):
-    channel, below = U(channel), at + U(columns)
-    a = flat[at, channel] + (flat[at + U(1), channel] - flat[at, channel]) * u
-    b = flat[below, channel] + (flat[below + U(1), channel] - flat[below, channel]) * u
-    return a + (b - a) * v
+def _turn(row, x, y, z):
+    """A row of a matrix times vectors."""
+    return _dot(x, y, z, v8.splat(row[0]), v8.splat(row[1]), v8.splat(row[2]))
 
 
 @inner()
-def _find_in_row(row, view, depth, shown, flat, rows, columns, share, most):
-    lens, pose, corner, per_cell = view.lens, view.pose, view.corner, 1.0 / view.cell_m
-    b, per_focal = (row + 0.5 - lens[3]) / lens[1], 1.0 / lens[0]
-    best = np.float32(0)
-    for x in range(depth.shape[1]):
-        share[row, x] = np.float32(0)
-        z = np.float64(depth[row, x])
-        if not (z > 0.0 and shown[row, x] > 0):
+def _across(first, lens):
+    """x at unit depth of the pixels from column `first` on. lens: 1 / fx, 1 / fy, cx, cy."""
+    middle = v8.splat(np.float32(first) + np.float32(0.5) - lens[2])
+    return (middle + v8.lane_numbers()) * v8.splat(lens[0])
+
+
+@inner()
+def _any(mask):
+    return v8.mask_bits(mask) != U(0)
+
+
+@inner()
+def _store_places(places, spare, u, v, i, j):
+    """Texels of float coordinates, column and row, and shares of the way to the next ones."""
+    v8.store_whole(places, U(0), i)
+    v8.store_whole(places, U(LANES), j)
+    v8.store(spare, U(0), u - i)
+    v8.store(spare, U(LANES), v - j)
+
+
+# ---- Which pixels show open ground ---------------------------------------------------------------
+# In the loops over pixels tuples hold numbers alone: numba counts references to arrays of records,
+# which takes longer than the arithmetic. `spare` is what lanes are handed over in: shares of the
+# way to the next texels, then, from OUT on, results.
+
+NEAR_OFF, NEAR_PER_M = 0.08, 0.003  # metres off the ground's height that a pixel surely may be
+FAR_OFF, FAR_PER_M = 0.2, 0.008  # and where it is something else
+FAINT = 0.004  # shares below this are none
+OUT, SPARE = 2 * LANES, 8 * LANES
+
+
+class View(NamedTuple):
+    """lens: 1 / fx, 1 / fy, cx, cy. axes [3, 3]: world_from_camera. eye [8]: its column and row in
+    the map, from the first cell's middle on, cells per metre, z; its columns and rows in the coarse
+    and in the fine mottle, less whole turns. place: its x and y, float64. rows, columns: of the
+    map, 2 at least. `_read_view` makes tuples of the arrays.
+    """
+
+    lens: Any
+    axes: Any
+    eye: Any
+    place: Any
+    rows: Any
+    columns: Any
+
+
+@inner()
+def _read_view(view):
+    lens, eye = view.lens, view.eye
+    return View(
+        (lens[0], lens[1], lens[2], lens[3]),
+        _read_matrix(view.axes),
+        (eye[0], eye[1], eye[2], eye[3], eye[4], eye[5], eye[6], eye[7]),
+        (view.place[0], view.place[1]),
+        view.rows,
+        view.columns,
+    )
+
+
+@inner()
+def _read_matrix(m):
+    return ((m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2]))
+
+
+@inner()
+def _find_cells(px, py, view, places, spare):
+    """Whether points from the eye lie on the map; finds the cells below left of them."""
+    eye, zero, per_m = view.eye, _splat(0), v8.splat(view.eye[2])
+    u, v = v8.fmuladd(px, per_m, v8.splat(eye[0])), v8.fmuladd(py, per_m, v8.splat(eye[1]))
+    inside = v8.both(v8.at_least(u, zero), v8.at_least(_splat(view.columns - 1), u))
+    inside = v8.both(inside, v8.at_least(v, zero))
+    inside = v8.both(inside, v8.at_least(_splat(view.rows - 1), v))
+    i, j = v8.floor(_clamp(u, 0, view.columns - 2)), v8.floor(_clamp(v, 0, view.rows - 2))
+    _store_places(places, spare, u, v, i, j)
+    return inside
+
+
+@inner()
+def _look_up(cells, columns, channel, count, places, spare):
+    """spare[OUT + k LANES + lane]: `count` channels from `channel` on, between the map's cells."""
+    step, down = U(CHANNELS), U(columns * CHANNELS)
+    for lane in range(U(LANES)):
+        first = U(places[lane + U(LANES)]) * down + U(places[lane]) * step + U(channel)
+        u, v = spare[lane], spare[lane + U(LANES)]
+        for k in range(U(count)):
+            at = first + k
+            a = cells[at] + (cells[at + step] - cells[at]) * u
+            at += down
+            b = cells[at] + (cells[at + step] - cells[at]) * u
+            spare[U(OUT) + k * U(LANES) + lane] = a + (b - a) * v
+
+
+@inner()
+def _find_in_row(row, width, view, cells, depth, shown, share):
+    view = _read_view(view)
+    lens, axes = view.lens, view.axes
+    places, spare = np.empty(2 * LANES, np.int32), np.empty(SPARE, np.float32)
+    zero, one, half = _splat(0), _splat(1), np.float32(0.5)
+    down = (np.float32(row) + half - lens[3]) * lens[1]
+    b, best = v8.splat(down), zero
+    for x in range(U(row * width), U((row + 1) * width)):
+        share[x] = np.float32(0)
+    left, right = (half - lens[2]) * lens[0], (np.float32(width) - half - lens[2]) * lens[0]
+    level = axes[2][1] * down + axes[2][2]
+    if min(axes[2][0] * left, axes[2][0] * right) + level >= np.float32(0):
+        return np.float32(0)
+    for j in range(0, width, LANES):
+        first = min(j, width - LANES)  # the last eight of a row take those before them
+        pixel = U(row * width + first)
+        z, own, a = v8.load(depth, pixel), v8.load(shown, pixel), _across(first, lens)
+        rise = _turn(axes[2], a, b, one)
+        falls = v8.both(v8.greater(z, zero), v8.greater(own, zero))
+        falls = v8.both(falls, v8.greater(zero, rise))
+        if not _any(falls):
             continue
-        a = (x + 0.5 - lens[2]) * per_focal
-        rise = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
-        if not rise < 0.0:
+        px, py, pz = z * _turn(axes[0], a, b, one), z * _turn(axes[1], a, b, one), z * rise
+        falls = v8.both(falls, _find_cells(px, py, view, places, spare))
+        if not _any(falls):
             continue
-        px = pose[0, 3] + z * (pose[0, 0] * a + pose[0, 1] * b + pose[0, 2])
-        py = pose[1, 3] + z * (pose[1, 0] * a + pose[1, 1] * b + pose[1, 2])
-        inside, at, u, v = _place(px, py, corner, per_cell, rows, columns)
-        if not inside:
-            continue
-        open_ = _between(flat, at, columns, OPEN, u, v)
-        if not open_ > FAINT:
-            continue
-        off = abs(pose[2, 3] + z * rise - _between(flat, at, columns, HEIGHT, u, v))
-        distance = z * math.sqrt(1.0 + a * a + b * b)
-        near, far = NEAR_OFF + NEAR_PER_M * distance, FAR_OFF + FAR_PER_M * distance
-        s = shown[row, x] * open_ * (1.0 - _smoothstep((off - near) / (far - near)))
-        if s > FAINT:
-            share[row, x] = np.float32(s)
-            best = max(best, np.float32(s))
-    most[row] = best
+        _look_up(cells, view.columns, HEIGHT, 2, places, spare)
+        off = v8.absolute(pz + v8.splat(view.eye[3]) - v8.load(spare, U(OUT)))
+        distance = z * v8.sqrt(_dot(a, b, one, a, b, one))
+        near = _line(distance, NEAR_PER_M, NEAR_OFF)
+        gap = _line(distance, FAR_PER_M - NEAR_PER_M, FAR_OFF - NEAR_OFF)
+        own = own * v8.load(spare, U(OUT + LANES)) * (one - _smoothstep((off - near) / gap))
+        own = v8.select(v8.both(falls, v8.greater(own, _splat(FAINT))), own, zero)
+        v8.store(share, pixel, own)
+        best = v8.maximum(best, own)
+    v8.store(spare, U(0), best)
+    most = spare[0]
+    for lane in range(1, LANES):
+        most = max(most, spare[lane])
+    return most
 
 
 @kernel
-def find_ground(view, depth, shown, flat, rows, columns, share, most):
-    """share [H, W]: of each pixel that is open ground; most [H]: of a row's pixels.
+def find_ground(view, cells, width, depth, shown, share, most):
+    """share [H W]: of each pixel that is open ground; most [H]: of a row's pixels.
 
-    flat [rows columns, CHANNELS]: the map, of 2 by 2 cells at least.
+    cells: the map, flat, CHANNELS of each cell. depth, shown: [H W]. W >= LANES.
     """
-    for y in prange(depth.shape[0]):
-        _find_in_row(np.int64(y), view, depth, shown, flat, rows, columns, share, most)
+    for y in prange(most.size):
+        most[y] = _find_in_row(np.int64(y), width, view, cells, depth, shown, share)
 
 
 # ---- What the film mirrors -----------------------------------------------------------------------
@@ -183,232 +284,305 @@ FINE_M, COARSE_M = 0.012, 0.2  # its texels
 FINE, COARSE = 0.07, 0.05  # by how much of the film
 LEVELS = 9  # of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels
 FARTHEST_M = 1e5  # stands for the sky
-# Steps of the table of reflectance, and the largest deviation of slopes in it.
-COSINES, ROUGHNESSES, ROUGHEST = 512, 64, 0.4
-TABLE = 1024  # steps of the tables of the display's encoding
+RUN = 6144  # numbers that a thread decodes at a time
+_LEAST = 1e-6  # what 1 - cosine is at least
+_PER_ROW = np.array([0.5 ** max(k - 1, 0) for k in range(LEVELS)], np.float32)
 
 
 class Mirrored(NamedTuple):
-    """lens, rotation [3, 3] (camera_from_world): of the mirrored camera. offset [3]: its centre,
-    from the eye. colors [texels, 3]: linear light, its levels one after the other. table [LEVELS,
-    3]: first texel, width, height of each. depth [h, w]: z, 0 of the sky.
+    """lens: fx, fy, cx, cy; rotation [3, 3] (camera_from_world): of the mirrored camera. offset
+    [3]: its centre, from the eye. width: of all its levels, 2 at least. rows: of the first.
     """
 
-    lens: np.ndarray
-    rotation: np.ndarray
-    offset: np.ndarray
-    colors: np.ndarray
-    table: np.ndarray
-    depth: np.ndarray
-
-
-class Water(NamedTuple):
-    """wetness, level: see reflection.Film. rings: share, variance, unseen. noise: MOTTLE_SIDE
-    squared. reflectance [ROUGHNESSES + 1, COSINES + 1]. decoded: linear light of i / TABLE.
-    encoded: display values of (i / TABLE)^2.
-    """
-
-    wetness: float
-    level: float
-    rings: np.ndarray
-    seed: np.uint64
-    timestamp_ns: np.int64
-    noise: np.ndarray
-    reflectance: np.ndarray
-    decoded: np.ndarray
-    encoded: np.ndarray
+    lens: Any
+    rotation: Any
+    offset: Any
+    width: Any
+    rows: Any
 
 
 @inner()
-def _mottle(noise, x, y, per_texel):
-    u, v = x * per_texel, y * per_texel
-    i, j = math.floor(u), math.floor(v)
-    u, v = u - i, v - j
-    side = MOTTLE_SIDE
-    i0, j0 = U(np.int64(i) & (side - 1)), U(np.int64(j) & (side - 1))
-    i1, j1 = (i0 + U(1)) & U(side - 1), (j0 + U(1)) & U(side - 1)
-    a = noise[j0, i0] + (noise[j0, i1] - noise[j0, i0]) * u
-    b = noise[j1, i0] + (noise[j1, i1] - noise[j1, i0]) * u
-    return a + (b - a) * v
-
-
-@inner()
-def _look_up(table, cosine, rough):
-    u, v = cosine * COSINES, min(rough * (1.0 / ROUGHEST), 1.0) * ROUGHNESSES
-    i, j = U(min(np.int64(u), COSINES - 1)), U(min(np.int64(v), ROUGHNESSES - 1))
-    u, v = u - np.int64(i), v - np.int64(j)
-    right, down = i + U(1), j + U(1)
-    a = table[j, i] + (table[j, right] - table[j, i]) * u
-    b = table[down, i] + (table[down, right] - table[down, i]) * u
-    return a + (b - a) * v
-
-
-@inner()
-def _step_of(table, at):
-    i = min(np.int64(at), TABLE - 1)
-    low, high = table[U(i)], table[U(i + 1)]
-    return low + (high - low) * (at - i)
-
-
-@inner()
-def _decode(table, value):
-    if value > 1.0:
-        return ((value + 0.055) / 1.055) ** 2.4
-    return _step_of(table, max(value, 0.0) * TABLE)
-
-
-@inner()
-def _encode(table, linear):
-    if linear > 1.0:
-        return 1.055 * linear ** (1.0 / 2.4) - 0.055
-    return _step_of(table, math.sqrt(max(linear, 0.0)) * TABLE)
-
-
-@inner()
-def _project(rotation, lens, x, y, z):
-    a = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
-    b = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-    c = 1.0 / max(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z, 1e-3)
-    return lens[0] * a * c + lens[2], lens[1] * b * c + lens[3]
-
-
-@inner()
-def _way_at(depth, rotation, lens, per_x, per_y, offset, column, row, x, y, z):
-    """Metres from a point of the ground to what the mirrored picture shows."""
-    h, w = depth.shape
-    i = np.int64(min(max(column, 0.0), w - 1.0))
-    j = np.int64(min(max(row, 0.0), h - 1.0))
-    far = np.float64(depth[U(j), U(i)])
-    if not far > 0.0:
-        return FARTHEST_M
-    a, b = (i + 0.5 - lens[2]) * per_x * far, (j + 0.5 - lens[3]) * per_y * far
-    dx = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * far + offset[0] - x
-    dy = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * far + offset[1] - y
-    dz = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * far + offset[2] - z
-    return math.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-@inner()
-def _texel(colors, table, level, column, row):
-    first, w, h = table[level, 0], table[level, 1], table[level, 2]
-    if level > 1:
-        row = row / (1 << (level - 1))
-    x, y = min(max(column - 0.5, 0.0), w - 1.0), min(max(row - 0.5, 0.0), h - 1.0)
-    i, j = np.int64(x), np.int64(y)
-    u, v, at = x - i, y - j, U(first + j * w + i)
-    right = at + U(i < w - 1)
-    down = U(w if j < h - 1 else 0)
-    a, b, c, d = (1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v
-    low, low_right = at + down, right + down
-    return (
-        a * colors[at, U(0)]
-        + b * colors[right, U(0)]
-        + c * colors[low, U(0)]
-        + d * colors[low_right, U(0)],
-        a * colors[at, U(1)]
-        + b * colors[right, U(1)]
-        + c * colors[low, U(1)]
-        + d * colors[low_right, U(1)],
-        a * colors[at, U(2)]
-        + b * colors[right, U(2)]
-        + c * colors[low, U(2)]
-        + d * colors[low_right, U(2)],
+def _read_mirror(mirror):
+    lens, offset = mirror.lens, mirror.offset
+    return Mirrored(
+        (lens[0], lens[1], lens[2], lens[3]),
+        _read_matrix(mirror.rotation),
+        (offset[0], offset[1], offset[2]),
+        mirror.width,
+        mirror.rows,
     )
 
 
-@kernel
-def decode(rgb, table, linear):
-    """Linear light of display-encoded colours, [H, W, 3] both."""
-    for y in prange(rgb.shape[0]):
-        line = np.int64(y)
-        for x in range(rgb.shape[1]):
-            for c in range(3):
-                linear[line, x, c] = np.float32(_decode(table, np.float64(rgb[line, x, c])))
+class Water(NamedTuple):
+    """wetness, level: see reflection.Film. rings: share, variance, unseen."""
+
+    wetness: Any
+    level: Any
+    rings: Any
+    seed: Any
+    timestamp_ns: Any
 
 
 @inner()
-def _shade_row(line, view, depth, share, flat, rows, columns, mirror, water, rgb):
-    lens, pose, corner, per_cell = view.lens, view.pose, view.corner, 1.0 / view.cell_m
-    m_lens, rotation, offset = mirror.lens, mirror.rotation, mirror.offset
-    colors, table, m_depth = mirror.colors, mirror.table, mirror.depth
-    wetness, level, rings, noise = water.wetness, water.level, water.rings, water.noise
-    seed, timestamp_ns = water.seed, water.timestamp_ns
-    decoded, encoded = water.decoded, water.encoded
-    reflectance = water.reflectance
-    drops = np.full((AT + 1, 4), np.nan)
-    per_x, per_y = 1.0 / m_lens[0], 1.0 / m_lens[1]
-    per_focal, per_row = 1.0 / lens[0], 1.0 / lens[1]
-    b = (line + 0.5 - lens[3]) * per_row
-    for x in range(depth.shape[1]):
-        own = np.float64(share[line, x])
-        if not own > 0.0:
+def _read_water(water):
+    rings = water.rings[0], water.rings[1], water.rings[2]
+    return Water(water.wetness, water.level, rings, water.seed, water.timestamp_ns)
+
+
+@inner()
+def _lanes_if(condition):
+    """How often a loop over lanes runs. Numba prunes references of arrays that a loop uses, but not
+    of those that a branch does.
+    """
+    return U(LANES) if condition else U(0)
+
+
+@inner()
+def _mottle(noise, px, py, weight, per_texel, column, row, places, spare):
+    """Weighted noise. column, row: the eye's."""
+    u = v8.fmuladd(px, _splat(per_texel), v8.splat(column))
+    v = v8.fmuladd(py, _splat(per_texel), v8.splat(row))
+    _store_places(places, spare, u, v, v8.floor(u), v8.floor(v))
+    side, wrap = U(MOTTLE_SIDE), np.int32(MOTTLE_SIDE - 1)
+    counts = v8.greater(weight, _splat(0))
+    for lane in range(_lanes_if(_any(counts))):
+        i, j = places[lane], places[lane + U(LANES)]
+        left, right = U(i & wrap), U((i + np.int32(1)) & wrap)
+        low, high = U(j & wrap) * side, U((j + np.int32(1)) & wrap) * side
+        a = noise[low + left] + (noise[low + right] - noise[low + left]) * spare[lane]
+        b = noise[high + left] + (noise[high + right] - noise[high + left]) * spare[lane]
+        spare[U(OUT) + lane] = a + (b - a) * spare[lane + U(LANES)]
+    return v8.select(counts, weight * v8.load(spare, U(OUT)), _splat(0))
+
+
+@inner()
+def _ring_lanes(px, py, footprint, puddle, place, water, spare, drops):
+    """`rings_at` where puddles are: see there."""
+    shown = v8.both(v8.greater(puddle, _splat(0)), v8.greater(_splat(WAVE_M / FADED_PX), footprint))
+    v8.store(spare, U(0), px)
+    v8.store(spare, U(LANES), py)
+    v8.store(spare, U(OUT), _splat(0))
+    v8.store(spare, U(OUT + LANES), _splat(0))
+    v8.store(spare, U(OUT + 2 * LANES), _splat(water.rings[1]))
+    v8.store(spare, U(OUT + 3 * LANES), v8.select(shown, footprint, _splat(0)))
+    for lane in range(_lanes_if(water.rings[0] > 0 and _any(shown))):
+        at = U(OUT) + lane
+        wide = spare[at + U(3 * LANES)]
+        if wide > np.float32(0):
+            x, y = place[0] + spare[lane], place[1] + spare[lane + U(LANES)]
+            sx, sy, rest = rings_at(
+                x, y, np.float64(wide), water.rings, water.seed, water.timestamp_ns, drops
+            )
+            spare[at] = np.float32(sx)
+            spare[at + U(LANES)] = np.float32(sy)
+            spare[at + U(2 * LANES)] = np.float32(rest)
+    slopes = v8.load(spare, U(OUT)), v8.load(spare, U(OUT + LANES))
+    return slopes[0], slopes[1], v8.load(spare, U(OUT + 2 * LANES))
+
+
+@inner()
+def _reflectance(cosine, rough):
+    """As reflection.mean_reflectance."""
+    one = _splat(1)
+    power = _splat(5) * exp2_fine(rough * _splat(-2.69 * LOG2_E))
+    base = v8.maximum(one - cosine, _splat(_LEAST))
+    rest = exp2_fine(v8.maximum(power * log2(base), _splat(-126)))
+    rest = rest / _line(rough * v8.sqrt(rough), 22.7, 1.0)
+    return _line(rest, 1 - R0, R0)
+
+
+@inner()
+def _to_linear(value):
+    """Linear light of display-encoded values."""
+    value = v8.maximum(value, _splat(0))
+    high = exp2_fine(_splat(2.4) * log2(_line(value, 1 / 1.055, 0.055 / 1.055)))
+    low = value * _splat(1 / 12.92)
+    return v8.select(v8.greater(value, _splat(0.04045)), high, low)
+
+
+@inner()
+def _to_display(linear):
+    """Display-encoded values of linear light; of what is below 0, those of 0."""
+    high = exp2_fine(_splat(1 / 2.4) * log2(v8.maximum(linear, _splat(0.0031308))))
+    low = v8.maximum(linear, _splat(0)) * _splat(12.92)
+    return v8.select(v8.greater(linear, _splat(0.0031308)), _line(high, 1.055, -0.055), low)
+
+
+@inner()
+def _project(mirror, x, y, z):
+    """Column and row of points from the mirrored eye."""
+    lens, rotation = mirror.lens, mirror.rotation
+    per_z = _splat(1) / v8.maximum(_turn(rotation[2], x, y, z), _splat(1e-3))
+    column, row = _turn(rotation[0], x, y, z) * per_z, _turn(rotation[1], x, y, z) * per_z
+    column = v8.fmuladd(v8.splat(lens[0]), column, v8.splat(lens[2]))
+    return column, v8.fmuladd(v8.splat(lens[1]), row, v8.splat(lens[3]))
+
+
+@inner()
+def _way_at(mirror, depth, column, row, px, py, pz, places, spare):
+    """Metres from points of the ground to what the mirrored picture shows."""
+    lens, m, offset, width = mirror.lens, mirror.rotation, mirror.offset, U(mirror.width)
+    i = v8.floor(_clamp(column, 0, mirror.width - 1))
+    j = v8.floor(_clamp(row, 0, mirror.rows - 1))
+    v8.store_whole(places, U(0), i)
+    v8.store_whole(places, U(LANES), j)
+    for lane in range(U(LANES)):
+        spare[lane] = depth[U(places[lane + U(LANES)]) * width + U(places[lane])]
+    z, half, one = v8.load(spare, U(0)), np.float32(0.5), np.float32(1)
+    a = (i + v8.splat(half - lens[2])) * v8.splat(one / lens[0]) * z
+    b = (j + v8.splat(half - lens[3])) * v8.splat(one / lens[1]) * z
+    x = _turn((m[0][0], m[1][0], m[2][0]), a, b, z) + v8.splat(offset[0]) - px
+    y = _turn((m[0][1], m[1][1], m[2][1]), a, b, z) + v8.splat(offset[1]) - py
+    up = _turn((m[0][2], m[1][2], m[2][2]), a, b, z) + v8.splat(offset[2]) - pz
+    way = v8.sqrt(_dot(x, y, up, x, y, up))
+    return v8.select(v8.greater(z, _splat(0)), way, _splat(FARTHEST_M))
+
+
+@inner()
+def _look_at(mirror, colors, levels, column, row, sigma, places, spare):
+    """Linear light of the mirrored picture at points, blurred upright by sigma >= 1 pixels."""
+    low = v8.floor(_clamp(log2(sigma), 0, LEVELS - 2))
+    upper = _clamp(sigma / exp2_fine(low) - _splat(1), 0, 1)
+    x = _clamp(column - _splat(0.5), 0, mirror.width - 1)
+    i = v8.minimum(v8.floor(x), _splat(mirror.width - 2))
+    _store_places(places, spare, x, upper + low, i, low)
+    v8.store(spare, U(OUT), _clamp(row, -1e6, 1e6))
+    pixel, wide = U(3), U(3 * mirror.width)
+    red, green, blue = U(OUT + 2 * LANES), U(OUT + 3 * LANES), U(OUT + 4 * LANES)
+    for lane in range(U(LANES)):
+        level, y, color = U(places[lane + U(LANES)]), spare[U(OUT) + lane], _splat(0)
+        for k in range(U(2)):
+            last = np.int64(levels[U(1), level]) - 1
+            v = y * _PER_ROW[level] - np.float32(0.5)
+            v = min(max(v, np.float32(0)), np.float32(last))
+            j = np.int64(v)
+            at = pixel * (U(levels[U(0), level]) + U(places[lane])) + U(j) * wide
+            above = v8.load(colors, at)
+            below = v8.load(colors, at + (wide if j < last else U(0)))
+            between = v8.fmuladd(v8.splat(v - np.float32(j)), below - above, above)
+            weight = spare[lane + U(LANES)] if k else np.float32(1) - spare[lane + U(LANES)]
+            color = v8.fmuladd(v8.splat(weight), between, color)
+            level += U(1)
+        v8.store(spare, U(OUT + LANES), color)  # of two texels side by side
+        at, u = U(OUT + LANES), spare[lane]
+        spare[red + lane] = spare[at] + (spare[at + U(3)] - spare[at]) * u
+        spare[green + lane] = spare[at + U(1)] + (spare[at + U(4)] - spare[at + U(1)]) * u
+        spare[blue + lane] = spare[at + U(2)] + (spare[at + U(5)] - spare[at + U(2)]) * u
+    return v8.load(spare, red), v8.load(spare, green), v8.load(spare, blue)
+
+
+@inner()
+def _film(track, puddle, uneven, variance, wetness):
+    """Deviation of slopes, and the share of the ground that the film covers."""
+    one = _splat(1)
+    rough = _splat(ASPHALT) * _line(track, -TRACK_SMOOTHS, 1.0) * (one - uneven)
+    still = v8.sqrt(_line(variance, 0.5, PUDDLE * PUDDLE))
+    film = _clamp(_line(track, 0.1, FILM) + uneven, 0.0, 1.0)
+    cover = v8.splat(wetness) * v8.fmuladd(one - film, puddle, film)
+    return v8.fmuladd(puddle, still - rough, rough), cover
+
+
+@inner()
+def _mixed(own, seen, strength):
+    linear = _to_linear(own)
+    return _to_display(v8.fmuladd(strength, seen - linear, linear))
+
+
+@inner()
+def _shade_row(
+    line, width, view, cells, depth, share, mirror, colors, levels, mirror_depth, water, noise, rgb
+):
+    view, mirror, water = _read_view(view), _read_mirror(mirror), _read_water(water)
+    lens, axes, eye, offset = view.lens, view.axes, view.eye, mirror.offset
+    places, spare = np.empty(2 * LANES, np.int32), np.empty(SPARE, np.float32)
+    drops, one = np.full((AT + 1, 4), np.nan), _splat(1)
+    b = v8.splat((np.float32(line) + np.float32(0.5) - lens[3]) * lens[1])
+    for j in range(0, width, LANES):
+        # The last eight of a row take those before them, which stay as they are.
+        first = min(j, width - LANES)
+        pixel = U(line * width + first)
+        own = v8.load(share, pixel)
+        inside = v8.both(
+            v8.greater(own, _splat(0)), v8.at_least(v8.lane_numbers(), _splat(j - first))
+        )
+        if not _any(inside):
             continue
-        a = (x + 0.5 - lens[2]) * per_focal
-        z = np.float64(depth[line, x])
-        px = z * (pose[0, 0] * a + pose[0, 1] * b + pose[0, 2])
-        py = z * (pose[1, 0] * a + pose[1, 1] * b + pose[1, 2])
-        pz = z * (pose[2, 0] * a + pose[2, 1] * b + pose[2, 2])
-        wx, wy = px + pose[0, 3], py + pose[1, 3]
-        _, at, u, v = _place(wx, wy, corner, per_cell, rows, columns)
-        hollow = _between(flat, at, columns, HOLLOW, u, v)
-        puddle = wetness * _smoothstep((hollow - level) * (0.5 / RIM) + 0.5)
-        track = _between(flat, at, columns, TRACK, u, v)
-        distance = math.sqrt(px * px + py * py + pz * pz)
-        per_distance = -1.0 / distance
-        ex, ey, ez = px * per_distance, py * per_distance, pz * per_distance
-        footprint = distance * per_row / max(ez, LEAST_SINE)
-        nx = -_between(flat, at, columns, RISE_X, u, v) * (1.0 - puddle)
-        ny = -_between(flat, at, columns, RISE_Y, u, v) * (1.0 - puddle)
-        fine = FINE * min(max(2.0 - footprint * (1.0 / FINE_M), 0.0), 1.0)
-        coarse = COARSE * min(max(2.0 - footprint * (1.0 / COARSE_M), 0.0), 1.0)
-        uneven = 0.0
-        if coarse > 0.0:
-            uneven += coarse * _mottle(noise, wx, wy, 1.0 / COARSE_M)
-        if fine > 0.0:
-            uneven += fine * _mottle(noise, wx, wy, 1.0 / FINE_M)
-        rough = ASPHALT * (1.0 - TRACK_SMOOTHS * track) * (1.0 - uneven)
-        still = PUDDLE
-        if puddle > 0.0:
-            sx, sy, variance = rings_at(wx, wy, footprint, rings, seed, timestamp_ns, drops)
-            nx -= sx * puddle
-            ny -= sy * puddle
-            still = math.sqrt(PUDDLE * PUDDLE + 0.5 * variance)
-        rough += puddle * (still - rough)
-        nz = 1.0 / math.sqrt(nx * nx + ny * ny + 1.0)
+        a, z = _across(first, lens), v8.select(inside, v8.load(depth, pixel), one)
+        px, py = z * _turn(axes[0], a, b, one), z * _turn(axes[1], a, b, one)
+        pz = z * _turn(axes[2], a, b, one)
+        _find_cells(px, py, view, places, spare)
+        _look_up(cells, view.columns, RISE_X, 4, places, spare)
+        rise_x, rise_y = v8.load(spare, U(OUT)), v8.load(spare, U(OUT + LANES))
+        hollow, track = v8.load(spare, U(OUT + 2 * LANES)), v8.load(spare, U(OUT + 3 * LANES))
+        puddle = _smoothstep(_line(hollow - v8.splat(water.level), 0.5 / RIM, 0.5))
+        puddle = v8.select(inside, puddle * v8.splat(water.wetness), _splat(0))
+        distance = v8.sqrt(_dot(px, py, pz, px, py, pz))
+        per_distance = one / distance
+        footprint = v8.maximum(v8.negate(pz * per_distance), _splat(LEAST_SINE))
+        footprint = distance * v8.splat(lens[1]) / footprint
+        coarse = _splat(COARSE) * _clamp(_line(footprint, -1 / COARSE_M, 2.0), 0.0, 1.0)
+        coarse = _mottle(noise, px, py, coarse, 1 / COARSE_M, eye[4], eye[5], places, spare)
+        fine = _splat(FINE) * _clamp(_line(footprint, -1 / FINE_M, 2.0), 0.0, 1.0)
+        fine = _mottle(noise, px, py, fine, 1 / FINE_M, eye[6], eye[7], places, spare)
+        sx, sy, variance = _ring_lanes(px, py, footprint, puddle, view.place, water, spare, drops)
+        rough, cover = _film(track, puddle, coarse + fine, variance, water.wetness)
+        flat = puddle - one
+        nx, ny = rise_x * flat - sx * puddle, rise_y * flat - sy * puddle
+        nz = one / v8.sqrt(v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, one)))
         nx, ny = nx * nz, ny * nz
-        cosine = min(max(nx * ex + ny * ey + nz * ez, 0.005), 1.0)
-        film = min(max(FILM + uneven + 0.1 * track, 0.0), 1.0)
-        cover = wetness * (film + (1.0 - film) * puddle)
-        strength = own * cover * _look_up(reflectance, cosine, rough)
-        rx, ry, rz = 2.0 * cosine * nx - ex, 2.0 * cosine * ny - ey, 2.0 * cosine * nz - ez
-        mx, my, mz = px - offset[0], py - offset[1], pz - offset[2]
-        column, row = _project(rotation, m_lens, mx, my, mz)
-        way = _way_at(m_depth, rotation, m_lens, per_x, per_y, offset, column, row, px, py, pz)
-        tx, ty, tz = mx + way * rx, my + way * ry, mz + way * rz
-        column, row = _project(rotation, m_lens, tx, ty, tz)
-        sigma = m_lens[1] * 2.0 * rough * way / (way + distance)
-        sigma = max(sigma * sigma / (sigma + 1.0), 1.0)
-        low, width = np.int64(0), 1.0
-        while low < LEVELS - 2 and sigma >= 2.0 * width:
-            low, width = low + 1, 2.0 * width
-        upper = min(sigma / width - 1.0, 1.0)
-        red = green = blue = 0.0
-        for k in range(2):
-            weight = upper if k else 1.0 - upper
-            if weight > 0.0:
-                r, g, b_ = _texel(colors, table, low + k, column, row)
-                red, green, blue = red + weight * r, green + weight * g, blue + weight * b_
-        for c in range(3):
-            seen = red if c == 0 else green if c == 1 else blue
-            mine = _decode(decoded, np.float64(rgb[line, x, c]))
-            rgb[line, x, c] = np.float32(_encode(encoded, mine + strength * (seen - mine)))
+        cosine = v8.negate(_dot(nx, ny, nz, px, py, pz) * per_distance)
+        cosine = _clamp(cosine, 0.005, 1.0)
+        # What a ray, 2 cosine normal - towards the eye, meets.
+        mx, my, mz = px - v8.splat(offset[0]), py - v8.splat(offset[1]), pz - v8.splat(offset[2])
+        column, row = _project(mirror, mx, my, mz)
+        way = _way_at(mirror, mirror_depth, column, row, px, py, pz, places, spare)
+        twice = cosine + cosine
+        column, row = _project(
+            mirror,
+            v8.fmuladd(way, v8.fmuladd(px, per_distance, twice * nx), mx),
+            v8.fmuladd(way, v8.fmuladd(py, per_distance, twice * ny), my),
+            v8.fmuladd(way, v8.fmuladd(pz, per_distance, twice * nz), mz),
+        )
+        sigma = v8.splat(np.float32(2) * mirror.lens[1]) * rough * way / (way + distance)
+        sigma = v8.maximum(sigma * sigma / (sigma + one), one)  # less than a pixel is none
+        red, green, blue = _look_at(mirror, colors, levels, column, row, sigma, places, spare)
+        strength = own * cover * _reflectance(cosine, rough)
+        r, g, b_ = v8.load_colours(rgb, U(3) * pixel)
+        red = v8.select(inside, _mixed(r, red, strength), r)
+        green = v8.select(inside, _mixed(g, green, strength), g)
+        blue = v8.select(inside, _mixed(b_, blue, strength), b_)
+        v8.store_colours(rgb, U(3) * pixel, red, green, blue)
 
 
 @kernel
-def shade_wet(view, depth, share, flat, rows, columns, mirror, water, rgb):
-    """Mix reflections into rgb [H, W, 3], in place, where share says how much is open ground."""
-    for y in prange(depth.shape[0]):
-        _shade_row(np.int64(y), view, depth, share, flat, rows, columns, mirror, water, rgb)
+def shade_wet(
+    view, cells, width, depth, share, mirror, colors, levels, mirror_depth, water, noise, rgb
+):
+    """Mix reflections into rgb [3 H W], in place, where share says how much is open ground.
+
+    cells, depth, share: as of find_ground. colors: flat, linear light of the mirror's levels one
+    after the other, and two numbers more. levels [2, LEVELS]: first texel and rows of each.
+    mirror_depth: flat, z, 0 of the sky. noise: flat, MOTTLE_SIDE squared.
+    """
+    for y in prange(depth.size // width):
+        _shade_row(
+            np.int64(y), width, view, cells, depth, share,
+            mirror, colors, levels, mirror_depth, water, noise, rgb,
+        )  # fmt: skip
+
+
+@kernel
+def decode(rgb, linear):
+    """Linear light of display-encoded numbers, flat, LANES of them at least."""
+    count = rgb.size
+    for run in prange((count + RUN - 1) // RUN):
+        start = np.int64(run) * RUN
+        for i in range(start, min(start + RUN, count), LANES):
+            at = U(min(i, count - LANES))
+            v8.store(linear, at, _to_linear(v8.load(rgb, at)))
+
+
+# ---- Rings on a flood ----------------------------------------------------------------------------
 
 
 @inner()

@@ -36,7 +36,6 @@ from augment.effects.wet.kernels import (
     ASPHALT,
     COARSE,
     COARSE_M,
-    COSINES,
     FAINT,
     FAR_OFF,
     FAR_PER_M,
@@ -57,16 +56,13 @@ from augment.effects.wet.kernels import (
     RIM,
     RISE_X,
     RISE_Y,
-    ROUGHEST,
-    ROUGHNESSES,
-    TABLE,
     TRACK,
     TRACK_SMOOTHS,
 )
 from augment.effects.wet.ripples import Rings, numbers_of, ring_slopes
 from augment.geometry import rigid
 from augment.render.buffers import AUTO, CPU, kernels_for
-from augment.render.layout import ABOVE, HeightClip
+from augment.render.layout import ABOVE, LANES, HeightClip
 from augment.render.threads import kernel_threads
 
 # ---- The plane and its mirrored camera -----------------------------------------------------------
@@ -171,10 +167,10 @@ def blur_upright(
 
     backend: on the CPU OpenCV blurs, equal to the definition within float rounding.
     """
-    if kernels_for(backend, rgb) == CPU:
+    if kernels_for(backend, rgb) == CPU and rgb.numel() >= LANES:
         linear = np.empty(tuple(rgb.shape), np.float32)
-        with kernel_threads(ROWS):
-            kernels.decode(_array(rgb), _tables()[0], linear)
+        with kernel_threads():
+            kernels.decode(_flat(rgb), linear.reshape(-1))
         image, levels = linear, [torch.from_numpy(linear)]
         for k in range(1, LEVELS):
             upright, aside = map(_taps, _widening(k))
@@ -278,12 +274,12 @@ def find_ground(
     depth: z of what a pixel shows, 0 = none. shown: how much of the pixel is the scene's own.
     backend: the CPU's kernel equals the definition within float rounding.
     """
-    if kernels_for(backend, depth, shown) == CPU:
+    if kernels_for(backend, depth, shown) == CPU and camera.width >= LANES:
         share = np.empty(tuple(depth.shape), np.float32)
-        most = np.empty(len(share), np.float32)
+        most, flat = np.empty(len(share), np.float32), share.reshape(-1)
         with kernel_threads(ROWS):
             kernels.find_ground(
-                _view(camera, ground), _array(depth), _array(shown), *_map(ground), share, most
+                *_view(camera, ground), camera.width, _flat(depth), _flat(shown), flat, most
             )
         found = np.flatnonzero(most > 0)
         rows = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
@@ -320,14 +316,14 @@ def shade_wet(
 ) -> Float[Tensor, "H W 3"]:
     """The picture with reflections on its wet ground; on the CPU, `rgb` is overwritten.
 
-    share: of `find_ground`. backend: as there; the kernel's tables of the display's encoding are
-    within 1e-4.
+    share: of `find_ground`. backend: as there.
     """
-    if kernels_for(backend, rgb, depth, share) == CPU and rgb.is_contiguous():
+    wide = camera.width >= LANES and mirror.camera.width >= 2
+    if kernels_for(backend, rgb, depth, share) == CPU and rgb.is_contiguous() and wide:
         with kernel_threads(ROWS):
             kernels.shade_wet(
-                _view(camera, ground), _array(depth), _array(share), *_map(ground),
-                _mirrored(mirror, camera), _water(film), rgb.detach().numpy(),
+                *_view(camera, ground), camera.width, _flat(depth), _flat(share),
+                *_mirrored(mirror, camera), *_water(film), _flat(rgb),
             )  # fmt: skip
         return rgb
     points, distance, ch = _points(camera, depth, ground)
@@ -428,55 +424,46 @@ def _mottle(x: Tensor, y: Tensor, texel_m: float) -> Tensor:
 ROWS = 8  # image rows a thread takes at a time: rows without ground cost nothing
 
 
-def _array(part: Tensor) -> np.ndarray:
-    return part.detach().float().contiguous().numpy()
+def _flat(part: Tensor) -> np.ndarray:
+    return part.detach().float().contiguous().numpy().reshape(-1)
 
 
-def _view(camera: Camera, ground: WetGround) -> kernels.View:
-    return kernels.View(
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-        np.ascontiguousarray(camera.world_from_camera.numpy()[:3]),
-        np.array([ground.left_m, ground.bottom_m]),
-        CELL_M,
+def _floats(*numbers: float) -> np.ndarray:
+    return np.array(numbers, np.float32)
+
+
+def _view(camera: Camera, ground: WetGround) -> tuple[kernels.View, np.ndarray]:
+    pose = camera.world_from_camera.numpy()
+    place = np.ascontiguousarray(pose[:2, 3])
+    cells = (place - (ground.left_m, ground.bottom_m)) / CELL_M - 0.5
+    turns = [place / texel_m % MOTTLE_SIDE for texel_m in (COARSE_M, FINE_M)]
+    view = kernels.View(
+        _floats(1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy),
+        np.ascontiguousarray(pose[:3, :3], np.float32),
+        _floats(*cells, 1 / CELL_M, pose[2, 3], *turns[0], *turns[1]),
+        place,
+        *ground.channels.shape[:2],
     )
+    return view, ground.channels.numpy().reshape(-1)
 
 
-def _map(ground: WetGround) -> tuple[np.ndarray, int, int]:
-    rows, columns, channels = ground.channels.shape
-    return ground.channels.numpy().reshape(-1, channels), rows, columns
-
-
-def _mirrored(mirror: Mirror, camera: Camera) -> kernels.Mirrored:
-    view, first, table = mirror.camera, 0, []
-    for level in mirror.levels:
-        table.append((first, level.shape[1], level.shape[0]))
-        first += level.shape[0] * level.shape[1]
-    return kernels.Mirrored(
-        np.array([view.fx, view.fy, view.cx, view.cy]),
-        np.ascontiguousarray(view.camera_from_world.numpy()[:3, :3]),
-        (view.centre - camera.centre).numpy(),
-        np.concatenate([_array(level).reshape(-1, 3) for level in mirror.levels]),
-        np.array(table, np.int64),
-        _array(mirror.depth),
+def _mirrored(
+    mirror: Mirror, camera: Camera
+) -> tuple[kernels.Mirrored, np.ndarray, np.ndarray, np.ndarray]:
+    view = mirror.camera
+    rows = np.array([len(level) for level in mirror.levels])
+    mirrored = kernels.Mirrored(
+        _floats(view.fx, view.fy, view.cx, view.cy),
+        np.ascontiguousarray(view.camera_from_world.numpy()[:3, :3], np.float32),
+        (view.centre - camera.centre).float().numpy(),
+        view.width,
+        view.height,
     )
+    colors = np.concatenate([*(_flat(level) for level in mirror.levels), _floats(0.0, 0.0)])
+    levels = np.stack([np.append(0, rows[:-1].cumsum()) * view.width, rows])
+    return mirrored, colors, levels, _flat(mirror.depth)
 
 
-def _water(film: Film) -> kernels.Water:
-    noise, tables = mottle_table(), _tables()
-    rings = numbers_of(film.rings)
-    return kernels.Water(film.wetness, film.level, *rings, noise, _reflectances(), *tables)
-
-
-@functools.cache
-def _reflectances() -> np.ndarray:
-    """`mean_reflectance` by slopes and cosine."""
-    cosines = torch.arange(COSINES + 1, dtype=torch.float64) / COSINES
-    slopes = ROUGHEST * torch.arange(ROUGHNESSES + 1, dtype=torch.float64) / ROUGHNESSES
-    slopes, cosines = torch.meshgrid(slopes, cosines, indexing="ij")
-    return mean_reflectance(cosines, slopes).numpy()
-
-
-@functools.cache
-def _tables() -> tuple[np.ndarray, np.ndarray]:
-    steps = torch.arange(TABLE + 2, dtype=torch.float64) / TABLE
-    return linear_of(steps).numpy(), display_of(steps**2).numpy()
+def _water(film: Film) -> tuple[kernels.Water, np.ndarray]:
+    numbers = np.float32(film.wetness), np.float32(film.level), *numbers_of(film.rings)
+    return kernels.Water(*numbers), mottle_table().reshape(-1)

@@ -9,6 +9,7 @@ there when the way back needs it. Bits do not depend on the number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ from augment.render.cpu.driver import (
     sort,
 )
 from augment.render.cpu.project import Splats
-from augment.render.layout import BLOCK, V_EYE
+from augment.render.layout import BLOCK, RECORD, SPLAT_ID, V_EYE
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
@@ -92,29 +93,56 @@ class Tape:
             d_depth = d_expected_depth / weight
             inside = self.alpha > np.float32(DEPTH_EPS)
             d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
-        scratch, inputs, listed = self.scratch, self.inputs, self.listed
-        entries, slots, blocks = len(listed.tile_splat_ids), inputs.slots, len(inputs.blocks)
-        shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
-        reached = scratch.array("reached", (len(listed.tile_offsets) - 1,), np.int64)
-        sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
-        touched = scratch.array("touched", (slots,), np.uint8)
+        scratch, inputs = self.scratch, self.inputs
+        slots, blocks = inputs.slots, len(inputs.blocks)
         rows = scratch.array("grads", (slots, backward_kernels.GRAD), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
         counts = scratch.array("grad_counts", (blocks,), np.int64)
         images = (self.rgb, self.alpha, depth, d_rgb, d_alpha, d_depth)
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            backward_kernels.blend_backward(listed, self.frame, slopes, shares, reached)
-            timer.end_stage("raster backward")
-            backward_kernels.sum_shares(
-                listed.tile_splat_ids, listed.tile_offsets, reached, shares, _RANGES, sums, touched
-            )
-            timer.end_stage("sum backward")
+            sums, touched = self._sum_shares(slopes, timer)
             backward_kernels.project_backward(
                 inputs.read, self.splats, touched, sums, rows.reshape(-1), ids, counts
             )
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
+
+    def splat_effects(
+        self, d_rgb: np.ndarray, d_alpha: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of every splat in the frame: its number, the sum of its weights times the loss's
+        derivative by red, and of its alphas times the loss's derivatives by them.
+        """
+        images = (self.rgb, self.alpha, None, d_rgb, d_alpha, None)
+        slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
+        with kernel_threads():
+            sums, touched = self._sum_shares(slopes, StageTimer(None))
+        there = np.arange(BLOCK) < self.splats.found[:, None]  # [B, BLOCK]
+        there, records = there.reshape(-1), self.splats.records.reshape(-1, RECORD)
+        ids = records[there, SPLAT_ID].view(np.int32)
+        shares = sums.reshape(-1, backward_kernels.SHARE)[there]
+        shares[touched[there] == 0] = 0  # where no light came is whatever lay there
+        by_log2 = shares[:, backward_kernels.S_0]
+        return ids, shares[:, backward_kernels.S_RED], by_log2 / np.float32(math.log(2))
+
+    def _sum_shares(
+        self, slopes: backward_kernels.Slopes, timer: StageTimer
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What all tiles say of every slot, and which slots any light came to."""
+        scratch, listed, slots = self.scratch, self.listed, self.inputs.slots
+        entries = len(listed.tile_splat_ids)
+        shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
+        reached = scratch.array("reached", (len(listed.tile_offsets) - 1,), np.int64)
+        sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
+        touched = scratch.array("touched", (slots,), np.uint8)
+        backward_kernels.blend_backward(listed, self.frame, slopes, shares, reached)
+        timer.end_stage("raster backward")
+        backward_kernels.sum_shares(
+            listed.tile_splat_ids, listed.tile_offsets, reached, shares, _RANGES, sums, touched
+        )
+        timer.end_stage("sum backward")
+        return sums, touched
 
 
 def record(
@@ -145,7 +173,7 @@ def record(
         bins = (edges[0], edges[-1])
         splats = project(inputs, depths, bins, tiles, scratch)
         timer.end_stage("project")
-        slots, rects = sort(splats, bins[0], scratch)
+        slots, rects = sort(splats, bins[0], scratch, is_ordered=inputs.is_ordered)
         timer.end_stage("sort")
         tile_splat_ids, tile_offsets = tiles.list_all(slots, rects)
         timer.end_stage("bin")

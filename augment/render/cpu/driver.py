@@ -50,7 +50,7 @@ from augment.render.cpu.order import cut_in_fog, order_of
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_of_arrays
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
-from augment.render.threads import kernel_threads, thread_count
+from augment.render.threads import kernel_threads, thread_count, usable_cores
 from augment.scene import Gaussians, PosedGaussians
 
 # ---- What the CPU kernels read: scene parts by address, and the numbers of a view ----------------
@@ -169,8 +169,8 @@ def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # Every render takes a space of its own, so threads that render at once never share one.
 
 _LINE = 64  # bytes of a cache line
-_KEPT = 2  # spaces kept for later renders; a process rarely renders in more threads
-_SPACES: deque[Scratch] = deque(maxlen=_KEPT)  # append and pop are atomic
+# Kept for later renders, of which there are rarely more at once. Append and pop are atomic.
+_SPACES: deque[Scratch] = deque(maxlen=max(2, usable_cores()))
 
 
 class Scratch:

@@ -9,6 +9,7 @@ Gaussians that change from view to view, would pay more for it than it saves.
 from __future__ import annotations
 
 import math
+import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
@@ -38,18 +39,25 @@ _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
 
 Value = TypeVar("Value")
 _known: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]] = {}
+_making = threading.RLock()  # views drawn at once want the same
 
 
 def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
     """What `make` gave for the tensor under this name; made anew after a change in place."""
     key = (id(tensor), name)
-    known = _known.get(key)
-    if known is not None and known[0]() is tensor and known[1] == tensor._version:
-        return known[2]
-    value = make()
-    gone = weakref.ref(tensor, lambda _: _known.pop(key, None))
-    _known[key] = (gone, tensor._version, value)
-    return value
+
+    def find() -> tuple[weakref.ref[Tensor], int, Any] | None:
+        known = _known.get(key)
+        return known if known and known[0]() is tensor and known[1] == tensor._version else None
+
+    known = find()
+    if known is None:
+        with _making:
+            known = find()
+            if known is None:
+                gone = weakref.ref(tensor, lambda _: _known.pop(key, None))
+                known = _known[key] = (gone, tensor._version, make())
+    return known[2]
 
 
 class _Uses:
@@ -120,10 +128,11 @@ def order_of(gaussians: Gaussians) -> Order | None:
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
     uses = known_of(g.means, "order", _Uses)
-    uses.count += 1
-    if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
-        uses.order = _find_order(g.means.detach().numpy())
-    return uses.order
+    with _making:
+        uses.count += 1
+        if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
+            uses.order = _find_order(g.means.detach().numpy())
+        return uses.order
 
 
 def _is_plain(tensor: Tensor) -> bool:

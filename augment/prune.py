@@ -1,0 +1,138 @@
+"""Splats of the background that no recorded view would miss, left out of views from nearby.
+
+Without splat i, of colour c_i and weight w_i = alpha_i T_i at a pixel, the pixel shows more of what
+is behind it, B_i, and changes by w_i (B_i - c_i): to first order alpha_i dL/dalpha_i, which the
+rasteriser's backward pass adds up over a view. A splat's change in a view is
+
+    max(|sum of w_i L(B_i - c_i)|, LEAST_CONTRAST sum of w_i) / pixels,    L: luma,
+
+and counts by the view that would change most. LEAST_CONTRAST stands for what changes of both signs
+hide, and for the changes that neighbours make when they go together. (Fan et al. 2024,
+"LightGaussian", and Niemeyer et al. 2024, "RadSplat", leave out by weight alone, which at the same
+error leaves out less.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from augment.cameras import Camera
+from augment.lod import keeps_levels
+from augment.memo import memo_of
+from augment.render.constants import RasterSettings
+from augment.render.cpu.order import known_of
+from augment.scene import Gaussians, PosedGaussians, Scene
+
+MAX_VIEWS, MAX_WIDTH_PX = 48, 320  # that are looked at
+# From farther away than this from all recorded cameras, a view may show what none of them did.
+FARTHEST_M = 2.0
+LUMA = (0.299, 0.587, 0.114)
+SKY = 0.7  # luma behind all splats
+LEAST_CONTRAST = 0.05
+_ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
+_CHANGES = ("changes without a splat",)
+
+
+def prune_parts(
+    parts: Sequence[PosedGaussians], scene: Scene, camera: Camera, millionths: float
+) -> tuple[PosedGaussians, ...]:
+    """The parts as `camera` needs them: opacities of splats are 0 without which no recorded view of
+    the scene would change by more than this share of white. parts: as the effects have left them.
+    """
+    if millionths <= 0 or not _is_near(camera, scene):
+        return tuple(parts)
+    return tuple(
+        _pruned(part, scene, millionths) if _is_background(part, scene) else part for part in parts
+    )
+
+
+def share_changes(scene: Scene) -> None:
+    """Find the changes now, so that other processes take them over."""
+    if not keeps_levels(scene.background):
+        memo_of(scene).put(_CHANGES, changes_of(scene), shared=True)
+
+
+def changes_of(scene: Scene) -> Float[np.ndarray, "N"]:
+    """By how much the mean luma of a recorded view would change without each splat of the
+    background, float32; infinite where no view has it in its frame. Found once a scene.
+    """
+    return memo_of(scene).get(_CHANGES, lambda: _find_changes(scene))
+
+
+def _is_background(part: PosedGaussians, scene: Scene) -> bool:
+    g = part.gaussians
+    is_plain = part.instance_id == 0 and not part.is_overlay and len(g) == len(scene.background)
+    return is_plain and not keeps_levels(scene.background)
+
+
+def _is_near(camera: Camera, scene: Scene) -> bool:
+    centres = memo_of(scene).get(("camera centres",), lambda: _centres_of(scene))
+    away_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
+    return bool(away_m.min(initial=np.inf) <= FARTHEST_M)
+
+
+def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
+    return np.array([camera.centre.numpy() for camera in _recorded(scene)]).reshape(-1, 3)
+
+
+def _pruned(part: PosedGaussians, scene: Scene, millionths: float) -> PosedGaussians:
+    own, changes = part.gaussians.opacities, changes_of(scene)
+
+    def prune() -> tuple[np.ndarray, torch.Tensor]:
+        is_missed = torch.from_numpy(changes > 1e-6 * millionths).to(own.device)
+        return changes, torch.where(is_missed, own, 0.0)
+
+    # Of the same tensor as long as that lives, so that the rasteriser knows it again.
+    by, opacities = known_of(own, f"pruned at {millionths}", prune)
+    if by is not changes:  # the same tensor in a scene of other views
+        opacities = prune()[1]
+    return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
+
+
+def _find_changes(scene: Scene) -> Float[np.ndarray, "N"]:
+    from augment.render.cpu.backward import record
+    from augment.render.cpu.driver import Scratch, gather_inputs
+
+    count, scratch = len(scene.background), Scratch()
+    changes = np.full(count, np.inf, np.float32)
+    opaque = scene.background.opacities.detach().cpu().numpy() >= _ALPHA_MAX
+    settings = RasterSettings(alpha_max=_ALPHA_MAX)
+    for camera in _views(scene):
+        parts = [_on_cpu(part) for part in scene.parts_for(camera)]
+        inputs = gather_inputs(parts, camera, settings, None, with_color=True, culled=True)
+        tape = record(inputs, camera, settings, scratch, with_depth=False)
+        d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
+        ids, weights, effects = tape.splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
+        own = (ids >= 0) & (ids < count)
+        ids, weights = ids[own], weights[own] / np.float32(LUMA[0])
+        least = np.where(opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
+        change = np.maximum(np.abs(effects[own]), least) / tape.alpha.size
+        known = changes[ids]
+        changes[ids] = np.maximum(np.where(np.isinf(known), 0, known), change)
+    return changes
+
+
+def _recorded(scene: Scene) -> list[Camera]:
+    frames = scene.seen_frames or scene.frames  # those of a camera path may see less
+    return [camera for frame in frames for camera in frame.cameras.values()]
+
+
+def _views(scene: Scene) -> list[Camera]:
+    """Spread over all recorded images, small."""
+    cameras = _recorded(scene)
+    places = np.linspace(0, len(cameras) - 1, min(MAX_VIEWS, len(cameras))).round().astype(int)
+    chosen = [cameras[place] for place in places if not cameras[place].is_orthographic]
+    return [camera.scaled(min(1.0, MAX_WIDTH_PX / camera.width)) for camera in chosen]
+
+
+def _on_cpu(part: PosedGaussians) -> PosedGaussians:
+    g = part.gaussians
+    if g.means.device.type == "cpu":
+        return part
+    fields = (g.means, g.quats, g.scales, g.opacities, g.sh)
+    return replace(part, gaussians=Gaussians(*(tensor.detach().cpu() for tensor in fields)))

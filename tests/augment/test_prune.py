@@ -1,0 +1,146 @@
+"""Splats that no recorded view would miss: what their absence changes, and from where they go."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from augment import prune
+from augment.cameras import Camera, Frame
+from augment.effects import Sharing, share_effects
+from augment.memo import memo_of
+from augment.plan import make_plan
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.sky import ConstantSky
+from augment.views import render_buffers, render_view
+from recipes.schema import Output, Recipe, Render
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, stack
+from tests.streets import open_street
+
+
+def scene_of(gaussians: Gaussians, *cameras: Camera) -> Scene:
+    frames = tuple(
+        Frame(n, camera.timestamp_ns, torch.eye(4, dtype=torch.float64), {camera.name: camera})
+        for n, camera in enumerate(cameras)
+    )
+    sky = ConstantSky(torch.full((3,), prune.SKY))
+    return Scene("pruned", "test:pruned", gaussians, actors=(), frames=frames, sky=sky)
+
+
+def buffers(scene: Scene, camera: Camera, millionths: float):
+    recipe = Recipe(render=Render(prune=millionths), output=Output(depth="median"))
+    return render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
+
+
+def luma(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+    out = rasterize([PosedGaussians(gaussians)], camera, backend="cpu")
+    assert out.rgb is not None and out.alpha is not None
+    seen = out.rgb + (1 - out.alpha)[..., None] * prune.SKY
+    return seen.double() @ torch.tensor(prune.LUMA, dtype=torch.float64)
+
+
+def test_changes_are_those_of_pictures_without_the_splat():
+    splats = random_gaussians(40, seed=3, sh_degree=1)
+    splats = dataclasses.replace(splats, opacities=splats.opacities.clamp(0.02, 0.9))
+    camera = camera_ahead(64, 48, 50.0)
+    found = prune.changes_of(scene_of(splats, camera))
+    whole, there = luma(splats, camera), np.isfinite(found)
+    assert 10 < there.sum() < 40  # some stand behind the camera
+    for i in np.flatnonzero(there):
+        left = splats.select(torch.arange(40) != i)
+        change = abs(float((luma(left, camera) - whole).mean()))
+        assert found[i] >= 0.97 * change - 1e-7  # the cut-off at 1/255 comes sooner or later
+        own = rasterize([PosedGaussians(splats.select(torch.tensor([i])))], camera, backend="cpu")
+        assert own.alpha is not None  # weights are no more than alphas
+        most = max(change * 1.03, prune.LEAST_CONTRAST * float(own.alpha.mean()))
+        assert found[i] <= most + 1e-7
+
+
+def street_of_walls() -> tuple[Scene, Camera]:
+    """A red wall, 100 splats that it hides, one beside it, and one behind the camera."""
+    y, z = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-2, 2, 9))
+    wall = stack(*(one_gaussian((5.0, *at), 0.5, 0.999) for at in zip(y.flat, z.flat, strict=True)))
+    hidden = random_gaussians(100, seed=1, sh_degree=0, size=0.1)
+    hidden.means[:] = torch.tensor([12.0, 0, 0]) + hidden.means * 0.05
+    others = stack(one_gaussian((5.0, 2.9, 0.0), 0.01, 0.05), one_gaussian((-5.0, 0.0, 0.0)))
+    camera = camera_ahead(64, 48, 50.0)
+    return scene_of(stack(wall, hidden, others), camera), camera
+
+
+def test_hidden_splats_go_without_a_trace_and_those_that_no_view_framed_stay():
+    scene, camera = street_of_walls()
+    changes = prune.changes_of(scene)
+    assert np.isinf(changes[-1]) and (changes[117:217] < 1e-6).all()
+    bare, less = buffers(scene, camera, 0), buffers(scene, camera, 1.0)
+    opacities = less.parts[0].gaussians.opacities
+    assert (opacities[117:217] == 0).all() and (opacities[:117] > 0).all() and opacities[-1] > 0
+    assert float((bare.rgb - less.rgb).abs().max()) < 1 / 255
+    assert less.depth_m is not None and torch.equal(less.depth_m, bare.depth_m)
+    assert (scene.background.opacities[117:217] > 0).all()  # nobody's scene is written to
+
+
+def test_the_mean_change_keeps_to_what_was_asked_for():
+    scene = scene_of(random_gaussians(3000, seed=5, sh_degree=0), camera_ahead(64, 48, 50.0))
+    (camera,) = scene.frames[0].cameras.values()
+    whole = buffers(scene, camera, 0).rgb
+    errors = list[float]()
+    for millionths in (1.0, 10.0, 100.0):
+        left_out = int((prune.changes_of(scene) <= 1e-6 * millionths).sum())
+        error = float((buffers(scene, camera, millionths).rgb - whole).abs().mean())
+        # Colours differ by more than luma, and signs cancel within a splat: hence twice.
+        assert left_out > 0 and error <= 2e-6 * millionths * left_out
+        errors.append(error)
+    assert errors == sorted(errors)
+
+
+def test_views_from_elsewhere_draw_all():
+    scene, camera = street_of_walls()
+    near, far = (camera_ahead(64, 48, 50.0, position=(0.0, 0.0, up)) for up in (1.9, 2.1))
+    for view, is_pruned in ((camera, True), (near, True), (far, False)):
+        opacities = buffers(scene, view, 1.0).parts[0].gaussians.opacities
+        assert bool((opacities[117:217] == 0).all()) is is_pruned
+
+
+@pytest.mark.parametrize("render", [Render(), Render(prune=1.0, lod_px=1.0)])
+def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
+    scene, camera = street_of_walls()
+    recipe = Recipe(render=render)
+    share_effects(Sharing(scene, [recipe]))
+    if render.prune == 0:
+        assert not memo_of(scene).shared()
+    plan = make_plan(recipe, scene)
+    assert plan.prune == 0
+    left = render_buffers(scene, camera, plan, backend="cpu").parts[0].gaussians.opacities
+    assert left is scene.background.opacities
+
+
+def test_other_processes_take_the_changes_over():
+    scene, camera = street_of_walls()
+    recipe = Recipe(render=Render(prune=1.0))
+    share_effects(Sharing(scene, [recipe]))
+    other = dataclasses.replace(scene)
+    memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
+    np.testing.assert_array_equal(prune.changes_of(other), prune.changes_of(scene))
+    alone = dataclasses.replace(scene)
+    assert torch.equal(
+        buffers(other, camera, 1.0).rgb, buffers(alone, camera, 1.0).rgb
+    )  # the same bits, whoever found them
+
+
+def test_weather_is_drawn_on_what_is_left():
+    scene = open_street()
+    camera = scene.frames[0].cameras["front"].scaled(0.1)
+    weather = {"snow": {"depth_m": 0.1, "cell_m": 0.4}, "flood": {"level_m": 0.1}}
+    views = [
+        render_view(scene, camera, Recipe(weather=weather, render=Render(prune=millionths)))
+        for millionths in (0.0, 0.5)
+    ]
+    off = np.abs(views[0].rgb.astype(int) - views[1].rgb).mean()
+    assert 0 < off < 2  # levels of 255
+    for name, mask in views[0].masks.items():
+        assert (mask != views[1].masks[name]).mean() < 0.01
