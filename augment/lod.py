@@ -330,7 +330,8 @@ def _reweighed(finer: Level, g: Gaussians, own: Level) -> Gaussians:
 
 def keeps_levels(gaussians: Gaussians) -> bool:
     """Whether levels lie in a file with these Gaussians."""
-    return memo_of(gaussians).known(_STORED)
+    is_known = memo_of(gaussians).known(_STORED)
+    return is_known and levels_of(gaussians).levels[0].unchecked is not None
 
 
 def join_pieces(pieces: Iterable[Piece]) -> Piece:

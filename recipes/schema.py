@@ -196,7 +196,9 @@ class Render(Section):
             tiers={"draft": 0.01, "balanced": 0.01},
         ),
         Knob("fog_cut", (0.02, 0.002, 0.0), "splats behind so much fog are left out", 5.5),
-        Knob("prune", (0.25, 0.15, 0.05, 0.0), "splats that no view would miss are left out", 1.5),
+        Knob(
+            "prune", (1.0, 0.2, 0.12, 0.05, 0.0), "splats that no view would miss are left out", 1.5
+        ),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
 

@@ -12,6 +12,7 @@ import torch
 from augment import prune
 from augment.cameras import Camera, Frame
 from augment.effects import Sharing, share_effects
+from augment.lod import MIN_SPLATS
 from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
@@ -96,6 +97,16 @@ def test_the_mean_change_keeps_to_what_was_asked_for():
         assert left_out > 0 and error <= 2e-6 * millionths * left_out
         errors.append(error)
     assert errors == sorted(errors)
+
+
+def test_views_in_levels_change_nothing_for_those_after_them():
+    g = random_gaussians(MIN_SPLATS, seed=2, sh_degree=0, size=0.05)
+    scene = scene_of(g, camera := camera_ahead(64, 48, 50.0))
+    before = buffers(scene, camera, 10.0).rgb
+    recipe = Recipe(render=Render(lod_px=1.0))
+    render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
+    assert torch.equal(buffers(scene, camera, 10.0).rgb, before)
+    assert not torch.equal(buffers(scene, camera, 0.0).rgb, before)
 
 
 def test_views_from_elsewhere_draw_all():

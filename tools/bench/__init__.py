@@ -169,8 +169,8 @@ def bench_trade(
 
     Args:
         scene: What is rendered.
-        recipe: A preset or a file, or clean, smog, flood, snow, style or all; may be given several
-            times. By default those six.
+        recipe: A preset or a file, or clean, smog, flood, snow, style, rain, snowfall, fog (the
+            picture alone) or all; may be given several times. By default those nine.
         quick: Small pictures, one timed frame of each, and no memory.
         device: What renders.
         table: Also write the tables to this file, as Markdown.

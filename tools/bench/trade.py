@@ -46,8 +46,10 @@ from augment.ground import ground_of
 from augment.jobs.files import decode_image, encode_image
 from augment.jobs.quality import Cost, Settings, Trial, render_trial, search, useful
 from augment.jobs.worker import default_renderer
+from augment.memo import memo_of
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import depth_errors, flip, ssim
+from augment.prune import share_changes
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
@@ -78,14 +80,18 @@ DEPTH, JPEG = "output.depth", "output.jpeg_quality"
 REFERENCE, DEFAULTS, CLEAN = "reference", "defaults", "clean"
 WATER = "water"  # the mask of what a ray meets before the scene
 TRUTH = "truth"  # what depths are compared with where the scene's surfaces are known
-PRESETS = {"smog": "brown-smog", "flood": "street-flood", "snow": "fresh-snow", "style": "evening"}
+PRESETS = {
+    "smog": "brown-smog", "flood": "street-flood", "snow": "fresh-snow", "style": "evening",
+    "rain": "rain", "snowfall": "flurries",
+}  # fmt: skip
+FOG = {"smog": {"visibility_m": 50.0}}  # of which the picture alone is rendered: it hides splats
 ALL = {
     "smog": {"visibility_m": 400.0, "scale_height_m": 120.0},
     "flood": {"level_m": 0.15, "turbidity_ntu": 20.0},
     "snow": {"depth_m": 0.1},
     "style": {"preset": "overcast"},
 }
-RECIPES = (CLEAN, *PRESETS, "all")
+RECIPES = (CLEAN, *PRESETS, "fog", "all")
 AT_A_TIME = 6  # settings between two frames of the reference
 DIGITS = 4  # significant ones that figures keep
 # What is measured of a knob at a value, by its heading where people read it.
@@ -108,11 +114,11 @@ Wholes = Mapping[str, Mapping[str, Value]]
 @dataclass(frozen=True)
 class TradeCase:
     """width: pixels of the pictures, at most. repeats: timed frames of each setting and view.
-    memory: whether it is measured.
+    memory: whether it is measured, of settings as a whole.
     """
 
     width: int = 640
-    repeats: int = 9
+    repeats: int = 4
     memory: bool = True
 
 
@@ -121,7 +127,9 @@ WHOLE_CASE, QUICK = TradeCase(), TradeCase(width=240, repeats=1, memory=False)
 
 def trade_recipe(name: str) -> Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
-    if name in (CLEAN, "all"):
+    if name == "fog":
+        recipe = recipe_of(FOG, Output(depth="none", labels=False, lidar=False))
+    elif name in (CLEAN, "all"):
         recipe = recipe_of(ALL if name == "all" else {}, Output())
     else:
         recipe = load_recipe(PRESETS.get(name, name)).resolve(0)
@@ -129,9 +137,12 @@ def trade_recipe(name: str) -> Recipe:
     return recipe.model_copy(update={"name": called, "quality": Quality()})
 
 
-def measured_values(knob: Knob) -> Sequence[Value]:
-    """Those that pictures are rendered with: all estimators of depth, which none is the best of."""
-    if knob.path == JPEG:  # is measured of files
+def measured_values(knob: Knob, recipe: Recipe | None = None) -> Sequence[Value]:
+    """Those that pictures are rendered with: all estimators of depth, which none is the best of.
+    recipe: None for any.
+    """
+    is_alone = recipe is not None and recipe.output.depth == "none"
+    if knob.path == JPEG or (knob.path == DEPTH and is_alone):  # the first is measured of files
         return ()
     return knob.values if knob.path == DEPTH else knob.values[:-1]
 
@@ -145,7 +156,7 @@ def settings_of_trade(recipe: Recipe, wholes: Wholes | None = None) -> list[tupl
     references = {knob.path: knob.reference for knob in knobs if knob.chosen}
     single: list[tuple[Row, Recipe]] = []
     if wholes is None:
-        pairs = [(knob.path, value) for knob in knobs for value in measured_values(knob)]
+        pairs = [(knob.path, value) for knob in knobs for value in measured_values(knob, recipe)]
         single = [({"knob": p, "value": v}, with_settings(best, {p: v})) for p, v in pairs]
         single.append(({"knob": WHOLE, "value": DEFAULTS}, recipe))
     whole: list[tuple[Row, Recipe]] = []
@@ -341,6 +352,7 @@ def bench_trade(
     scene = open_scene(scene_uri)
     with contextlib.suppress(SceneError):  # looked for once, not for every copy of the scene
         scene = dataclasses.replace(scene, ground=ground_of(scene))
+    share_changes(scene)
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
     machine, gpu = harness.machine_facts(), None if backend == CPU else harness.gpu_facts()
@@ -350,6 +362,7 @@ def bench_trade(
     entries = []
     for recipe in tqdm(drawn, unit="recipe"):
         own = dataclasses.replace(scene)  # which forgets what it knows of other recipes
+        memo_of(own).update(memo_of(scene).shared())
         settings = settings_of_trade(recipe, wholes)
         standards = [
             standard_of(own, camera, settings[0][1], true, backend)
@@ -413,7 +426,7 @@ def setting_rows(
             row["over_reference"] = harness.spread_ratio(seconds[n], seconds[1])["median"]
             row["over_clean"] = harness.spread_ratio(seconds[n], seconds[0])["median"]
             row |= errors_of(row["knob"], trials[n], standards)
-            if case.memory:
+            if case.memory and row["knob"] == WHOLE:
                 row["mib"] = frame_mib(frame(own, cameras[0]), backend)
             yield row, trials[n][0].picture
 
