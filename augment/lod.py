@@ -668,7 +668,8 @@ def _pieces(
         if not len(rows):
             continue
         if shares.min() < 1:
-            opacities = g.opacities.clone() if is_small else torch.empty(len(g))
+            own = g.opacities.numpy()  # NumPy wakes no threads
+            opacities = torch.from_numpy(own.copy() if is_small else np.empty_like(own))
             for (first, last), share in zip(rows.tolist(), shares.tolist(), strict=True):
                 if share < 1:
                     opacities[first:last] = faded(g.opacities[first:last], share)
@@ -690,7 +691,7 @@ def _pieces(
 
 def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
     """Of splats that are drawn for a share of what they hide."""
-    own = opacities.numpy()  # NumPy wakes no threads
+    own = opacities.numpy()
     low = np.clip(own, 1e-6, 0.99)  # flat tops, which have more, fade in proportion
     return torch.from_numpy(own * (-np.expm1(share * np.log1p(-low)) / low))
 
