@@ -384,7 +384,7 @@ def test_a_dry_recipe_keeps_its_bits_and_a_wet_one_mirrors_the_wall():
 def test_a_coarse_mirror_shows_nearly_what_a_fine_one_does():
     scene, eye = street()
     fine, coarse = (
-        render_view(scene, eye.scaled(4), rain(0.0, wetness=1.0, mirror_px=px)).rgb.astype(float)
+        render_view(scene, eye.scaled(4.0), rain(0.0, wetness=1.0, mirror_px=px)).rgb.astype(float)
         for px in (2, 4)
     )
     assert 0 < np.abs(fine - coarse).mean() < 0.5  # of 255: 0.2, most of it at the wall's edges
