@@ -83,6 +83,10 @@ class WetEffect(Effect):
     draws = (MIRRORED,)
     shares_files = True
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        rain = self.of(recipe)
+        return rain is not None and rain.ground_wetness > 0
+
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         rain = self.of(recipe)
         why = ""
