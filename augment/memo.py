@@ -104,6 +104,20 @@ class SceneMemo:
         return value
 
 
+class Latest:
+    """The value of the last key that was asked for. Threads may share it: one makes the value."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[Hashable, Any] | None = None
+        self._making = threading.Lock()
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        with self._making:
+            if self._kept is None or self._kept[0] != key:
+                self._kept = key, make()
+            return self._kept[1]
+
+
 def memo_of(owner: Any) -> SceneMemo:
     """The memo of a scene, or of any object that is hashed by identity; it goes when that goes."""
     with _lock:

@@ -20,7 +20,7 @@ from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LabelSource, LidarSweep
-from augment.memo import memo_of
+from augment.memo import Latest, memo_of
 from augment.render.sh import rotate_sh, sh_turn
 from augment.render.threads import kernel_threads
 from augment.sky import Sky
@@ -355,13 +355,23 @@ class Actor:
             )
 
     def gaussians_at(self, timestamp_ns: int) -> Gaussians:
-        """Its Gaussians in the colours they have at a time, SH for directions in its own frame."""
+        """Its Gaussians in the colours they have at a time, SH for directions in its own frame. The
+        last moment's are kept, for other cameras that look at it.
+        """
         pose = self.track.pose_at(timestamp_ns) if self.colors_in_world else None
         turn = None if pose is None or self.gaussians.sh_degree == 0 else pose[:3, :3].T
         if self.color_waves is None and turn is None:
             return self.gaussians
-        sh = colors_at(self.gaussians.sh, self.color_waves, timestamp_ns, turn)
-        return replace(self.gaussians, sh=sh)
+        own, waves = self.gaussians, self.color_waves
+
+        def color() -> Gaussians:
+            return replace(own, sh=colors_at(own.sh, waves, timestamp_ns, turn))
+
+        read = [own.sh, *([] if waves is None else [waves.coefficients])]
+        if any(tensor.requires_grad or tensor.is_inference() for tensor in read):
+            return color()
+        moment = timestamp_ns, *(tensor._version for tensor in read)
+        return memo_of(self).get(("colours of a moment",), Latest).get(moment, color)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def composite_cubemap(
     texels, line = faces.reshape(-1), U(3 * faces.shape[1])
     scale = np.float32(faces.shape[1] - 2) * half
     for i in prange(height):
-        places = np.empty(4 * _AHEAD, np.float32)
+        places, begins = np.empty(4 * _AHEAD, np.float32), np.empty(_AHEAD, np.uint64)
         v = (np.float32(i) + half - cy) * ify
         bx = rotation[0, 1] * v + rotation[0, 2]
         by = rotation[1, 1] * v + rotation[1, 2]
@@ -106,9 +106,14 @@ def composite_cubemap(
                 y = v8.splat(rotation[1, 0]) * u + v8.splat(by)
                 z = v8.splat(rotation[2, 0]) * u + v8.splat(bz)
                 _place_eight(x, y, z, scale, np.float32(faces.shape[1]), places, k)
-            for k in range(min(U(_AHEAD), U(width) - first)):
-                j = first + k
+            count = min(U(_AHEAD), U(width) - first)
+            for k in range(count):  # a row of pixels crosses many of texels, each far in memory
                 at = U(np.int32(places[k])) * line + U(3) * U(np.int32(places[k + U(_AHEAD)]))
+                v8.prefetch(texels, at)
+                v8.prefetch(texels, at + line)
+                begins[k] = at
+            for k in range(count):
+                j, at = first + k, begins[k]
                 fc, fr = places[k + U(2 * _AHEAD)], places[k + U(3 * _AHEAD)]
                 transmittance = one - alphas[j]
                 visible, gain = one, np.float32(0)

@@ -265,6 +265,20 @@ def test_colours_in_the_world_stand_still_while_an_actor_turns():
     assert fixed.gaussians_at(1_600) is gaussians
 
 
+def test_cameras_of_a_moment_share_an_actors_colours():
+    gaussians = dataclasses.replace(some(3), sh=torch.ones(3, 4, 3))
+    actor = Actor("a", "car", gaussians, track(), (4.0, 2.0, 1.5), waves(), colors_in_world=True)
+    first = actor.gaussians_at(1_250)
+    assert actor.gaussians_at(1_250) is first
+    later = actor.gaussians_at(1_600)
+    assert not torch.equal(later.sh, first.sh)
+    assert torch.equal(actor.gaussians_at(1_250).sh, first.sh)
+    gaussians.sh.mul_(2)  # in place: what was kept is no longer true
+    assert not torch.equal(actor.gaussians_at(1_250).sh, first.sh)
+    gaussians.sh.requires_grad_()
+    assert all(actor.gaussians_at(1_250).sh.requires_grad for _ in range(2))
+
+
 @pytest.mark.parametrize("bands", [1, 4, 9, 16])
 @pytest.mark.parametrize("has_waves", [False, True])
 @pytest.mark.parametrize("turns", [False, True])

@@ -96,15 +96,18 @@ def blend_puffs(
     numbers, before = _numbers(puffs, camera, fog), np.zeros(3)
     if fog is not None:
         before = np.square(np.asarray(fog.rgb, np.float64))
-    surfaces = torch.where((alpha >= 0.5) & (depth > 0), depth, torch.inf).float()
     if kernels_for(backend, rgb, depth) == CPU and rgb.is_contiguous():
+        # By numpy: torch's threads would wait for more work, on the cores that the kernel needs.
+        z = depth.contiguous().numpy()
+        surfaces = np.where((alpha.detach().numpy() >= 0.5) & (z > 0), z, np.float32(np.inf))
         rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         with kernel_threads(ROWS):
             kernels.blend_puffs(
-                rgb.detach().numpy(), surfaces.contiguous().numpy(), rays, numbers, windows,
+                rgb.detach().numpy(), surfaces, rays, numbers, windows,
                 np.asarray(light, np.float64), before,
             )  # fmt: skip
         return rgb
+    surfaces = torch.where((alpha >= 0.5) & (depth > 0), depth, torch.inf).float()
     return _blend_by_torch(rgb, surfaces, camera, numbers, windows, light, before)
 
 

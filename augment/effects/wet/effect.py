@@ -58,6 +58,7 @@ DARKER, MIRRORED, SHINE = PASSES = (
 LEAST_SEEN = 0.05  # of a photo's ground through fog, below which its colour is not known
 COARSE = 0.5  # resolution of the mirrored view
 STOP = 0.01  # of its transmittance: a film reflects little of what is behind that
+SOLID = 0.5  # alpha from which on the mirrored view shows a surface
 LOWERED_M = 0.3  # below the plane: what stands on ground that is no plane is whole
 LOW_MARGIN_PX = 8
 UP_MARGIN = 0.2  # of the image's height, that rough ground looks higher than its mirror
@@ -198,7 +199,11 @@ def _draw_mirror(
     assert raster.rgb is not None and raster.alpha is not None
     assert raster.expected_depth is not None
     rgb = layers.add_sky(raster.rgb, raster.alpha, view)
-    depth = torch.where(raster.alpha >= 0.5, raster.expected_depth, 0.0)
+    depth = raster.expected_depth
+    if depth.device.type == "cpu":  # torch's threads would wait for more work meanwhile
+        depth.detach().numpy()[raster.alpha.detach().numpy() < SOLID] = 0
+    else:
+        depth = torch.where(raster.alpha >= SOLID, depth, 0.0)
     return Mirror(view, blur_upright(rgb, backend=own.backend), depth)
 
 

@@ -283,6 +283,7 @@ MOTTLE_SIDE = 256  # a power of 2: texels of the noise that makes film and rough
 FINE_M, COARSE_M = 0.012, 0.2  # its texels
 FINE, COARSE = 0.07, 0.05  # by how much of the film
 LEVELS = 9  # of the mirrored picture: sharp, and blurred upright by 2 to 256 pixels
+SHARP_PX = 2.0  # of the image: blurs of less are none
 FARTHEST_M = 1e5  # stands for the sky
 RUN = 6144  # numbers that a thread decodes at a time
 _LEAST = 1e-6  # what 1 - cosine is at least
@@ -543,8 +544,9 @@ def _shade_row(
             v8.fmuladd(way, v8.fmuladd(py, per_distance, twice * ny), my),
             v8.fmuladd(way, v8.fmuladd(pz, per_distance, twice * nz), mz),
         )
-        sigma = v8.splat(np.float32(2) * mirror.lens[1]) * rough * way / (way + distance)
-        sigma = v8.maximum(sigma * sigma / (sigma + one), one)  # less than a pixel is none
+        sigma = v8.splat(np.float32(2) / lens[1]) * rough * way / (way + distance)
+        sigma = sigma * sigma / (sigma + _splat(SHARP_PX))
+        sigma = v8.maximum(sigma * v8.splat(mirror.lens[1] * lens[1]), one)
         red, green, blue = _look_at(mirror, colors, levels, column, row, sigma, places, spare)
         strength = own * cover * _reflectance(cosine, rough)
         r, g, b_ = v8.load_colours(rgb, U(3) * pixel)

@@ -56,6 +56,7 @@ from augment.effects.wet.kernels import (
     RIM,
     RISE_X,
     RISE_Y,
+    SHARP_PX,
     TRACK,
     TRACK_SMOOTHS,
 )
@@ -174,29 +175,29 @@ def blur_upright(
         image, levels = linear, [torch.from_numpy(linear)]
         for k in range(1, LEVELS):
             upright, aside = map(_taps, _widening(k))
-            image = cv2.sepFilter2D(image, -1, aside, upright, borderType=cv2.BORDER_REPLICATE)
             if k >= 2:
                 image = np.concatenate((image, image[-1:])) if len(image) % 2 else image
-                image = 0.5 * (image[0::2] + image[1::2])
+                image = cv2.addWeighted(image[0::2], 0.5, image[1::2], 0.5, 0.0)
+            image = cv2.sepFilter2D(image, -1, aside, upright, borderType=cv2.BORDER_REPLICATE)
             levels.append(torch.from_numpy(image))
         return levels
     linear = linear_of(rgb)
     image, found = linear.permute(2, 0, 1)[:, None], [linear]  # [3, 1, H, W]
     for k in range(1, LEVELS):
-        for axis, sigma in zip((2, 3), _widening(k), strict=True):
-            image = _gauss(image, sigma, axis)
         if k >= 2:
             image = _halved(image)
+        for axis, sigma in zip((2, 3), _widening(k), strict=True):
+            image = _gauss(image, sigma, axis)
         found.append(image[:, 0].permute(1, 2, 0))
     return found
 
 
 def _widening(k: int) -> tuple[float, float]:
-    """Standard deviations upright, in rows that are 2^(k-2) apart (or 1), and sideways, that take a
-    blur of 2^(k-1) pixels (or none) to one of 2^k.
+    """Standard deviations upright, in rows that are 2^(k-1) apart, and sideways, that take a blur
+    of 2^(k-1) pixels (or none) to one of 2^k.
     """
     added = math.sqrt(4.0**k - (4.0 ** (k - 1) if k > 1 else 0.0))
-    return added / 2.0 ** max(k - 2, 0), SIDEWAYS * added
+    return added / 2.0 ** (k - 1), SIDEWAYS * added
 
 
 def _taps(sigma: float) -> np.ndarray:
@@ -380,8 +381,8 @@ def _seen_in_mirror(
 
     way = way_at(*project(points - to_mirror))
     column, row = project(points + way[..., None] * ray - to_mirror)
-    sigma = view.fy * 2 * rough * way / (way + distance)
-    sigma = sigma * sigma / (sigma + 1)  # less than a pixel is none
+    sigma = camera.fy * 2 * rough * way / (way + distance)
+    sigma = sigma * sigma / (sigma + SHARP_PX) * (view.fy / camera.fy)
     found = _look_up(mirror.levels, column.reshape(-1), row.reshape(-1), sigma.reshape(-1))
     return found.reshape(*column.shape, 3)
 
