@@ -31,6 +31,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.memo import memo_of
 from augment.render.buffers import SPLAT_IDS, RenderOutput
 from augment.render.constants import ALPHA_MIN, COV2D_BLUR, RasterSettings
-from augment.render.cpu.order import CELL, may_be_drawn
+from augment.render.cpu.order import CELL, known_of, may_be_drawn
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.sh import SH_C0
@@ -66,7 +67,7 @@ BLUR_CELLS = math.sqrt(2 * COV2D_BLUR)
 FLAT_TOP = 2.0  # a flat top covers this many times what the deviations say; beyond it they grow
 MAX_OPACITY = math.exp(FLAT_TOP - 1)
 THINNEST_M = 1e-4
-FEW_TESTED = 64  # squares whose splats are tested as quickly as they are
+FEW_TESTED = 1024  # squares whose splats are tested as quickly as they are
 BATCH = 1 << 18  # splats merged at once
 OFF_GRID = (0.37, 0.37, 0.5)  # of a cell: walls and ground at round numbers lie within one
 _ODD = np.uint64(0x9E3779B97F4A7C15)
@@ -119,6 +120,10 @@ class Boxes(NamedTuple):
         lows, highs = (f.reduceat(means, starts) for f in (np.minimum, np.maximum))
         return Boxes(lows, highs, np.maximum.reduceat(longest, starts))
 
+    @staticmethod
+    def join(boxes: Sequence[Boxes]) -> Boxes:
+        return Boxes(*map(np.concatenate, zip(*boxes, strict=True)))
+
     def bounds(self, rows: np.ndarray) -> Bounds:
         lows, highs = self.lows[rows].astype(np.float64), self.highs[rows].astype(np.float64)
         owners = np.zeros(len(rows), np.int64)
@@ -129,13 +134,15 @@ class Boxes(NamedTuple):
 class Level:
     """Splats, square after square, neighbours together. stands_for [N]: the part's own splat whose
     number and class each has. unchecked: the file that they come from, whose numbers are looked at
-    when they are taken. splats: of the part, where it is unchecked.
+    when they are taken. splats: of the part, where it is unchecked. parents [N]: the splat of the
+    next level that each is merged into, -1 for none.
     """
 
     gaussians: Gaussians
     stands_for: Int32[np.ndarray, "N"]
     squares: Squares
     boxes: Boxes
+    parents: Int32[np.ndarray, "N"]
     unchecked: str | None = None
     splats: int = 0
     _checked: Bool[np.ndarray, "C"] = field(init=False)
@@ -158,12 +165,48 @@ class Level:
         self._checked[cells] = True
 
 
+class Tree(NamedTuple):
+    """The squares of all levels, [S], those of level 0 first. numbers: their levels. parents: the
+    square that holds each, -1 for none. firsts, ends: of their splats. cells_m: c_k; 0 of level 0.
+    cells: the Boxes of all levels; cell_starts: where each level's begin.
+    """
+
+    boxes: Boxes
+    numbers: Int64[np.ndarray, "S"]
+    parents: Int64[np.ndarray, "S"]
+    firsts: Int64[np.ndarray, "S"]
+    ends: Int64[np.ndarray, "S"]
+    cells_m: Float[np.ndarray, "S"]
+    cells: Boxes
+    cell_starts: Int64[np.ndarray, "_"]
+
+
 @dataclass(frozen=True, eq=False)
 class Levels:
     """Of a part, the finest first. finest_m: c_1."""
 
     finest_m: float
     levels: tuple[Level, ...]
+
+    @cached_property
+    def tree(self) -> Tree:
+        squares, cells = [own.squares for own in self.levels], [own.boxes for own in self.levels]
+        counts = [len(own) for own in squares]
+        numbers = np.repeat(np.arange(len(counts)), counts)
+        starts, parents = np.cumsum([0, *counts]), np.full(sum(counts), -1)
+        for number, (finer, own) in enumerate(itertools.pairwise(squares)):
+            above = starts[number + 1] + np.searchsorted(own.keys, finer.keys >> 2)
+            parents[starts[number] : starts[number + 1]] = above
+        return Tree(
+            Boxes.join([Boxes(own.lows, own.highs, own.longest) for own in squares]),
+            numbers,
+            parents,
+            np.concatenate([own.starts[:-1] for own in squares]),
+            np.concatenate([own.starts[1:] for own in squares]),
+            np.where(numbers > 0, self.finest_m * 2.0 ** (numbers - 1), 0),
+            Boxes.join(cells),
+            np.cumsum([0, *(len(own.longest) for own in cells)]),
+        )
 
     def cell_m(self, number: int) -> float:
         return self.finest_m * 2.0 ** (number - 1)
@@ -214,14 +257,75 @@ class Piece(NamedTuple):
 
 def levels_of(gaussians: Gaussians, *, antialiased: bool = False) -> Levels:
     """The levels of a part, made once for these Gaussians."""
-    return memo_of(gaussians).get(
-        (*_LEVELS, antialiased), lambda: build_levels(gaussians, antialiased=antialiased)
-    )
+
+    def make() -> Levels:
+        stored = known_of(gaussians.means, "levels", lambda: None)
+        if stored is None or antialiased or not _has_shapes(gaussians, stored.levels[0].gaussians):
+            return build_levels(gaussians, antialiased=antialiased)
+        return edited_levels(stored, gaussians)
+
+    return memo_of(gaussians).get((*_LEVELS, antialiased), make)
 
 
 def keep_levels(gaussians: Gaussians, levels: Levels) -> None:
-    """Let `levels_of` know levels that lie in a file. levels: must not hold this object."""
+    """Let `levels_of` know levels that lie in a file. levels: must not hold this object, or its
+    means.
+    """
     memo_of(gaussians).put(_STORED, levels, shared=True)
+    known_of(gaussians.means, "levels", lambda: levels)
+
+
+def _has_shapes(g: Gaussians, other: Gaussians) -> bool:
+    return all(getattr(g, n).data_ptr() == getattr(other, n).data_ptr() for n in _COLUMNS[:3])
+
+
+def edited_levels(levels: Levels, g: Gaussians) -> Levels:
+    """The levels of Gaussians that have other colours, or let more through: mean colours and sums
+    of opacities are taken anew, where nothing moves.
+
+    Raises:
+        SceneError: the levels' file is damaged.
+    """
+    edited = [replace(levels.levels[0], gaussians=rows_of(g, slice(None)), unchecked=None)]
+    for finer, own in itertools.pairwise(levels.levels):
+        if len(finer.parents) and not -1 <= finer.parents.min() <= finer.parents.max() < len(
+            own.gaussians
+        ):
+            raise SceneError(f"{own.unchecked}: parents must be splats of the next level")
+        edited.append(replace(own, gaussians=_reweighed(finer, edited[-1].gaussians, own)))
+    return replace(levels, levels=tuple(edited))
+
+
+def _reweighed(finer: Level, g: Gaussians, own: Level) -> Gaussians:
+    """The splats of a level as the finer ones' new opacities and colours make them."""
+    count, functions = len(own.gaussians), g.sh.shape[1]
+    before, after, sh = np.zeros(count), np.zeros(count), np.zeros((count, functions * 3))
+    for rows in batches(len(g)):
+        into = finer.parents[rows]
+        merged = np.flatnonzero(into >= 0)
+        if not len(merged):
+            continue
+        into = into[merged]
+        first, end = int(into.min()), int(into.max()) + 1
+        a, b, c = g.scales[rows].double().numpy()[merged].T
+        area, size = a * b + b * c + c * a, end - first
+        weights = area * g.opacities[rows].numpy()[merged]
+        whole = area * finer.gaussians.opacities[rows].numpy()[merged]
+        before[first:end] += np.bincount(into - first, whole, size)
+        after[first:end] += np.bincount(into - first, weights, size)
+        values = g.sh[rows].reshape(-1, functions * 3).numpy()[merged]
+        for column in range(functions * 3):
+            own_sum = np.bincount(into - first, weights * values[:, column], size)
+            sh[first:end, column] += own_sum
+    is_left = (after > 0) & (before > 0)
+    left = np.where(is_left, after / np.where(is_left, before, 1), 0)
+    known = np.where(is_left, after, 1)[:, None]
+    mean = np.where(is_left[:, None], sh / known, own.gaussians.sh.reshape(count, -1).numpy())
+    return replace(
+        own.gaussians,
+        opacities=own.gaussians.opacities * torch.from_numpy(left).clamp(max=1).float(),
+        sh=torch.from_numpy(mean.astype(np.float32)).reshape(own.gaussians.sh.shape),
+    )
 
 
 def keeps_levels(gaussians: Gaussians) -> bool:
@@ -333,33 +437,37 @@ def level_of(found: Piece, finer: Squares | None = None) -> Level:
         lows = np.minimum.reduceat(finer.lows, firsts)
         highs = np.maximum.reduceat(finer.highs, firsts)
     boxes = Boxes.around(g, np.arange(0, len(g), CELL))
-    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes)
+    parents = np.full(len(g), -1, np.int32)
+    return Level(g, found.stands_for, Squares(own, starts, lows, highs, longest), boxes, parents)
 
 
 def coarser(finer: Level, cell_m: float, *, antialiased: bool = False) -> Iterator[Piece]:
-    """The next level, a few squares at a time. cell_m: its cells."""
+    """The next level, a few squares at a time; `finer` learns its parents. cell_m: its cells."""
     keys = finer.squares.keys >> 2
     firsts = np.append(np.flatnonzero(np.diff(keys, prepend=-1)), len(keys))
     starts = finer.squares.starts[firsts]
     blur_m = 0.0 if antialiased else BLUR_CELLS * cell_m
-    first = 0
+    first, count = 0, 0
     while first < len(starts) - 1:
         end = max(int(np.searchsorted(starts, starts[first] + BATCH, "right")) - 1, first + 1)
         rows = slice(int(starts[first]), int(starts[end]))
         squares = np.repeat(keys[firsts[first:end]], np.diff(starts[first : end + 1]))
-        merged, leads = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
+        merged, leads, into = merge_cells(rows_of(finer.gaussians, rows), squares, cell_m, blur_m)
+        finer.parents[rows] = np.where(into < 0, -1, into + count)
+        count += len(leads)
         yield Piece(merged, finer.stands_for[rows][leads], squares[leads])
         first = end
 
 
 def merge_cells(
     g: Gaussians, squares: Int64[np.ndarray, "N"], cell_m: float, blur_m: float
-) -> tuple[Gaussians, Int64[np.ndarray, "M"]]:
+) -> tuple[Gaussians, Int64[np.ndarray, "M"], Int64[np.ndarray, "N"]]:
     """The splats of each cell merged into one, square after square.
 
     squares [N]: the number of each splat's square, increasing. blur_m: standard deviation of the
     rasteriser's blur. Splats that are too clear to be drawn are left out. Returns also the splat
-    that stands for each merged one: the heaviest of the class that weighs most.
+    that stands for each merged one, the heaviest of the class that weighs most; and which one each
+    is merged into, -1 for none.
     """
     kept = np.flatnonzero(g.opacities.numpy() >= ALPHA_MIN)
     longest, squares = g.scales.numpy().max(1)[kept], squares[kept]
@@ -372,9 +480,11 @@ def merge_cells(
     order, starts = kept[order], np.flatnonzero(begins)
     counts = np.diff(starts, append=len(order))
     leads, several = order[starts], counts > 1
+    into = np.full(len(g), -1)
+    into[order] = np.repeat(np.arange(len(starts)), counts)
     at = np.flatnonzero(several)
     if not len(at):
-        return g.select(torch.from_numpy(leads)), leads
+        return g.select(torch.from_numpy(leads)), leads, into
     rows = order[np.repeat(several, counts)]
     firsts = np.cumsum(counts[at]) - counts[at]
     merged, heaviest = merge_groups(g.select(torch.from_numpy(rows)), firsts, blur_m)
@@ -382,7 +492,7 @@ def merge_cells(
     out = g.select(torch.from_numpy(leads))
     for name in _COLUMNS:
         getattr(out, name)[torch.from_numpy(at)] = getattr(merged, name).to(g.means.dtype)
-    return out, leads
+    return out, leads, into
 
 
 def _grouped(is_apart: np.ndarray, cells: np.ndarray, squares: np.ndarray) -> tuple:
@@ -552,14 +662,17 @@ def _pieces(
     taken: _Taken, part: PosedGaussians, *, whole: bool
 ) -> Iterator[tuple[PosedGaussians, np.ndarray]]:
     level, is_faded = taken.level, taken.shares < 1
-    for chosen in (~is_faded, is_faded):
-        rows, g = taken.rows[chosen], level.gaussians
+    is_small = len(level.gaussians) <= BATCH  # then a copy costs less than another part
+    for chosen in [np.ones_like(is_faded)] if is_small else [~is_faded, is_faded]:
+        rows, shares, g = taken.rows[chosen], taken.shares[chosen], level.gaussians
         if not len(rows):
             continue
-        if chosen is is_faded:
-            opacities = torch.empty(len(g))
-            for (first, last), share in zip(rows.tolist(), taken.shares[chosen], strict=True):
-                opacities[first:last] = faded(g.opacities[first:last], share)
+        if shares.min() < 1:
+            own = g.opacities.numpy()  # NumPy wakes no threads
+            opacities = torch.from_numpy(own.copy() if is_small else np.empty_like(own))
+            for (first, last), share in zip(rows.tolist(), shares.tolist(), strict=True):
+                if share < 1:
+                    opacities[first:last] = faded(g.opacities[first:last], share)
             g = replace(g, opacities=opacities)
         color_rows = None
         if part.color_rows is not None:
@@ -578,7 +691,7 @@ def _pieces(
 
 def faded(opacities: Float[Tensor, "N"], share: float) -> Float[Tensor, "N"]:
     """Of splats that are drawn for a share of what they hide."""
-    own = opacities.numpy()  # NumPy wakes no threads
+    own = opacities.numpy()
     low = np.clip(own, 1e-6, 0.99)  # flat tops, which have more, fade in proportion
     return torch.from_numpy(own * (-np.expm1(share * np.log1p(-low)) / low))
 
@@ -593,89 +706,51 @@ def _taken(
 ) -> Iterator[_Taken]:
     """Of each level, what may be seen of the squares that the camera takes."""
     pose = None if part.world_from_part is None else part.world_from_part.numpy()
-    pieces = [
-        _in_cells(levels.levels[number], squares, shares)
-        for number, squares, shares in squares_taken(levels, part, camera, settings, fog, clip)
-    ]
-    each = [piece.level.boxes.bounds(piece.cells) for piece in pieces]
-    seen = may_be_drawn(Bounds.join(each), pose, camera, settings, fog, clip)
-    for own, piece in zip(np.split(seen, np.cumsum([*map(len, each)])), pieces, strict=False):
-        if not own.any():
-            continue
-        cells, first, end, shares = (values[own] for values in piece[1:])
-        piece.level.check(cells)
-        begins = np.ones(len(first), bool)
-        begins[1:] = (first[1:] != end[:-1]) | (shares[1:] != shares[:-1])
-        heads = np.flatnonzero(begins)
-        lasts = np.append(heads[1:], len(first)) - 1
-        yield _Taken(piece.level, np.stack([first[heads], end[lasts]], 1), shares[heads])
-
-
-class _InCells(NamedTuple):
-    """Pieces [P] of squares: the CELL of each, its first splat and last + 1, its share."""
-
-    level: Level
-    cells: Int64[np.ndarray, "P"]
-    first: Int64[np.ndarray, "P"]
-    end: Int64[np.ndarray, "P"]
-    shares: Float[np.ndarray, "P"]
-
-
-def _in_cells(level: Level, squares: np.ndarray, shares: np.ndarray) -> _InCells:
-    firsts, ends = level.squares.starts[squares], level.squares.starts[squares + 1]
-    low = firsts // CELL
-    counts = -(-ends // CELL) - low
-    square = np.repeat(np.arange(len(squares)), counts)
-    cells = np.arange(len(square)) + (low - counts.cumsum() + counts)[square]
-    first = np.maximum(firsts[square], cells * CELL)
-    end = np.minimum(ends[square], (cells + 1) * CELL)
-    return _InCells(level, cells, first, end, shares[square])
+    tree = levels.tree
+    taken, shares = squares_taken(levels, part, camera, settings)
+    if len(taken) > FEW_TESTED:
+        seen = may_be_drawn(tree.boxes.bounds(taken), pose, camera, settings, fog, clip)
+        taken, shares = taken[seen], shares[seen]
+    low = tree.firsts[taken] // CELL
+    counts = -(-tree.ends[taken] // CELL) - low
+    owner = np.repeat(np.arange(len(taken)), counts)
+    cells = np.arange(len(owner)) + (low - counts.cumsum() + counts)[owner]
+    inside = tree.cells.bounds(cells + tree.cell_starts[tree.numbers[taken]][owner])
+    seen = may_be_drawn(inside, pose, camera, settings, fog, clip)
+    cells, owner = cells[seen], owner[seen]
+    square = taken[owner]
+    first = np.maximum(tree.firsts[square], cells * CELL)
+    end = np.minimum(tree.ends[square], (cells + 1) * CELL)
+    begins = np.ones(len(first), bool)
+    begins[1:] = (first[1:] != end[:-1]) | (np.diff(shares[owner]) != 0)
+    begins[1:] |= np.diff(tree.numbers[square]) != 0
+    heads = np.flatnonzero(begins)
+    rows = np.stack([first[heads], end[np.append(heads[1:], len(first))[: len(heads)] - 1]], 1)
+    number_of, share_of = tree.numbers[square[heads]], shares[owner[heads]]
+    for number, level in enumerate(levels.levels):
+        own = number_of == number
+        if own.any():
+            level.check(cells[tree.numbers[square] == number])
+            yield _Taken(level, rows[own], share_of[own])
 
 
 def squares_taken(
-    levels: Levels,
-    part: PosedGaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    fog: Fog | None = None,
-    clip: HeightClip | None = None,
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Of each level, the squares that the camera may see and takes, and their shares."""
-    pose = None if part.world_from_part is None else part.world_from_part.numpy()
+    levels: Levels, part: PosedGaussians, camera: Camera, settings: RasterSettings
+) -> tuple[Int64[np.ndarray, "T"], Float[np.ndarray, "T"]]:
+    """The tree's squares that the camera takes, wherever it looks, and their shares."""
     eye_m = camera.centre.numpy()
-    if pose is not None:
-        eye_m = np.linalg.solve(pose, np.append(eye_m, 1.0))[:3]
-    focal = max(camera.fx, camera.fy)
-    number = len(levels.levels) - 1
-    rows = np.arange(len(levels.levels[number].squares))
-    left = np.ones(len(rows))  # of each, what the squares that hold it leave to it
-    while True:
-        squares = levels.levels[number].squares
-        if len(rows) > FEW_TESTED:
-            boxes = Boxes(squares.lows, squares.highs, squares.longest)
-            seen = may_be_drawn(boxes.bounds(rows), pose, camera, settings, fog, clip)
-            rows, left = rows[seen], left[seen]
-        lows, highs = squares.lows[rows], squares.highs[rows]
-        refined = np.zeros(len(rows))
-        if number > 0:
-            cell_px = focal * levels.cell_m(number) / settings.lod_px
-            if camera.is_orthographic:
-                refined[:] = cell_px > 1
-            else:
-                away_m = np.linalg.norm(
-                    np.maximum(np.maximum(lows - eye_m, eye_m - highs), 0), axis=1
-                )
-                refined = np.clip((1 + BAND - away_m / cell_px) / BAND, 0, 1)
-        taken = left * (1 - refined)
-        if taken.any():
-            yield number, rows[taken > 0], taken[taken > 0]
-        if number == 0:
-            return
-        number -= 1
-        finer = levels.levels[number].squares.keys >> 2
-        opened = refined > 0
-        keys = squares.keys[rows[opened]]
-        firsts = np.searchsorted(finer, keys)
-        counts = np.searchsorted(finer, keys, "right") - firsts
-        left = np.repeat((left * refined)[opened], counts)
-        rows = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(len(left))
+    if part.world_from_part is not None:
+        eye_m = np.linalg.solve(part.world_from_part.numpy(), np.append(eye_m, 1.0))[:3]
+    tree = levels.tree
+    cell_px = max(camera.fx, camera.fy) * tree.cells_m / settings.lod_px
+    if camera.is_orthographic:
+        refined = (cell_px > 1).astype(np.float64)
+    else:
+        beside_m = np.maximum(tree.boxes.lows - eye_m, eye_m - tree.boxes.highs)
+        away_m = np.linalg.norm(np.maximum(beside_m, 0), axis=1)
+        refined = np.clip((1 + BAND - away_m / np.maximum(cell_px, 1e-9)) / BAND, 0, 1)
+    refined[tree.numbers == 0] = 0
+    # Whatever holds a square that is refined at all is refined wholly: d_k doubles.
+    shares = (1 - refined) * np.append(refined, 1)[tree.parents]
+    taken = np.flatnonzero(shares > 0)
+    return taken, shares[taken]

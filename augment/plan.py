@@ -101,8 +101,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"(augment.jobs.quality)"
         )
     check_base(recipe, scene)
-    if any(effect.of(recipe) is not None for effect in effects.EFFECTS):
-        check_background(scene.background)  # whose numbers effects work with
+    if any(effect.reads_splats(recipe) for effect in effects.EFFECTS):
+        check_background(scene.background)
     placed = dict[str, Placed]()
     for effect in reversed(effects.EFFECTS):  # what comes later may cover what comes before
         placed[effect.name] = effect.place(recipe, scene, placed)

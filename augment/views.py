@@ -18,7 +18,7 @@ from augment.cameras import Camera
 from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
 from augment.jobs.layout import TRUST
-from augment.jobs.processes import choose_backend, renders_on_gpu
+from augment.jobs.processes import awaited, choose_backend, renders_on_gpu
 from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
 from augment.prune import prune_parts
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
@@ -321,7 +321,7 @@ class ViewPool:
         drawn = self._threads.submit(
             lambda: begin_view(scene, camera, recipe, backend=backend).result()
         )
-        return PendingView(drawn.result)
+        return PendingView(lambda: awaited(drawn))
 
     def close(self) -> None:
         """Begin nothing more; what is being drawn is finished without being waited for."""

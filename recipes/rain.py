@@ -29,6 +29,13 @@ class Rain(EffectModel):
     )
     knobs = (
         Knob("min_width_px", (1.0, 0.5, 0.35, 0.25), "drops drawn one by one; the rest is veil", 7),
+        Knob(
+            "mirror_px",
+            (8.0, 4.0, 2.0),
+            "resolution of what wet ground mirrors",
+            6.5,
+            works=lambda it: it.ground_wetness > 0,
+        ),
     )
     columns = (
         Column(
@@ -71,6 +78,8 @@ class Rain(EffectModel):
     puddles: Unit | None = None
     """Share of that ground on which water stands, in its hollows first; null follows from the rate;
     none where wetness is 0."""
+    mirror_px: Number = Field(default=2.0, ge=1, le=16)
+    """What wet ground mirrors is drawn with pixels this wide, pixels of the rendered picture."""
     spray: Flag = True
     """Vehicles that drive faster than 40 km/h lift spray, by their speed, the rate and the ground's
     wetness."""

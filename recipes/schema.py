@@ -235,7 +235,8 @@ class Render(Section):
     picture alone is wanted: depth, classes, snow and water are drawn through any smog."""
     lod_px: Number = Field(default=0.0, ge=0, le=64)
     """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
-    this in the picture, pixels; 0 draws all as they are. For scenes of many millions."""
+    this in the picture, pixels, or twice that where they are of one colour; 0 draws all as they
+    are. For scenes of many millions."""
     prune: Number = Field(default=0.0, ge=0, le=0.5)
     """Splats of the background are left out of which each alone changes the mean of a recorded view
     so little that it adds up to no more than this share of white; 0 leaves out none. Found once a

@@ -11,6 +11,7 @@ import torch
 
 from adapters.procedural import open_procedural
 from adapters.street.layout import FRAME_NS, build_frames, parse_parameters
+from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from augment.files.level_file import save_large_scene
 from augment.scene import Gaussians, Scene
 
@@ -54,6 +55,8 @@ def write_long_street(
             name=f"long-street-{round(stretches * STRETCH_M)}m",
             actors=(),
             labels=None,
+            # A drive of its own: the street's boxes and LiDAR are not along it.
+            source=add_to_uri(scene.source, CAMERA_PATH_KEY, "along"),
             frames=build_frames(whole),
             made_by={"stretches": stretches, "seeds": list(seeds), "gaussians": gaussians},
         ),

@@ -204,6 +204,10 @@ class Effect:
 
     # ---- Once a recipe and scene, once a scene ---------------------------------------------------
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        """Whether it works with the background's numbers: a large scene is read whole for it."""
+        return self.of(recipe) is not None
+
     def kernels(self, section: Any) -> Hashable:
         """What of its section chooses the kernels that are compiled; None where nothing does."""
         return None

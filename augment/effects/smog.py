@@ -91,6 +91,10 @@ class SmogEffect(Effect):
         visible="transmittance",
     )
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        smog = self.of(recipe)
+        return smog is not None and smog.shadow_fade > 0
+
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         smog = self.of(recipe)
         fog, reason = _in_heights(smog, scene)

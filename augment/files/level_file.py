@@ -3,8 +3,8 @@
 Beside the files of a scene folder, whose background then lies square after square (augment.lod),
 
     levels.safetensors    of each level k: k.keys, k.starts, k.lows, k.highs, k.longest (Squares),
-                          k.boxes.lows, k.boxes.highs, k.boxes.longest (Boxes); from level 1 on also
-                          k.means, k.quats, ..., k.stands_for
+                          k.boxes.lows, k.boxes.highs, k.boxes.longest (Boxes), k.parents; from
+                          level 1 on also k.means, k.quats, ..., k.stands_for
 
 holds its levels of detail, and the metadata `finest_m`. All arrays are mapped: a view reads the
 squares that it takes. Their numbers are looked at then, and the whole background's before an effect
@@ -106,6 +106,7 @@ def _arrays(levels: Levels) -> dict[str, np.ndarray]:
     for number, level in enumerate(levels.levels):
         own = {f.name: getattr(level.squares, f.name) for f in fields(Squares)}
         own |= {f"boxes.{name}": box for name, box in level.boxes._asdict().items()}
+        own["parents"] = level.parents
         if number > 0:  # the background is level 0
             g = level.gaussians
             values = {f.name: getattr(g, f.name) for f in fields(g)}
@@ -125,9 +126,10 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
     finest_m = metadata.get("finest_m", "")
     if finest_m not in map(repr, CELLS_M):
         raise SceneError(f"{path}: finest_m must be one of {CELLS_M}; got {finest_m!r}")
-    if "0.boxes.lows" not in tensors:
+    if "0.parents" not in tensors:
         raise SceneError(
-            f"{path} has no boxes: another version of this package wrote it; write the scene again"
+            f"{path} has no parents: another version of this package wrote it; write the scene "
+            f"again"
         )
     levels = list[Level]()
     while f"{len(levels)}.keys" in tensors and len(levels) <= MAX_LEVELS:
@@ -139,7 +141,9 @@ def read_levels(path: Path, background: Gaussians) -> Levels:
         cells = (-(-len(own) // CELL),)
         found = _boxes(tensors, f"{number}.boxes.", cells, str(path))
         boxes = Boxes(*(found[name] for name in Boxes._fields))
-        levels.append(Level(own, stands_for, squares, boxes, unchecked=str(path), splats=count))
+        parents = _take(tensors, f"{number}.parents", (len(own),), str(path), torch.int32).numpy()
+        level = Level(own, stands_for, squares, boxes, parents, unchecked=str(path), splats=count)
+        levels.append(level)
     if tensors or not levels:
         raise SceneError(f"{path} must hold levels 0, 1, ... alone; got {sorted(tensors)[:5]}")
     return Levels(float(finest_m), tuple(levels))

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import reduction, resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -260,7 +260,17 @@ def uninterrupted(call: Callable[[], Result]) -> Result:
     if threading.current_thread() is not threading.main_thread():
         return call()
     with ThreadPoolExecutor(1) as pool:
-        return pool.submit(call).result()
+        return awaited(pool.submit(call))
+
+
+def awaited(future: Future[Result]) -> Result:
+    """The future's result. An interrupt in `future.result()` can end as a RuntimeError of its lock,
+    if it comes when that has just been let go; a SimpleQueue has no such moment.
+    """
+    done = SimpleQueue()
+    future.add_done_callback(done.put)
+    done.get()
+    return future.result()
 
 
 def sender(connection: Connection) -> Callable[[Any], None]:

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs import worker as runner
 from augment.jobs.files import WritePump
 from augment.jobs.manifest import read_manifest
-from augment.jobs.processes import available_cores, share_scene, thread_limits
+from augment.jobs.processes import available_cores, awaited, share_scene, thread_limits
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.worker import shares_of
 from augment.scene import Actor, Track
@@ -289,6 +290,22 @@ def test_an_interrupt_waits_for_what_is_being_written() -> None:
     with pytest.raises(KeyboardInterrupt):
         pump.close()
     assert written
+
+
+def test_an_interrupt_of_a_wait_is_an_interrupt_and_the_result_still_comes() -> None:
+    future, waiter = Future(), threading.get_ident()
+
+    def interrupt() -> None:
+        time.sleep(0.1)
+        signal.pthread_kill(waiter, signal.SIGINT)
+
+    other = threading.Thread(target=interrupt)
+    other.start()
+    with pytest.raises(KeyboardInterrupt):
+        awaited(future)
+    other.join()
+    future.set_result(3)
+    assert awaited(future) == 3
 
 
 def test_who_is_busiest_bounds_the_job() -> None:

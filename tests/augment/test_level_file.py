@@ -20,8 +20,9 @@ from augment.plan import make_plan
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
-from recipes.schema import Recipe, Smog, Weather
+from recipes.schema import Flood, Recipe, Smog, Snowfall, Weather
 from tests.augment.test_lod import eye, road
 
 SETTINGS = RasterSettings(lod_px=2.0)
@@ -81,9 +82,10 @@ def test_numbers_are_looked_at_when_they_are_drawn_and_before_an_effect_works_on
     opened = load_scene_parts(folder)  # nothing is read
     with pytest.raises(SceneError, match=r"levels.safetensors: splats 0 to .* cannot be drawn"):
         draw(opened.background, -7.0)
-    make_plan(Recipe(), opened)
+    smog = Smog(visibility_m=100.0)
+    make_plan(Recipe(weather=Weather(smog=smog, snowfall=Snowfall(rate_mm_h=1.0))), opened)
     with pytest.raises(SceneError, match="splats 0 to"):
-        make_plan(Recipe(weather=Weather(smog=Smog(visibility_m=100.0))), opened)
+        make_plan(Recipe(weather=Weather(flood=Flood(level_m=0.1))), opened)
 
 
 @pytest.mark.parametrize(
@@ -110,6 +112,27 @@ def test_damaged_splats_of_a_level_are_refused_when_they_are_drawn(folder, name,
     damaged = lod.levels_of(load_scene_parts(folder).background).levels[number]
     with pytest.raises(SceneError, match=r"splats 0 to .* cannot be drawn"):
         damaged.check(np.array([0]))
+
+
+def test_what_effects_have_edited_keeps_the_files_levels_and_their_shapes(folder):
+    """Half as bright, and the road gone: nothing is merged anew."""
+    background = load_scene_parts(folder).background
+    stored = lod.levels_of(background).levels
+    dark = lod.levels_of(dataclasses.replace(background, sh=background.sh / 2)).levels
+    is_road = background.semantic == int(SemanticClass.ROAD)
+    opacities = torch.where(is_road, 0.0, background.opacities)
+    bare = dataclasses.replace(background, opacities=opacities)
+    for level, own, left in zip(stored, dark, lod.levels_of(bare).levels, strict=True):
+        for name in ("means", "quats", "scales"):
+            kept = getattr(level.gaussians, name).data_ptr()
+            assert getattr(own.gaussians, name).data_ptr() == kept
+            assert getattr(left.gaussians, name).data_ptr() == kept
+        # Sums in another order, rounded to float32.
+        torch.testing.assert_close(own.gaussians.sh, level.gaussians.sh / 2, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(own.gaussians.opacities, level.gaussians.opacities)
+    shown, built = draw(bare), draw(bare.select(torch.arange(len(bare))))  # the latter merged anew
+    assert float((shown - built).abs().mean()) < 0.5 / 255 < float(shown.mean())
+    assert float((draw(background) - shown).abs().mean()) > 1 / 255
 
 
 def test_levels_of_another_background_are_refused(scene, folder):

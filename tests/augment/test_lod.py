@@ -98,8 +98,9 @@ def test_large_splats_stay_as_they_are_and_clear_ones_are_left_out():
         lod.Piece(each, np.zeros(1, np.int32), np.zeros(1, np.int64))
         for each in (small, large, small, dataclasses.replace(small, opacities=torch.zeros(1)))
     ).gaussians
-    merged, leads = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
+    merged, leads, into = lod.merge_cells(g, np.zeros(4, np.int64), 0.4, 0.1)
     assert sorted(leads.tolist()) == [0, 1]
+    assert into[0] == into[2] != into[1] and into[3] == -1
     kept = int(np.flatnonzero(leads == 1)[0])
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(merged, name)[kept], getattr(g, name)[1])
@@ -181,11 +182,13 @@ def test_shares_add_up_to_one_wherever_the_camera_is(part):
         near = dataclasses.replace(SHARP, lod_px=SHARP.lod_px * 30)
         for settings in (near, SHARP):
             total[:] = 0
-            for level, squares, shares in lod.squares_taken(levels, part, camera, settings):
-                for key, share in zip(
-                    levels.levels[level].squares.keys[squares], shares, strict=True
-                ):
-                    total[leaves.keys >> (2 * level) == key] += share
+            for square, share in zip(
+                *lod.squares_taken(levels, part, camera, settings), strict=True
+            ):
+                number = int(levels.tree.numbers[square])
+                within = int(square) - np.searchsorted(levels.tree.numbers, number)
+                key = levels.levels[number].squares.keys[within]
+                total[leaves.keys >> (2 * number) == key] += share
             np.testing.assert_allclose(total, 1)
 
 
@@ -193,8 +196,8 @@ def test_turning_the_camera_changes_no_share(part):
     levels = lod.levels_of(part.gaussians)
 
     def taken(yaw):
-        found = lod.squares_taken(levels, part, eye(20.0, yaw), SHARP)
-        return {(n, s): w for n, squares, w_ in found for s, w in zip(squares, w_, strict=True)}
+        squares, shares = lod.squares_taken(levels, part, eye(20.0, yaw), SHARP)
+        return dict(zip(squares.tolist(), shares.tolist(), strict=True))
 
     ahead, turned = taken(0.0), taken(0.3)
     both = ahead.keys() & turned.keys()

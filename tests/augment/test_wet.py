@@ -381,6 +381,15 @@ def test_a_dry_recipe_keeps_its_bits_and_a_wet_one_mirrors_the_wall():
     assert near.mean() < clean[60:, 40:56].mean()  # darker where it is seen steeply
 
 
+def test_a_coarse_mirror_shows_nearly_what_a_fine_one_does():
+    scene, eye = street()
+    fine, coarse = (
+        render_view(scene, eye.scaled(4.0), rain(0.0, wetness=1.0, mirror_px=px)).rgb.astype(float)
+        for px in (2, 4)
+    )
+    assert 0 < np.abs(fine - coarse).mean() < 0.5  # of 255: 0.2, most of it at the wall's edges
+
+
 def test_what_lies_on_the_ground_and_cars_are_not_mirrors():
     ground, camera = flat_map(), looking((-10.0, 0.0, 1.5), (0.0, 0.0, 0.5), 64, 48, 60.0)
     rays = camera.ray_directions(torch.float64)

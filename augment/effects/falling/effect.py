@@ -38,6 +38,9 @@ class FallingEffect(Effect):
     step: ClassVar[str]
     kind: ClassVar[Kind]
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        return False
+
     def kernels(self, section: Rain | Snowfall) -> Any:
         return section.changes or None
 

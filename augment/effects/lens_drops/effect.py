@@ -25,6 +25,9 @@ class LensDropsEffect(Effect):
     is_see_through = True
     share_column = "lens_drops_fraction"
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        return False
+
     def kernels(self, section: LensDrops) -> Hashable:
         return section.changes or None
 

@@ -50,6 +50,9 @@ class SprayEffect(Effect):
 
     name, section, model = "spray", "weather.rain", Rain
 
+    def reads_splats(self, recipe: Recipe) -> bool:
+        return False
+
     def kernels(self, section: Rain) -> Hashable:
         return (section.changes and section.spray) or None
 

@@ -56,7 +56,6 @@ DARKER, MIRRORED, SHINE = PASSES = (
     "wet ground: reflection",
 )
 LEAST_SEEN = 0.05  # of a photo's ground through fog, below which its colour is not known
-COARSE = 0.5  # resolution of the mirrored view
 STOP = 0.01  # of its transmittance: a film reflects little of what is behind that
 SOLID = 0.5  # alpha from which on the mirrored view shows a surface
 LOWERED_M = 0.3  # below the plane: what stands on ground that is no plane is whole
@@ -66,12 +65,15 @@ UP_MARGIN = 0.2  # of the image's height, that rough ground looks higher than it
 
 @dataclass(frozen=True)
 class PlacedWet:
-    """Of a recipe. seed: of the puddles' noise. wetness, puddles: 0 to 1."""
+    """Of a recipe. seed: of the puddles' noise. wetness, puddles: 0 to 1. mirror_px: of the
+    picture, that a pixel of the mirrored view is wide.
+    """
 
     seed: int
     wetness: float
     puddles: float
     rate_mm_h: float
+    mirror_px: float
 
 
 class WetEffect(Effect):
@@ -80,6 +82,10 @@ class WetEffect(Effect):
     name, section, model = "wet", "weather.rain", Rain
     draws = (MIRRORED,)
     shares_files = True
+
+    def reads_splats(self, recipe: Recipe) -> bool:
+        rain = self.of(recipe)
+        return rain is not None and rain.ground_wetness > 0
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
         rain = self.of(recipe)
@@ -95,12 +101,14 @@ class WetEffect(Effect):
             )
         check_metric_and_level(scene)
         wet = f"wetness {rain.ground_wetness:.2g} of what is open to the sky"
+        mirrored = f"at 1 / {rain.mirror_px:g} of the resolution, without the ground"
         steps = (
             Step(DARKER, True, wet, SCENE),
-            Step(MIRRORED, True, "at half the resolution, without the ground", PICTURE),
+            Step(MIRRORED, True, mirrored, PICTURE),
             Step(SHINE, True, f"{wet}; puddles on {100 * rain.puddle_share:.3g} %", PICTURE),
         )
-        data = PlacedWet(recipe.seed, rain.ground_wetness, rain.puddle_share, rain.rate_mm_h)
+        numbers = rain.ground_wetness, rain.puddle_share, rain.rate_mm_h, rain.mirror_px
+        data = PlacedWet(recipe.seed, *numbers)
         return Placed(data, steps, frozenset({EXPECTED_DEPTH}))
 
     def prepare(self, own: Active) -> WetGround:
@@ -183,7 +191,7 @@ def _mirror_camera(camera: Camera, plane: Plane, rows: tuple[int, int]) -> Camer
 def _draw_mirror(
     own: Active, layers: LayerRenderer, camera: Camera, plane: Plane, rows: tuple[int, int]
 ) -> Mirror:
-    view = _mirror_camera(camera, plane, rows).scaled(COARSE)
+    view = _mirror_camera(camera, plane, rows).scaled(1 / own.data.mirror_px)
     splats = wet_splats(own.scene, own.prepared)
     parts = [
         replace(part, gaussians=_without_ground(part.gaussians, splats))
