@@ -40,6 +40,11 @@ class LayerRenderer:
     def without_fog(self) -> LayerRenderer:
         return replace(self, fog=None)
 
+    def for_scale(self, scale: float) -> LayerRenderer:
+        """Of layers with this many times as many pixels a side as the picture: splats as wide."""
+        settings = replace(self.settings, blur_px2=self.settings.blur_px2 * scale * scale)
+        return replace(self, settings=settings)
+
     def draw(
         self,
         camera: Camera,

@@ -44,6 +44,9 @@ class RasterSettings:
     share of the light behind would. Alpha then is that of the splats drawn: whoever sets this puts
     the fog behind them, its airlight or the sky through it. 0 leaves out nothing.
 
+    blur_px2: added to the diagonal of the projected covariance; less in an image that is shown
+    enlarged, where splats would grow.
+
     lod_px: far splats of large backgrounds are drawn merged, in cells of this many pixels at most
     (augment.lod); 0 draws all as they are.
     """
@@ -56,4 +59,5 @@ class RasterSettings:
     transmittance_stop: float = TRANSMITTANCE_STOP
     radius_clip_px: float = 0.0
     fog_cut: float = 0.0
+    blur_px2: float = COV2D_BLUR
     lod_px: float = 0.0

@@ -10,13 +10,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.render import layout
-from augment.render.constants import (
-    ALPHA_MIN,
-    COV2D_BLUR,
-    MAX_EXTENT_SIGMAS,
-    TAN_FOV_MARGIN,
-    RasterSettings,
-)
+from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
 from augment.render.fog import Fog
 from augment.render.layout import LONGEST, HeightClip
 from augment.render.sh import MAX_DEGREE
@@ -85,7 +79,7 @@ def part_views(
     views[:, layout.V_SIZE :][:, :2] = size
     views[:, layout.V_LOW :][:, :2], views[:, layout.V_HIGH :][:, :2] = low, high
     views[:, layout.V_GAIN :][:, :2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
-    views[:, layout.V_NEAR], views[:, layout.V_BLUR] = settings.near_m, COV2D_BLUR
+    views[:, layout.V_NEAR], views[:, layout.V_BLUR] = settings.near_m, settings.blur_px2
     views[:, layout.V_ALPHA_MIN], views[:, layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
     if fog is not None:
         views[:, layout.V_SIGMA] = fog.sigma_per_m

@@ -30,7 +30,12 @@ from augment.render.buffers import (
     import_cuda,
     kernels_for,
 )
-from augment.render.constants import MAX_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import (
+    COV2D_BLUR,
+    MAX_TRANSMITTANCE_STOP,
+    TRANSMITTANCE_STOP,
+    RasterSettings,
+)
 from augment.render.cpu.order import cut_in_fog
 from augment.render.fog import Fog
 from augment.render.gsplat_backend import GEOMETRY, tracked_geometry
@@ -352,6 +357,7 @@ def _check_settings(settings: RasterSettings) -> None:
             f"> 0 and at most {most}, since median depth is where less than half the light is left",
         ),
         "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
+        "blur_px2": (0 < s.blur_px2 <= COV2D_BLUR, f"> 0 and at most {COV2D_BLUR} (px^2)"),
         "fog_cut": (0 <= s.fog_cut <= most, f">= 0 and at most {most}"),
         "lod_px": (0 <= s.lod_px < math.inf, "finite and >= 0 (pixels)"),
         "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),

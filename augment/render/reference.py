@@ -35,7 +35,6 @@ from augment.render.buffers import (
 )
 from augment.render.constants import (
     ALPHA_MIN,
-    COV2D_BLUR,
     DEPTH_EPS,
     MAX_EXTENT_SIGMAS,
     TAN_FOV_MARGIN,
@@ -151,7 +150,8 @@ def _project_part(
     axes = rotation @ rotmat_from_quat(gaussians.quats) * gaussians.scales[:, None, :]  # [M, 3, 3]
     covs2d, det_sharp = _project_covariances(points, axes, camera)
     # The same product written as a sum of positive terms, so that no digits cancel.
-    dets = det_sharp + COV2D_BLUR * (covs2d[:, 0] + covs2d[:, 2]) + COV2D_BLUR**2
+    blur = settings.blur_px2
+    dets = det_sharp + blur * (covs2d[:, 0] + covs2d[:, 2]) + blur**2
     opacities = gaussians.opacities
     if settings.antialiased:
         tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
@@ -165,7 +165,7 @@ def _project_part(
         ids=index + first_id,
         depths=depths,
         means2d=_project_points(points, camera),
-        covs2d=covs2d + torch.tensor([COV2D_BLUR, 0, COV2D_BLUR], dtype=covs2d.dtype),
+        covs2d=covs2d + torch.tensor([blur, 0, blur], dtype=covs2d.dtype),
         dets=dets,
         opacities=opacities,
         colors=colors,

@@ -25,15 +25,17 @@ from adapters.procedural import open_truth
 from augment import drawing
 from augment.boxes import BOTTOM_M, SIDES_M
 from augment.cameras import Camera, Frame
-from augment.effects.flood.effect import hidden_pixels, submerged_fraction
+from augment.effects.flood.effect import flood_medium, hidden_pixels, submerged_fraction
 from augment.effects.flood.flood import exact, schlick
+from augment.effects.flood.flood_view import visible_depth_m
 from augment.geometry import rigid
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.buffers import RenderOutput
+from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
-from augment.scene import Actor, Gaussians, Ground, Scene, Track
+from augment.scene import Actor, Gaussians, Ground, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, Sky
 from augment.views import render_buffers, render_view
@@ -235,6 +237,62 @@ def test_kernels_match_the_definition(scene, reflection):
         0.05 if reflection == "screen_space" else 0.01
     )
     assert bool((fast.masks["water"] == slow.masks["water"]).float().mean() > 0.999)
+
+
+def test_layers_of_wider_pixels_match_the_definition_and_the_whole_ones(scene):
+    views = {}
+    for name, width in (("cpu", 1.0), ("cpu", 2.0), ("reference", 2.0)):
+        water = flood(waves=Waves(preset="breeze"), turbidity_ntu=1, layers_px=width)
+        plan = make_plan(recipe_of(water, depth="none", labels=False), scene)
+        views[name, width] = render_buffers(scene, camera(), plan, backend=name).rgb
+    fast, slow = views["cpu", 2.0], views["reference", 2.0]
+    error = (fast - slow).abs().amax(-1)
+    assert float(error.median()) < 1e-5 and float((error > 2 / 255).float().mean()) < 0.01
+    # Plain surfaces keep their colours: what moves are the edges of wall and car, half a pixel.
+    assert 0 < float((fast - views["cpu", 1.0]).abs().mean()) < 2 / 255
+
+
+def test_a_smaller_image_widens_no_splat_with_the_blur_of_the_larger_one():
+    """Needles thinner than a pixel cover as much of an image of half the size; twice as much
+    with the same blur in pixels.
+    """
+    across = np.arange(-2.7, 2.7, 0.207)  # 4.14 px: they meet pixels at all places
+    points = np.c_[np.full(len(across), 6.0), across, 0 * across]
+    needles = dataclasses.replace(
+        sheet(points, 1, WALL, SemanticClass.POLE),
+        scales=torch.tensor([[0.004, 0.004, 1.0]]).repeat(len(points), 1),
+        opacities=torch.full((len(points),), 0.3),
+    )
+    view, areas = camera(120, 120, focal=120.0), []
+    for scale, blur in ((1.0, 0.3), (0.5, 0.075), (0.5, 0.3)):
+        settings = RasterSettings(blur_px2=blur)
+        alpha = rasterize([PosedGaussians(needles)], view.scaled(scale), settings=settings).alpha
+        areas.append(float(alpha.double().sum()) / scale**2)
+    assert areas[1] == pytest.approx(areas[0], rel=0.06)  # of some 26 places within a pixel
+    assert areas[2] > 1.6 * areas[0]
+
+
+def test_bed_that_hardly_comes_up_is_left_out_of_mere_pictures(scene):
+    down = camera(pitch=0.5)
+    medium, _ = flood_medium(flood(turbidity_ntu=20), 0, scene)  # 0.4 m of it: exp(-4) comes up
+    cut = dataclasses.replace(medium, bed_cut=0.03)
+    steepest = math.cos(math.radians(90) - (0.5 + math.atan2(30, 60)))  # sine to the horizon
+    way = 1 / math.sqrt(1 - (1 - steepest**2) / 1.333**2)
+    depth = visible_depth_m(cut, down)
+    left = math.exp(-min(cut.extinction_per_m) * depth * way)
+    assert 0.8 * 0.03 < left < 1.25 * 0.03 and visible_depth_m(medium, down) > 0.4 > depth
+    opaque = dataclasses.replace(medium, extinction_per_m=(math.inf,) * 3)
+    assert visible_depth_m(opaque, down) == 0
+    whole, less = (
+        view_of(scene, flood(turbidity_ntu=20, bed_cut=share), down, depth="none", labels=False)
+        for share in (0.001, 0.03)
+    )
+    change = np.abs(whole.rgb.astype(int) - less.rgb)
+    assert 0 < change.max() <= 0.03 * 255
+    written = view_of(scene, flood(turbidity_ntu=20, bed_cut=0.03), down)
+    dry = view_of(scene, None, down)
+    road = (slice(40, 60), slice(5, 75))
+    assert np.abs(written.depth_m[road] / dry.depth_m[road] - 1).max() < 0.05
 
 
 def drawn_elsewhere(parts, camera, *, pixel_mask, backend, **settings) -> RenderOutput:

@@ -165,6 +165,8 @@ def flood_medium(
         refraction_index=flood.refraction_index,
         fresnel=flood.fresnel,
         reflection=flood.reflection,
+        bed_cut=flood.bed_cut,
+        layers_px=flood.layers_px,
         rain_mm_h=rain_mm_h,
         seed=seed,
     )

@@ -14,6 +14,7 @@ from augment.effects.flood.waves import WaveSet
 
 # ---- The water and its layers --------------------------------------------------------------------
 
+MIN_BED_CUT = 0.001  # a quarter of an 8-bit step
 FresnelModel = Literal["exact", "schlick"]
 ReflectionTier = Literal["sky", "screen_space", "mirrored"]
 
@@ -23,8 +24,9 @@ class FloodMedium:
     """Water placed in a scene: its surface is the plane z = level_z_m, scene world, metres.
 
     extinction_per_m: of red, green and blue along the way through the water, >= 0, may be
-    infinite. rgb: colour of deep water seen from above, display-encoded. rain_mm_h: whose drops
-    draw rings on it; seed: of them.
+    infinite. rgb: colour of deep water seen from above, display-encoded. bed_cut: bed of which no
+    more than this share comes up is not seen. layers_px: width of the pixels of bed and mirrored
+    view. rain_mm_h: whose drops draw rings on the water; seed: of them.
     """
 
     level_z_m: float
@@ -34,6 +36,8 @@ class FloodMedium:
     refraction_index: float = 1.333
     fresnel: FresnelModel = "exact"
     reflection: ReflectionTier = "mirrored"
+    bed_cut: float = MIN_BED_CUT
+    layers_px: float = 1.0
     rain_mm_h: float = 0.0
     seed: int = 0
 

@@ -84,18 +84,21 @@ def composite_water(
 ) -> Float[Tensor, "H W 3"]:
     """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
 
-    color: of the window's pixels. renderer: that drew the front.
+    color: of the window's pixels. renderer: that drew the front, whose colours the CPU's kernels
+    write to.
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
-    image, dry = rgb.clone(), _dry_rows(camera)
+    in_place = kernels_for(renderer.backend, rgb, alpha) == CPU
+    image, dry = rgb if in_place else rgb.clone(), _dry_rows(camera)
+    both = rgb[window.top : dry].clone()  # rows that show water and sky
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
         image[:dry] = renderer.add_sky(rgb[:dry], alpha[:dry], above)
-    if kernels_for(renderer.backend, rgb, alpha) == CPU:
-        if window.top < dry:  # rows that show both: what falls belongs to the water
+    if in_place:
+        if window.top < dry:  # what falls belongs to the water
             wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
-            image[window.top : dry][wet] = rgb[window.top : dry][wet]
+            image[window.top : dry][wet] = both[wet]
         with kernel_threads(ROWS):
             images = alpha.numpy(), color.contiguous().numpy(), image.numpy()
             rays = _rays(window.of(camera))
@@ -229,6 +232,8 @@ REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
 MAX_MARGIN = 0.25  # of the image's longer side
 STEEPEST = 0.65  # fall of the ray whose bed refraction moves the most in the image
 MAX_SHIFT = 0.12  # of the image's height
+STEEP_PLACES = 17  # along each side of the image, where rays are asked how steep they are
+STEEPER = 0.05  # sine of the angle to the horizon that others may have more
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +299,8 @@ def render_flooded(
             shown = torch.zeros(bed_camera.height, bed_camera.width, device=device)
             here, there = bed_window.overlap(front.alpha)
             shown[there] = 1 - front.alpha[here]
-        bed = _draw_bed(renderer, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen, shown)
+        others = buffers - {RGB, ALPHA}
+        bed_camera, bed = _draw_bed(renderer, bed_camera, medium, others, margins, seen, shown)
     with timed("flood: mirrored view"):
         mirror = _mirror_layer(renderer, camera, medium, window, seen)
     screen = None
@@ -330,18 +336,36 @@ def _draw_bed(
     margins: Margins,
     seen: Bool[Tensor, "h w"],
     shown: Float[Tensor, "rows columns"] | None,
-) -> RenderOutput:
-    """What lies below the surface; not what the front hides, nor, in a mere picture, the water."""
-    reach = math.inf if scene_buffers else visible_depth_m(medium)
+) -> tuple[Camera, RenderOutput]:
+    """What lies below the surface; not what the front hides, nor, in a mere picture, the water.
+    With the camera, whose pixels are wider where the picture alone is wanted.
+    """
+    reach = math.inf if scene_buffers else visible_depth_m(medium, camera)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
     requested = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    return renderer.draw(camera, below, requested, margins.around(seen, margins), shown)
+    pixel_mask = margins.around(seen, margins)
+    if medium.layers_px > 1 and not scene_buffers and shown is None:
+        camera = camera.scaled(1 / medium.layers_px)
+        pixel_mask = resized(pixel_mask, camera)
+        renderer = renderer.for_scale(1 / medium.layers_px)
+    return camera, renderer.draw(camera, below, requested, pixel_mask, shown)
 
 
-def visible_depth_m(medium: FloodMedium) -> float:
-    """Depth below the surface from which less than 1/512 of any colour comes up."""
+def visible_depth_m(medium: FloodMedium, camera: Camera) -> float:
+    """Depth below the surface from which no more than the cut comes up of any colour, along the
+    camera's steepest ray.
+    """
     least = min(medium.extinction_per_m)
-    return math.log(512) / least if least > 0 else math.inf
+    if least == 0:
+        return math.inf
+    columns = (np.linspace(0, camera.width, STEEP_PLACES) - camera.cx) / camera.fx
+    rows = (np.linspace(0, camera.height, STEEP_PLACES) - camera.cy) / camera.fy
+    u, v = np.meshgrid(columns, rows)
+    right, down, ahead = camera.world_from_camera[2, :3].tolist()
+    sine = float((-(u * right + v * down + ahead) / np.sqrt(u * u + v * v + 1)).max())
+    sine = min(max(sine, 0.0) + STEEPER, 1.0)  # between those places, and where waves tilt
+    inside = math.sqrt(1 - (1 - sine * sine) / medium.refraction_index**2)
+    return -math.log(medium.bed_cut) * inside / least
 
 
 def _mirror_layer(
@@ -358,9 +382,11 @@ def _mirror_layer(
     view = place.of(mirrored_camera(camera, medium.level_z_m))
     # Within the window tilted waves look as far down as up.
     pixel_mask = margins.around(seen.flip(0), replace(margins, bottom=margins.top))
-    if medium.reflection == "screen_space":
-        view = view.scaled(COARSE)
+    scale = COARSE if medium.reflection == "screen_space" else 1 / medium.layers_px
+    if scale != 1:
+        view = view.scaled(scale)
         pixel_mask = resized(pixel_mask, view)
+        renderer = renderer.for_scale(scale)
     above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
     return as_layer(view, renderer.draw(view, above, buffers, pixel_mask))
@@ -389,7 +415,7 @@ def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
     an upright camera's, by c D (1 - c t) / (h + c D t) in tangents, most for c near STEEPEST.
     """
     height = float(camera.centre[2]) - medium.level_z_m
-    depth = min(medium.waves.depth_m, visible_depth_m(medium))
+    depth = min(medium.waves.depth_m, visible_depth_m(medium, camera))
     fall = min(max((camera.height - camera.cy) / camera.fy, 0.1), STEEPEST)
     sine = 1 / (medium.refraction_index * math.hypot(1, fall))
     bent = sine / math.sqrt(1 - sine**2)

@@ -9,6 +9,7 @@ mirrored direction, T: what comes up through the surface.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -29,14 +30,13 @@ from augment.effects.flood.water_kernels import (
     HIDDEN_COVER,
     MATCH_M,
     MATCH_SHARE,
-    MAX_OPTICAL_DEPTH,
     MIN_COSINE,
     MIN_DEPTH,
     SETTLED_M,
     SOLID_ALPHA,
     STEEPEST,
 )
-from augment.effects.flood.water_plane import image_coordinates, window_offset
+from augment.effects.flood.water_plane import image_coordinates, places_in
 from augment.effects.flood.waves import WaveField
 from augment.memo import memo_of
 from augment.render.buffers import CPU, kernels_for
@@ -354,9 +354,11 @@ def through_the_surface(
     deep = _tensor(medium.rgb, normal).expand(normal.shape)
     if fog is not None:
         deep = blend_airlight(deep, fog_before(surface, water, fog), fog)
-    left, top = window_offset(bed.camera, camera)
-    own_column = (torch.arange(camera.width, device=normal.device) + (left + 0.5)).to(normal.dtype)
-    own_row = (torch.arange(camera.height, device=normal.device) + (top + 0.5)).to(normal.dtype)
+    right, left, down, top = places_in(bed.camera, camera).tolist()
+    own_column, own_row = (
+        ((torch.arange(size, device=normal.device) + 0.5) * scale + offset).to(normal.dtype)
+        for size, scale, offset in ((camera.width, right, left), (camera.height, down, top))
+    )
     own_row, own_column = torch.meshgrid(own_row, own_column, indexing="ij")
     own_solid, own_point = point_at(bed, own_column, own_row)
     own_depth = _depth_below(surface, own_point)
@@ -367,7 +369,7 @@ def through_the_surface(
         ray = refracted(surface.to_eye, normal, medium.refraction_index)
     opaque = _optical_depth(own_depth / -ray[..., 2], extinction.min())
     own_solid = own_solid & is_inside(bed.camera, own_column, own_row)
-    own_solid = own_solid & (opaque < MAX_OPTICAL_DEPTH)
+    own_solid = own_solid & (opaque < -math.log(medium.bed_cut))
     image = stacked(bed)
     depth, colors = own_depth, bilinear(image, own_column, own_row)
     if bends:
@@ -527,10 +529,7 @@ def _run_kernel(water: Water) -> Tensor:
         front, distance, weight = screen.layer, screen.distance, screen.weight
     x, y, variance = map(_array, (field.normal_x, field.normal_y, field.slope_variance))
     pixels = kernels.Pixels(
-        *image_coordinates(camera),
-        axes,
-        _array(water.cover),
-        *window_offset(water.bed.camera, camera),
+        *image_coordinates(camera), axes, _array(water.cover), places_in(water.bed.camera, camera)
     )
     out = np.empty((camera.height, camera.width, 3), np.float32)
     with kernel_threads(ROWS):
@@ -591,7 +590,9 @@ def _image(layer: Layer | None) -> kernels.Image:
     project = rotation * [[fx], [fy], [1.0]]
     rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
     numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
-    parts = (_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth))
+    parts = [_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth)]
+    if min(camera.width, camera.height) == 1:  # look-ups read the next column and row as well
+        parts = [np.append(part, np.zeros(3 * camera.width + 3, np.float32)) for part in parts]
     return kernels.Image(np.asarray(numbers, np.float32), *parts)
 
 
@@ -626,5 +627,12 @@ def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]
-    numbers += [*medium.extinction_per_m, *medium.rgb, per_m, above, *airlight]
+    numbers += [
+        *medium.extinction_per_m,
+        *medium.rgb,
+        per_m,
+        above,
+        *airlight,
+        -math.log(medium.bed_cut),
+    ]
     return np.minimum(numbers, LARGEST).astype(np.float32)

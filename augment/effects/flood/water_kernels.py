@@ -2,14 +2,13 @@
 
 `shade` implements `water.shade_water`. It sorts a row's water pixels into a smooth and a rough list
 and works on eight pixels at a time: rough ones need three slopes and mip levels, smooth ones the
-image itself. Coordinates and colours are vectors of eight; pixels are fetched one by one through
-scratch memory. All is float32 but the rays' directions, whose sign decides where there is water and
-whose small downward part the distance to it is divided by. Indices are unsigned, so nothing wraps.
+image itself. Coordinates and colours are vectors of eight; colours are fetched for two pixels at a
+time. All is float32 but the rays' directions, whose sign decides where there is water and whose
+small downward part the distance to it is divided by. Indices are unsigned, so nothing wraps.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,10 +37,6 @@ MIN_COSINE = 1e-3  # of rays against the surface, and of reflected ones against 
 STEEPEST = 1e-6  # least square of a normal's z
 BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
 SETTLED_M = 0.01  # unless the last one was smaller
-# Where less of any colour comes up from the bed straight behind a pixel, no bed is looked for: a
-# quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
-MIN_TRANSMITTANCE = 1 / 1024
-MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
 MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
 FAINT = 1 / 256  # a share of the sky that does not change what it shows through
@@ -163,13 +158,14 @@ EIGHTS = ~U(7)  # a number's multiple of eight
 DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
 LIST = U(STRIP * 10)
 
-# Lines of the scratch memory. Look-ups: pixel, way from it, colour; was the bed found and how deep;
-# two mip levels; for each of three slopes the mirrored ray, its share of the light and its place in
-# the mirror.
-C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(11))
-LOW, WIDE, HIGH, SCALE = (U(88 + 16 * k) for k in range(4))
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(152 + 24 * k) for k in range(6))
-SCRATCH = 152 + 24 * 6
+# Lines of the scratch memory. A colour; was the bed found and how deep; two mip levels; for each of
+# three slopes the mirrored ray, its share of the light and its place in the mirror.
+R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(7))
+LOW, WIDE, HIGH, SCALE = (U(56 + 16 * k) for k in range(4))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(120 + 24 * k) for k in range(6))
+SCRATCH = 120 + 24 * 6
+# Where flat images begin, of eight pixels each: two mip levels, and 0.
+LOWER, UPPER, WHOLE = U(0), U(8), U(16)
 
 
 class View(NamedTuple):
@@ -196,7 +192,8 @@ class Medium(NamedTuple):
 
     height: of the eye over the water. fog_per_m: optical depth between eye and water per metre of
     the ray, 0 without fog. fog_above: from the water straight up, < 0 where the sky is seen
-    clearly (or replaced by the airlight already). least_extinction: of the three.
+    clearly (or replaced by the airlight already). opaque: optical depth of the water from which no
+    bed is looked for. least_extinction: of the three.
     """
 
     height: np.float32
@@ -207,6 +204,7 @@ class Medium(NamedTuple):
     fog_per_m: np.float32
     fog_above: np.float32
     airlight: tuple[np.float32, ...]
+    opaque: np.float32
     least_extinction: np.float32
 
 
@@ -222,74 +220,120 @@ def _view(n):
 def _medium(n):
     extinction, rgb, airlight = (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[11], n[12], n[13])
     least = min(n[3], min(n[4], n[5]))
-    return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, least)
+    return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, n[14], least)
+
+
+def _shuffled(builder, left, right, order):
+    lanes = ir.VectorType(ir.IntType(32), len(order))
+    return builder.shuffle_vector(left, right, ir.Constant(lanes, order))
+
+
+def _squares(context, builder, sig, args):
+    """Of a bilinear look-up's arguments: the images' data, then, as vectors of eight, the indices
+    of the upper and lower left pixels, ways right and down from them and what is left of 1.
+    """
+    *arrays, firsts, start, row, column, width, across, down = zip(sig.args, args, strict=True)
+    data = [context.make_array(kind)(context, builder, array).data for kind, array in arrays]
+    kind, array = firsts
+    number, wide = (ir.VectorType(ir.IntType(bits), v8.LANES) for bits in (32, 64))
+    at = builder.gep(context.make_array(kind)(context, builder, array).data, [start[1]])
+    first = builder.load(builder.bitcast(at, wide.as_pointer()), align=8)
+    r, c, w = (builder.zext(builder.fptosi(v, number), wide) for _, v in (row, column, width))
+    above = builder.add(first, builder.add(builder.mul(r, w), c))
+    one = ir.Constant(across[1].type, [1.0] * v8.LANES)
+    rest = [builder.fsub(one, v) for _, v in (across, down)]
+    return data, above, builder.add(above, w), across[1], down[1], *rest
+
+
+def _pointer_to(builder, data, indices, lane, stride, count):
+    wide, lanes = ir.IntType(64), ir.VectorType(ir.FloatType(), count)
+    at = builder.mul(builder.extract_element(indices, ir.IntType(32)(lane)), wide(stride))
+    return builder.gep(data, [at]), lanes.as_pointer()
+
+
+def _channels(context, builder, sig, fours):
+    """Four channels of eight pixels, from vectors of two pixels' four channels each."""
+    halves = []
+    for left, right in (fours[:2], fours[2:]):
+        halves.append(_shuffled(builder, left, right, [0, 4, 8, 12, 1, 5, 9, 13]))
+        halves.append(_shuffled(builder, left, right, [2, 6, 10, 14, 3, 7, 11, 15]))
+    values = [
+        _shuffled(builder, halves[k], halves[k + 2], [*range(n, n + 4), *range(n + 8, n + 12)])
+        for k in range(2)
+        for n in (0, 4)
+    ]
+    return context.make_tuple(builder, sig.return_type, values)
 
 
 @intrinsic
-def _mix(typingctx, image, a, b, c, d, wa, wb, wc, wd):
-    """Sums of four pixels of a flat image of three channels times four weights."""
+def _texels(typingctx, image, firsts, start, row, column, width, across, down):
+    """Bilinear from a flat image of four channels, for eight pixels: four vectors.
+
+    firsts[start:]: the first texels of eight images in it. row, column: whole; width: of the
+    images; across, down: the way from there.
+    """
 
     def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
-        two, four = ir.VectorType(real, 2), ir.VectorType(real, 4)
-        order = ir.Constant(ir.VectorType(number, 4), [0, 1, 0, 1])
-        spread = ir.Constant(ir.VectorType(number, 4), [0, 0, 0, 0])
-        nothing = ir.Constant(four, ir.Undefined)
-        parts = []
-        for index, weight in zip(args[1:5], args[5:], strict=True):
-            at = builder.gep(data, [builder.mul(index, wide(3))])
-            # Not four numbers at once: the fourth may lie beyond the last pixel.
-            pair = builder.load(builder.bitcast(at, two.as_pointer()), align=4)
-            pixel = builder.shuffle_vector(pair, pair, order)
-            third = builder.load(builder.gep(at, [wide(2)]))
-            pixel = builder.insert_element(pixel, third, number(2))
-            weights = builder.insert_element(nothing, weight, number(0))
-            weights = builder.shuffle_vector(weights, nothing, spread)
-            parts.append(builder.fmul(pixel, weights))
-        total = builder.fadd(builder.fadd(*parts[:2]), builder.fadd(*parts[2:]))
-        values = [builder.extract_element(total, number(k)) for k in range(3)]
-        return context.make_tuple(builder, sig.return_type, values)
+        (data,), above, below, right, down, left, up = _squares(context, builder, sig, args)
+        fours = []
+        for lane in range(0, v8.LANES, 2):
 
-    result = types.UniTuple(types.float32, 3)
-    return result(image, *[types.uint64] * 4, *[types.float32] * 4), codegen
+            def pairs(indices, lane=lane):
+                """A texel and the next one, of this lane and the next one."""
+                found = []
+                for k in (lane, lane + 1):
+                    at, kind = _pointer_to(builder, data, indices, k, 4, 8)
+                    found.append(builder.load(builder.bitcast(at, kind), align=4))
+                return _shuffled(builder, *found, [*range(16)])
+
+            own, both = [lane] * 8 + [lane + 1] * 8, []
+            for indices, share in ((above, up), (below, down)):
+                both.append(builder.fmul(pairs(indices), _shuffled(builder, share, share, own)))
+            order = [k + side for k in (lane, lane + 1) for side in (0, 8) for _ in range(4)]
+            total = builder.fmul(builder.fadd(*both), _shuffled(builder, left, right, order))
+            sides = [[*range(n, n + 4), *range(n + 8, n + 12)] for n in (0, 4)]
+            fours.append(builder.fadd(*(_shuffled(builder, total, total, n) for n in sides)))
+        return _channels(context, builder, sig, fours)
+
+    result = types.UniTuple(v8.float8, 4)
+    return result(image, firsts, types.uint64, *[v8.float8] * 5), codegen
 
 
 @intrinsic
-def _between(typingctx, image, a, b, fc, fr):
-    """Bilinear from a flat image of four channels: pixels a, a + 1 and below them b, b + 1."""
+def _colors(typingctx, rgb, alpha, firsts, start, row, column, width, across, down):
+    """As `_texels`, from a flat image of three channels and one of alpha."""
 
     def codegen(context, builder, sig, args):
-        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
-        eight, one = ir.VectorType(real, 8), real(1)
-        nothing = ir.Constant(eight, ir.Undefined)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        found = _squares(context, builder, sig, args)
+        (rgb, alpha), above, below, right, down, left, up = found
+        fours = []
+        for lane in range(0, v8.LANES, 2):
 
-        def splat(*values):
-            vector = nothing
-            for k, value in enumerate(values):
-                vector = builder.insert_element(vector, value, number(k))
-            count = 8 // len(values)
-            order = [k for k in range(len(values)) for _ in range(count)]
-            order = ir.Constant(ir.VectorType(number, 8), order)
-            return builder.shuffle_vector(vector, nothing, order)
+            def pairs(indices, lane=lane):
+                """rgb, rgb of a pixel and the next one and their alphas, of two lanes."""
+                found = []
+                for k in (lane, lane + 1):
+                    at, kind = _pointer_to(builder, rgb, indices, k, 3, 4)
+                    first = builder.load(builder.bitcast(at, kind), align=4)
+                    at = builder.gep(at, [ir.IntType(64)(4)])
+                    rest, kind = _pointer_to(builder, alpha, indices, k, 1, 2)
+                    ends = [builder.load(builder.bitcast(p, kind), align=4) for p in (at, rest)]
+                    last = _shuffled(builder, *ends, [*range(4)])
+                    found.append(_shuffled(builder, first, last, [*range(8)]))
+                return _shuffled(builder, *found, [*range(16)])
 
-        def pair(index):
-            at = builder.gep(data, [builder.mul(index, wide(4))])
-            return builder.load(builder.bitcast(at, eight.as_pointer()), align=4)
+            order = [k + 8 * (n in (3, 4, 5, 7)) for k in (lane, lane + 1) for n in range(8)]
+            sides = [[0, 1, 2, 6, 8, 9, 10, 14], [3, 4, 5, 7, 11, 12, 13, 15]]
+            sums = []
+            for indices, share in ((above, up), (below, down)):
+                weights = [builder.fmul(side, share) for side in (left, right)]
+                shown = builder.fmul(pairs(indices), _shuffled(builder, *weights, order))
+                sums.append(builder.fadd(*(_shuffled(builder, shown, shown, n) for n in sides)))
+            fours.append(builder.fadd(*sums))
+        return _channels(context, builder, sig, fours)
 
-        top = builder.fmul(pair(args[1]), splat(builder.fsub(one, args[4])))
-        bottom = builder.fmul(pair(args[2]), splat(args[4]))
-        across = splat(builder.fsub(one, args[3]), args[3])
-        both = builder.fmul(builder.fadd(top, bottom), across)
-        values = [
-            builder.fadd(*(builder.extract_element(both, number(k + side)) for side in (0, 4)))
-            for k in range(4)
-        ]
-        return context.make_tuple(builder, sig.return_type, values)
-
-    result = types.UniTuple(types.float32, 4)
-    return result(image, types.uint64, types.uint64, types.float32, types.float32), codegen
+    result = types.UniTuple(v8.float8, 4)
+    return result(rgb, alpha, firsts, types.uint64, *[v8.float8] * 5), codegen
 
 
 @intrinsic
@@ -428,8 +472,8 @@ def _end(p, distance, ray):
 
 
 @inner()
-def _place(s, column, row, columns, rows):
-    """The first of the four pixels round coordinates (C0, R0), and the way from it (FC, FR).
+def _place(column, row, columns, rows):
+    """The first of the four pixels round coordinates, row and column, and the way right and down.
 
     columns, rows: the image's sides, vectors. On the last pixels the way is 1, from those before.
     """
@@ -438,15 +482,7 @@ def _place(s, column, row, columns, rows):
     y = v8.minimum(v8.maximum(row - half, zero), rows - one)
     c0 = v8.maximum(v8.minimum(v8.floor(x), columns - two), zero)
     r0 = v8.maximum(v8.minimum(v8.floor(y), rows - two), zero)
-    v8.store(s, C0, c0)
-    v8.store(s, R0, r0)
-    v8.store(s, FC, x - c0)
-    v8.store(s, FR, y - r0)
-
-
-@inner()
-def _fetched(s):
-    return v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
+    return r0, c0, x - c0, y - r0
 
 
 @inner()
@@ -455,32 +491,10 @@ def _pixel(x):
 
 
 @inner()
-def _bilinear(s, k, rgb, alpha, width, right, below):
-    """Colour and alpha at the place of a lane."""
-    a = _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
-    b, c, d = a + right, a + below, a + right + below
-    fc, fr = s[FC + k], s[FR + k]
-    gc, gr = ONE - fc, ONE - fr
-    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
-    opaque = (alpha[a] * wa + alpha[b] * wb) + (alpha[c] * wc + alpha[d] * wd)
-    red, green, blue = _mix(rgb, a, b, c, d, wa, wb, wc, wd)
-    return red, green, blue, opaque
-
-
-@inner()
-def _neighbours(view):
-    """Steps to the pixels right and below; 0 in images of one column or row."""
-    return min(view.width - U(1), U(1)), min(view.height - U(1), U(1)) * view.width
-
-
-@inner()
-def _fetch(s, column, row, rgb, alpha, view):
-    _place(s, column, row, v8.splat(view.columns), v8.splat(view.rows))
-    right, below = _neighbours(view)
-    for k in range(LANES):
-        r, g, b, a = _bilinear(s, k, rgb, alpha, view.width, right, below)
-        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
-    return _fetched(s)
+def _fetch(starts, column, row, rgb, alpha, view):
+    columns = v8.splat(view.columns)
+    r0, c0, across, down = _place(column, row, columns, v8.splat(view.rows))
+    return _colors(rgb, alpha, starts, WHOLE, r0, c0, columns, across, down)
 
 
 @inner()
@@ -502,17 +516,12 @@ def _fetch_level(s, starts, second, column, row, mips):
     """Colours and alphas from one of the chosen levels; second: LANES for the upper one."""
     scale = v8.load(s, SCALE + second)
     wide, high = v8.load(s, WIDE + second), v8.load(s, HIGH + second)
-    _place(s, column * scale, row * scale, wide, high)
-    for k in range(LANES):
-        width = _pixel(s[WIDE + second + k])
-        at = U(starts[second + k]) + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
-        r, g, b, a = _between(mips, at, at + width, s[FC + k], s[FR + k])
-        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
-    return _fetched(s)
+    r0, c0, across, down = _place(column * scale, row * scale, wide, high)
+    return _texels(mips, starts, second, r0, c0, wide, across, down)
 
 
 @inner()
-def _sky(s, faces, size, x, y, z, near, medium):
+def _sky(starts, faces, size, x, y, z, near, medium):
     """Colours of a flat, bordered cube map in directions that climb, behind fog."""
     zero = v8.splat(ZERO)
     ax, ay = v8.absolute(x), v8.absolute(y)
@@ -528,13 +537,9 @@ def _sky(s, faces, size, x, y, z, near, medium):
     side = v8.splat(F(np.int32(size)))
     middle = v8.splat(HALF) * side
     inverse = (middle - v8.splat(ONE)) / major
-    _place(s, across * inverse + middle, down * inverse + middle, side, side)
-    v8.store(s, R0, v8.load(s, R0) + face * side)
-    for k in range(LANES):
-        at = _pixel(s[R0 + k]) * size + _pixel(s[C0 + k])
-        r, g, b, _ = _between(faces, at, at + size, s[FC + k], s[FR + k])
-        s[R + k], s[G + k], s[B + k] = r, g, b
-    seen = _load3(s, R, G, B)
+    r0, c0, across, down = _place(across * inverse + middle, down * inverse + middle, side, side)
+    r, g, b, _ = _texels(faces, starts, WHOLE, r0 + face * side, c0, side, across, down)
+    seen = r, g, b
     if medium.fog_above >= ZERO:
         t = _exponential(near + v8.splat(medium.fog_above) / z)
         seen = _blend3(t, seen, _splat3(medium.airlight))
@@ -597,8 +602,10 @@ def _place_on_bed(px, py, tx, ty, depth, bed, medium):
 
 
 @inner()
-def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium):
-    """The bed's depth along the refracted rays; C0 to FR, FOUND (1 or 0): where they meet it."""
+def _search_bed(found, depth, px, py, tx, ty, alpha, depths, bed, medium):
+    """Where refracted rays meet the bed: its depth and its place in the bed's image; 1 where they
+    do, else 0.
+    """
     zero, one = v8.splat(ZERO), v8.splat(ONE)
     going = found
     for _ in range(BED_STEPS):
@@ -616,26 +623,25 @@ def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium):
         going = v8.select(moved, going, zero)
         depth = better
     column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium)
-    _place(s, column, row, v8.splat(bed.columns), v8.splat(bed.rows))
-    v8.store(s, FOUND, v8.select(inside, found, zero))
-    return depth
+    return depth, column, row, v8.select(inside, found, zero)
 
 
 @inner()
-def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed):
-    """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
+def _own_bed(s, q, own, place, at, depth, colors, rgb, alpha):
+    """The bed straight behind the pixel where the other one's FOUND is 0: its depth and colour."""
+    r, g, b, a = colors
     v8.store(s, DEPTH, depth)
-    right, below = _neighbours(bed)
+    v8.store(s, R, r)
+    v8.store(s, G, g)
+    v8.store(s, B, b)
+    v8.store(s, A, a)
     for k in range(LANES):
-        r = g = b = a = ZERO
-        if s[FOUND + k] > ZERO:
-            r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
-        if a < SOLID:
+        if s[FOUND + k] == ZERO:
             pixel = U(own[place + k])
-            r, g, b = (rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)], rgb[U(3) * pixel + U(2)])
-            a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
-        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
-    return v8.load(s, DEPTH)
+            s[R + k], s[G + k] = rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)]
+            s[B + k], s[A + k] = rgb[U(3) * pixel + U(2)], alpha[pixel]
+            s[DEPTH + k] = q[OWN_DEPTH + at + k]
+    return v8.load(s, DEPTH), v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
 
 
 @inner()
@@ -721,15 +727,14 @@ def _store_tap(s, tap, share, ray):
 
 class Pixels(NamedTuple):
     """u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera; all float64.
-    cover [H, W]: alpha before the water. left, top: of the camera's window in the bed's.
+    cover [H, W]: alpha before the water. bed: places_in the bed's image.
     """
 
     u: np.ndarray
     v: np.ndarray
     axes: np.ndarray
     cover: np.ndarray
-    left: int
-    top: int
+    bed: np.ndarray
 
 
 class Normals(NamedTuple):
@@ -742,9 +747,9 @@ class Normals(NamedTuple):
 
 
 class Image(NamedTuple):
-    """A layer, flat; empty where there is none. view [22]: focal length times the camera's right,
-    down (fx, fy) and forward axes; coefficients of column, row and 1 in the x, y, z of a pixel's
-    ray; cx, cy, width, height.
+    """A layer, flat, with a row and a pixel beyond it where a side is 1; empty where there is none.
+    view [22]: focal length times the camera's right, down (fx, fy) and forward axes; coefficients
+    of column, row and 1 in the x, y, z of a pixel's ray; cx, cy, width, height.
     """
 
     view: np.ndarray
@@ -782,7 +787,8 @@ class Faces(NamedTuple):
 def _shade_row(
     i, pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out
 ):
-    u, v, axes, cover, left, top = pixels
+    u, v, axes, cover, in_bed = pixels
+    bed_right, bed_left, bed_down, bed_top = in_bed[0], in_bed[1], in_bed[2], in_bed[3]
     normal_x, normal_y, variance, smooth_variance = normals
     bed_view, bed_rgb, bed_alpha, bed_depth = bed_image
     mirror_view, mirror_rgb, mirror_alpha, mirror_depth = mirror_image
@@ -796,10 +802,10 @@ def _shade_row(
     medium = _medium(water)
     q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
     places, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
-    starts = np.zeros(16, np.int64)
+    starts = np.zeros(24, np.int64)
     smooth_count, rough_count, j = U(0), U(0), 0
     bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
-    own_row = i + top
+    own_row = np.int64(np.floor((np.float64(i) + 0.5) * bed_down + bed_top))
     row_inside = own_row >= 0 and own_row < np.int64(bed.height)
     far = np.float64(F(FARTHEST))
     while True:
@@ -827,7 +833,7 @@ def _shade_row(
             q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
             q[OWN_DEPTH + n] = -ONE
             own[p] = 0
-            column = j + left
+            column = np.int64(np.floor((np.float64(j) + 0.5) * bed_right + bed_left))
             if row_inside and column >= 0 and column < np.int64(bed.width):
                 pixel = U(own_row) * bed.width + U(column)
                 if bed_alpha[pixel] >= SOLID:
@@ -883,18 +889,23 @@ def _shade_row(
                 tx, ty, steep = _refract(normal, c, inside, view, medium)
             thick = own_depth * steep * v8.splat(medium.least_extinction)
             clear = v8.both(
-                v8.at_least(own_depth, zero), v8.greater(v8.splat(F(MAX_OPTICAL_DEPTH)), thick)
+                v8.at_least(own_depth, zero), v8.greater(v8.splat(medium.opaque), thick)
             )
             if _any(clear):
-                found = v8.select(clear, one, zero)
-                v8.store(s, FOUND, zero)
-                depth = own_depth
+                found, depth, colors = zero, own_depth, (zero, zero, zero, zero)
                 if bends:
-                    depth = _search_bed(
-                        s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium
+                    depth, column, row, found = _search_bed(
+                        v8.select(clear, one, zero), own_depth, px, py, tx, ty,
+                        bed_alpha, bed_depth, bed, medium,
+                    )  # fmt: skip
+                    colors = _fetch(starts, column, row, bed_rgb, bed_alpha, bed)
+                    found = v8.select(v8.at_least(colors[3], v8.splat(SOLID)), found, zero)
+                v8.store(s, FOUND, found)
+                r, g, b, a = colors
+                if _any(v8.both(clear, v8.greater(v8.splat(HALF), found))):
+                    depth, r, g, b, a = _own_bed(
+                        s, q, own, start + first, at, depth, colors, bed_rgb, bed_alpha
                     )
-                depth = _fetch_bed(s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed)
-                r, g, b, a = _fetched(s)
                 way = depth * steep
                 absorbed = (
                     _absorb(r, a, deep[0], way, medium.extinction[0]),
@@ -927,7 +938,7 @@ def _shade_row(
                         front_alpha, front_depth, front, medium,
                     )  # fmt: skip
                     if _any(v8.greater(weight, zero)):
-                        image = _fetch(s, column, row, front_rgb, front_alpha, front)
+                        image = _fetch(starts, column, row, front_rgb, front_alpha, front)
                     rest = _any(v8.greater(one - weight, v8.splat(TINY)))
                     needs_mirror = has_mirror and rest
                 if needs_mirror:
@@ -942,11 +953,11 @@ def _shade_row(
                     if needs_mirror:
                         column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
                         if rough:
-                            lower = _fetch_level(s, starts, U(0), column, row, mirror_mips)
-                            upper = _fetch_level(s, starts, LANES, column, row, mirror_mips)
+                            lower = _fetch_level(s, starts, LOWER, column, row, mirror_mips)
+                            upper = _fetch_level(s, starts, UPPER, column, row, mirror_mips)
                             seen = _blend4(v8.load(s, SHARE_ABOVE), upper, lower)
                         else:
-                            seen = _fetch(s, column, row, mirror_rgb, mirror_alpha, mirror)
+                            seen = _fetch(starts, column, row, mirror_rgb, mirror_alpha, mirror)
                     if has_front:
                         seen = _blend4(weight, image, seen)
                     r, g, b, a = seen
@@ -956,7 +967,7 @@ def _shade_row(
                     color = r * whole, g * whole, b * whole
                     if _any(shines):
                         rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)
-                        behind = _sky(s, faces, size, rx, ry, rz, near, medium)
+                        behind = _sky(starts, faces, size, rx, ry, rz, near, medium)
                         before = (
                             r + transmittance * behind[0],
                             g + transmittance * behind[1],

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.geometry import rigid
+from augment.geometry import any_in_squares, rigid
 
 # ---- Which rays meet the plane -------------------------------------------------------------------
 
@@ -68,14 +68,13 @@ class Margins:
         high = mask.shape[0] + self.top + self.bottom
         wide = mask.shape[1] + self.left + self.right
         rows, columns = -(-high // GRAIN), -(-wide // GRAIN)
-        inside = mask.new_zeros(rows * GRAIN, columns * GRAIN)
-        inside[self.top : self.top + mask.shape[0], self.left : self.left + mask.shape[1]] = mask
-        coarse = inside.view(rows, GRAIN, -1).any(1).view(rows, columns, GRAIN).any(2)
-        coarse = torch.nn.functional.pad(coarse.float()[None], (right, left, down, up))
-        size = (up + down + 1, left + right + 1)
-        grown = torch.nn.functional.max_pool2d(coarse, size, 1)[0] > 0
-        fine = grown.repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
-        return fine[:high, :wide].contiguous()
+        inside = np.zeros((high, wide), bool)
+        inside[self.top :, self.left :][: mask.shape[0], : mask.shape[1]] = mask.cpu().numpy()
+        coarse = np.pad(any_in_squares(inside, GRAIN), ((down, up), (right, left)))
+        coarse = np.any([coarse[k : k + rows] for k in range(up + down + 1)], 0)
+        coarse = np.any([coarse[:, k : k + columns] for k in range(left + right + 1)], 0)
+        fine = np.repeat(np.repeat(coarse, GRAIN, 0), GRAIN, 1)[:high, :wide]
+        return torch.from_numpy(np.ascontiguousarray(fine)).to(mask.device)
 
 
 @dataclass(frozen=True)
@@ -136,6 +135,24 @@ def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
             f"({left:.6g}, {top:.6g}) pixels"
         )
     return round(left), round(top)
+
+
+def places_in(outer: Camera, inner: Camera) -> Float64[np.ndarray, "4"]:
+    """Of the same eye's image in other pixels: scale and offset of columns, then those of rows.
+
+    A place x in the window `inner` is one at scale x + offset in `outer`.
+
+    Raises:
+        ValueError: they do not look the same way.
+    """
+    apart = float((outer.camera_from_world - inner.camera_from_world).abs().max())
+    if apart > 1e-6:
+        raise ValueError(
+            f"cameras {outer.name!r} and {inner.name!r} must be windows of one image; their poses "
+            f"differ by {apart:.3g}"
+        )
+    right, down = outer.fx / inner.fx, outer.fy / inner.fy
+    return np.array([right, outer.cx - right * inner.cx, down, outer.cy - down * inner.cy])
 
 
 def plane_window(camera: Camera, level_z_m: float) -> Window | None:
