@@ -7,7 +7,8 @@ rasteriser's backward pass adds up over a view. A splat's change in a view is
     max(|sum of w_i L(B_i - c_i)|, LEAST_CONTRAST sum of w_i) / pixels,    L: luma,
 
 and counts by the view that would change most. LEAST_CONTRAST stands for what changes of both signs
-hide, and for the changes that neighbours make when they go together. (Fan et al. 2024,
+hide, and for the changes that neighbours make when they go together. Those that change least go
+first, until what they change adds up to the error that is allowed in some view. (Fan et al. 2024,
 "LightGaussian", and Niemeyer et al. 2024, "RadSplat", leave out by weight alone, which at the same
 error leaves out less.)
 """
@@ -16,10 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 
 from augment.cameras import Camera
 from augment.lod import keeps_levels
@@ -28,40 +30,43 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
 from augment.scene import Gaussians, PosedGaussians, Scene
 
-MAX_VIEWS, MAX_WIDTH_PX = 48, 320  # that are looked at
+MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 48, 320  # that are looked at
+MAX_NUMBERS = 200_000_000  # of views and splats: fewer views of larger backgrounds
 # From farther away than this from all recorded cameras, a view may show what none of them did.
 FARTHEST_M = 2.0
 LUMA = (0.299, 0.587, 0.114)
 SKY = 0.7  # luma behind all splats
 LEAST_CONTRAST = 0.05
 _ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
-_CHANGES = ("changes without a splat",)
+_ERRORS = ("errors without splats",)
 
 
 def prune_parts(
-    parts: Sequence[PosedGaussians], scene: Scene, camera: Camera, millionths: float
+    parts: Sequence[PosedGaussians], scene: Scene, camera: Camera, error: float
 ) -> tuple[PosedGaussians, ...]:
-    """The parts as `camera` needs them: opacities of splats are 0 without which no recorded view of
-    the scene would change by more than this share of white. parts: as the effects have left them.
+    """The parts as `camera` needs them: opacities of splats are 0 of which each alone changes the
+    mean of a recorded view so little that it adds up to no more than this share of white. parts: as
+    the effects have left them.
     """
-    if millionths <= 0 or not _is_near(camera, scene):
+    if error <= 0 or not _is_near(camera, scene):
         return tuple(parts)
     return tuple(
-        _pruned(part, scene, millionths) if _is_background(part, scene) else part for part in parts
+        _pruned(part, scene, error) if _is_background(part, scene) else part for part in parts
     )
 
 
-def share_changes(scene: Scene) -> None:
-    """Find the changes now, so that other processes take them over."""
+def share_errors(scene: Scene) -> None:
+    """Find the errors now, so that other processes take them over."""
     if not keeps_levels(scene.background):
-        memo_of(scene).put(_CHANGES, changes_of(scene), shared=True)
+        memo_of(scene).put(_ERRORS, errors_of(scene), shared=True)
 
 
-def changes_of(scene: Scene) -> Float[np.ndarray, "N"]:
-    """By how much the mean luma of a recorded view would change without each splat of the
-    background, float32; infinite where no view has it in its frame. Found once a scene.
+def errors_of(scene: Scene) -> Float[np.ndarray, "N"]:
+    """The changes by each splat of the background and all that change less, added up in the worst
+    recorded view, share of white, float32; infinite where no view has it in its frame. Found once a
+    scene.
     """
-    return memo_of(scene).get(_CHANGES, lambda: _find_changes(scene))
+    return memo_of(scene).get(_ERRORS, lambda: _find_errors(scene))
 
 
 def _is_background(part: PosedGaussians, scene: Scene) -> bool:
@@ -80,41 +85,59 @@ def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
     return np.array([camera.centre.numpy() for camera in _recorded(scene)]).reshape(-1, 3)
 
 
-def _pruned(part: PosedGaussians, scene: Scene, millionths: float) -> PosedGaussians:
-    own, changes = part.gaussians.opacities, changes_of(scene)
+def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
+    own, errors = part.gaussians.opacities, errors_of(scene)
 
     def prune() -> tuple[np.ndarray, torch.Tensor]:
-        is_missed = torch.from_numpy(changes > 1e-6 * millionths).to(own.device)
-        return changes, torch.where(is_missed, own, 0.0)
+        is_missed = torch.from_numpy(errors > error).to(own.device)
+        return errors, torch.where(is_missed, own, 0.0)
 
     # Of the same tensor as long as that lives, so that the rasteriser knows it again.
-    by, opacities = known_of(own, f"pruned at {millionths}", prune)
-    if by is not changes:  # the same tensor in a scene of other views
+    by, opacities = known_of(own, f"pruned at {error}", prune)
+    if by is not errors:  # the same tensor in a scene of other views
         opacities = prune()[1]
     return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
 
 
-def _find_changes(scene: Scene) -> Float[np.ndarray, "N"]:
-    from augment.render.cpu.backward import record
-    from augment.render.cpu.driver import Scratch, gather_inputs
+def _find_errors(scene: Scene) -> Float[np.ndarray, "N"]:
+    from augment.render.cpu.driver import Scratch
 
     count, scratch = len(scene.background), Scratch()
-    changes = np.full(count, np.inf, np.float32)
     opaque = scene.background.opacities.detach().cpu().numpy() >= _ALPHA_MAX
+    views = [_changes_in(scene, camera, opaque, scratch) for camera in _views(scene)]
+    most = np.full(count, np.inf, np.float32)
+    for ids, changes in views:
+        known = most[ids]
+        most[ids] = np.maximum(np.where(np.isinf(known), 0, known), changes)
+    order = np.argsort(most, kind="stable")
+    sums = np.zeros(count)
+    for ids, changes in views:
+        own = np.zeros(count)
+        own[ids] = changes
+        np.maximum(sums, own[order].cumsum(), out=sums)
+    errors = np.full(count, np.inf, np.float32)
+    framed = np.isfinite(most[order])
+    errors[order[framed]] = sums[framed]
+    return errors
+
+
+def _changes_in(
+    scene: Scene, camera: Camera, opaque: np.ndarray, scratch: Any
+) -> tuple[Int32[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """The background's splats in the camera's frame, and each one's change of the view's mean."""
+    from augment.render.cpu.backward import record
+    from augment.render.cpu.driver import gather_inputs
+
     settings = RasterSettings(alpha_max=_ALPHA_MAX)
-    for camera in _views(scene):
-        parts = [_on_cpu(part) for part in scene.parts_for(camera)]
-        inputs = gather_inputs(parts, camera, settings, None, with_color=True, culled=True)
-        tape = record(inputs, camera, settings, scratch, with_depth=False)
-        d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
-        ids, weights, effects = tape.splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
-        own = (ids >= 0) & (ids < count)
-        ids, weights = ids[own], weights[own] / np.float32(LUMA[0])
-        least = np.where(opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
-        change = np.maximum(np.abs(effects[own]), least) / tape.alpha.size
-        known = changes[ids]
-        changes[ids] = np.maximum(np.where(np.isinf(known), 0, known), change)
-    return changes
+    parts = [_on_cpu(part) for part in scene.parts_for(camera)]
+    inputs = gather_inputs(parts, camera, settings, None, with_color=True, culled=True)
+    tape = record(inputs, camera, settings, scratch, with_depth=False)
+    d_rgb = np.broadcast_to(np.array(LUMA, np.float32), tape.rgb.shape).copy()
+    ids, weights, effects = tape.splat_effects(d_rgb, np.full_like(tape.alpha, -SKY))
+    own = (ids >= 0) & (ids < len(opaque))
+    ids, weights = ids[own], weights[own] / np.float32(LUMA[0])
+    least = np.where(opaque[ids], np.float32(1), np.float32(LEAST_CONTRAST)) * weights
+    return ids, np.maximum(np.abs(effects[own]), least) / np.float32(tape.alpha.size)
 
 
 def _recorded(scene: Scene) -> list[Camera]:
@@ -125,7 +148,9 @@ def _recorded(scene: Scene) -> list[Camera]:
 def _views(scene: Scene) -> list[Camera]:
     """Spread over all recorded images, small."""
     cameras = _recorded(scene)
-    places = np.linspace(0, len(cameras) - 1, min(MAX_VIEWS, len(cameras))).round().astype(int)
+    room = max(MIN_VIEWS, MAX_NUMBERS // len(scene.background))
+    count = min(MAX_VIEWS, room, len(cameras))
+    places = np.linspace(0, len(cameras) - 1, count).round().astype(int)
     chosen = [cameras[place] for place in places if not cameras[place].is_orthographic]
     return [camera.scaled(min(1.0, MAX_WIDTH_PX / camera.width)) for camera in chosen]
 

@@ -190,14 +190,17 @@ class Render(Section):
         Knob("lod_px", (2.0, 1.0, 0.5, 0.0), "far splats are merged in cells as large", 13),
         Knob(
             "transmittance_stop",
-            (0.05, 0.01, 1e-3, 1e-4),
+            (0.05, 0.02, 0.01, 1e-3, 1e-4),
             "light behind it is given up",
             5,
             tiers={"draft": 0.01, "balanced": 0.01},
         ),
         Knob("fog_cut", (0.02, 0.002, 0.0), "splats behind so much fog are left out", 5.5),
         Knob(
-            "prune", (1.0, 0.2, 0.12, 0.05, 0.0), "splats that no view would miss are left out", 1.5
+            "prune",
+            (0.006, 0.0015, 0.0007, 0.0003, 0.0),
+            "splats that no view would miss are left out",
+            1.5,
         ),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )
@@ -234,10 +237,11 @@ class Render(Section):
     """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than
     this in the picture, pixels, or twice that where they are of one colour; 0 draws all as they
     are. For scenes of many millions."""
-    prune: Number = Field(default=0.0, ge=0, le=100)
-    """Splats of the background without which no recorded view's mean would change by more than this
-    share of white, in millionths, are left out of views from within 2 m of a recorded one; 0 leaves
-    out none. Found once a scene; of no effect with lod_px or on recorded images."""
+    prune: Number = Field(default=0.0, ge=0, le=0.5)
+    """Splats of the background are left out of which each alone changes the mean of a recorded view
+    so little that it adds up to no more than this share of white; 0 leaves out none. Found once a
+    scene, for views from within 2 m of a recorded one; of no effect with lod_px or on recorded
+    images."""
 
 
 class Sensor(Section):

@@ -11,7 +11,7 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
-from augment.prune import share_changes
+from augment.prune import share_errors
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
@@ -40,7 +40,7 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
         if effect.shares_files or not only_files:
             effect.share(job)
     if not only_files and any(recipe.render.prune > 0 for recipe in job.recipes):
-        share_changes(job.scene)
+        share_errors(job.scene)
 
 
 def add_effect(effect: Effect) -> None:

@@ -23,6 +23,10 @@ from recipes.schema import Output, Recipe, Render
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, stack
 from tests.streets import open_street
 
+HIDDEN = (
+    1e-4  # what the wall's hidden splats change together is less, and any splat of the wall more
+)
+
 
 def scene_of(gaussians: Gaussians, *cameras: Camera) -> Scene:
     frames = tuple(
@@ -33,8 +37,8 @@ def scene_of(gaussians: Gaussians, *cameras: Camera) -> Scene:
     return Scene("pruned", "test:pruned", gaussians, actors=(), frames=frames, sky=sky)
 
 
-def buffers(scene: Scene, camera: Camera, millionths: float):
-    recipe = Recipe(render=Render(prune=millionths), output=Output(depth="median"))
+def buffers(scene: Scene, camera: Camera, error: float):
+    recipe = Recipe(render=Render(prune=error), output=Output(depth="median"))
     return render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
 
 
@@ -49,9 +53,11 @@ def test_changes_are_those_of_pictures_without_the_splat():
     splats = random_gaussians(40, seed=3, sh_degree=1)
     splats = dataclasses.replace(splats, opacities=splats.opacities.clamp(0.02, 0.9))
     camera = camera_ahead(64, 48, 50.0)
-    found = prune.changes_of(scene_of(splats, camera))
-    whole, there = luma(splats, camera), np.isfinite(found)
+    errors = prune.errors_of(scene_of(splats, camera))
+    whole, there = luma(splats, camera), np.isfinite(errors)
     assert 10 < there.sum() < 40  # some stand behind the camera
+    order, found = np.argsort(errors), np.zeros(40)
+    found[order] = np.diff(errors[order].clip(max=1), prepend=0)  # of one view: their running sum
     for i in np.flatnonzero(there):
         left = splats.select(torch.arange(40) != i)
         change = abs(float((luma(left, camera) - whole).mean()))
@@ -75,37 +81,38 @@ def street_of_walls() -> tuple[Scene, Camera]:
 
 def test_hidden_splats_go_without_a_trace_and_those_that_no_view_framed_stay():
     scene, camera = street_of_walls()
-    changes = prune.changes_of(scene)
-    assert np.isinf(changes[-1]) and (changes[117:217] < 1e-6).all()
-    bare, less = buffers(scene, camera, 0), buffers(scene, camera, 1.0)
+    errors = prune.errors_of(scene)
+    assert np.isinf(errors[-1]) and (errors[117:217] < HIDDEN).all()
+    bare, less = buffers(scene, camera, 0), buffers(scene, camera, HIDDEN)
     opacities = less.parts[0].gaussians.opacities
-    assert (opacities[117:217] == 0).all() and (opacities[:117] > 0).all() and opacities[-1] > 0
-    assert float((bare.rgb - less.rgb).abs().max()) < 1 / 255
-    assert less.depth_m is not None and torch.equal(less.depth_m, bare.depth_m)
+    assert (opacities[117:217] == 0).all() and opacities[-1] > 0
+    assert (opacities[:117] > 0).sum() > 110  # of a corner no pixel may be in the frame
+    assert float((bare.rgb - less.rgb).abs().mean()) < 2.5 * HIDDEN  # of colours, see below
+    assert less.depth_m is not None and bare.depth_m is not None
+    assert float((less.depth_m != bare.depth_m).double().mean()) < 0.01
     assert (scene.background.opacities[117:217] > 0).all()  # nobody's scene is written to
 
 
-def test_the_mean_change_keeps_to_what_was_asked_for():
+def test_the_mean_change_follows_what_was_asked_for():
     scene = scene_of(random_gaussians(3000, seed=5, sh_degree=0), camera_ahead(64, 48, 50.0))
     (camera,) = scene.frames[0].cameras.values()
     whole = buffers(scene, camera, 0).rgb
     errors = list[float]()
-    for millionths in (1.0, 10.0, 100.0):
-        left_out = int((prune.changes_of(scene) <= 1e-6 * millionths).sum())
-        error = float((buffers(scene, camera, millionths).rgb - whole).abs().mean())
-        # Colours differ by more than luma, and signs cancel within a splat: hence twice.
-        assert left_out > 0 and error <= 2e-6 * millionths * left_out
-        errors.append(error)
-    assert errors == sorted(errors)
+    for asked in (1e-4, 1e-3, 1e-2):
+        change = buffers(scene, camera, asked).rgb - whole
+        # Neighbours that go together uncover each other, the more the more of them go.
+        assert abs(float((change @ torch.tensor(prune.LUMA)).mean())) <= 2.5 * asked
+        errors.append(float(change.abs().mean()))
+    assert 0 < errors[0] < errors[1] < errors[2]
 
 
 def test_views_in_levels_change_nothing_for_those_after_them():
     g = random_gaussians(MIN_SPLATS, seed=2, sh_degree=0, size=0.05)
     scene = scene_of(g, camera := camera_ahead(64, 48, 50.0))
-    before = buffers(scene, camera, 10.0).rgb
+    before = buffers(scene, camera, 1e-3).rgb
     recipe = Recipe(render=Render(lod_px=1.0))
     render_buffers(scene, camera, make_plan(recipe, scene), backend="cpu")
-    assert torch.equal(buffers(scene, camera, 10.0).rgb, before)
+    assert torch.equal(buffers(scene, camera, 1e-3).rgb, before)
     assert not torch.equal(buffers(scene, camera, 0.0).rgb, before)
 
 
@@ -113,11 +120,11 @@ def test_views_from_elsewhere_draw_all():
     scene, camera = street_of_walls()
     near, far = (camera_ahead(64, 48, 50.0, position=(0.0, 0.0, up)) for up in (1.9, 2.1))
     for view, is_pruned in ((camera, True), (near, True), (far, False)):
-        opacities = buffers(scene, view, 1.0).parts[0].gaussians.opacities
+        opacities = buffers(scene, view, HIDDEN).parts[0].gaussians.opacities
         assert bool((opacities[117:217] == 0).all()) is is_pruned
 
 
-@pytest.mark.parametrize("render", [Render(), Render(prune=1.0, lod_px=1.0)])
+@pytest.mark.parametrize("render", [Render(), Render(prune=0.1, lod_px=1.0)])
 def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
     scene, camera = street_of_walls()
     recipe = Recipe(render=render)
@@ -132,14 +139,14 @@ def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
 
 def test_other_processes_take_the_changes_over():
     scene, camera = street_of_walls()
-    recipe = Recipe(render=Render(prune=1.0))
+    recipe = Recipe(render=Render(prune=HIDDEN))
     share_effects(Sharing(scene, [recipe]))
     other = dataclasses.replace(scene)
     memo_of(other).update(pickle.loads(pickle.dumps(memo_of(scene).shared())))
-    np.testing.assert_array_equal(prune.changes_of(other), prune.changes_of(scene))
+    np.testing.assert_array_equal(prune.errors_of(other), prune.errors_of(scene))
     alone = dataclasses.replace(scene)
     assert torch.equal(
-        buffers(other, camera, 1.0).rgb, buffers(alone, camera, 1.0).rgb
+        buffers(other, camera, HIDDEN).rgb, buffers(alone, camera, HIDDEN).rgb
     )  # the same bits, whoever found them
 
 
@@ -148,8 +155,8 @@ def test_weather_is_drawn_on_what_is_left():
     camera = scene.frames[0].cameras["front"].scaled(0.1)
     weather = {"snow": {"depth_m": 0.1, "cell_m": 0.4}, "flood": {"level_m": 0.1}}
     views = [
-        render_view(scene, camera, Recipe(weather=weather, render=Render(prune=millionths)))
-        for millionths in (0.0, 0.5)
+        render_view(scene, camera, Recipe(weather=weather, render=Render(prune=error)))
+        for error in (0.0, 2e-3)
     ]
     off = np.abs(views[0].rgb.astype(int) - views[1].rgb).mean()
     assert 0 < off < 2  # levels of 255

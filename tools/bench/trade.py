@@ -49,7 +49,7 @@ from augment.jobs.worker import default_renderer
 from augment.memo import memo_of
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import depth_errors, flip, ssim
-from augment.prune import share_changes
+from augment.prune import share_errors
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
@@ -352,7 +352,7 @@ def bench_trade(
     scene = open_scene(scene_uri)
     with contextlib.suppress(SceneError):  # looked for once, not for every copy of the scene
         scene = dataclasses.replace(scene, ground=ground_of(scene))
-    share_changes(scene)
+    share_errors(scene)
     views = trade_views(scene, case.width)
     cameras = [camera for _, camera in views]
     machine, gpu = harness.machine_facts(), None if backend == CPU else harness.gpu_facts()
