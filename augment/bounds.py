@@ -103,8 +103,11 @@ def may_show(
     sides, offsets, reach = _half_spaces(camera, near_m)
     rotation, shift = camera_from_part[..., :3, :3], camera_from_part[..., :3, 3]
     axes = (sides @ rotation).reshape(-1, 5, 3)  # along the part's own axes, [1 or B, 5, 3]
-    centres = (axes * bounds.centres[:, None]).sum(-1)
-    extents = (np.abs(axes) * bounds.halves[:, None]).sum(-1)
+    if len(axes) == 1:
+        centres, extents = bounds.centres @ axes[0].T, bounds.halves @ np.abs(axes[0]).T
+    else:
+        centres = (axes * bounds.centres[:, None]).sum(-1)
+        extents = (np.abs(axes) * bounds.halves[:, None]).sum(-1)
     placed = shift @ sides.T + offsets
     most = centres + placed + extents + bounds.longest[:, None] * reach
     slack = _ROUNDING * (np.abs(centres) + np.abs(placed) + extents)

@@ -27,6 +27,7 @@ class LayerRenderer:
 
     fog: in front of parts and sky. fog_on_buffers: whether it is applied to finished layers, and
     not blended per Gaussian. photo: what cameras that took it see in place of the splats' colours.
+    unpruned: the parts where `parts` lack what no recorded view would miss.
     """
 
     parts: Sequence[PosedGaussians]
@@ -36,6 +37,7 @@ class LayerRenderer:
     settings: RasterSettings
     backend: str
     photo: Photo | None = None
+    unpruned: Sequence[PosedGaussians] | None = None
 
     def without_fog(self) -> LayerRenderer:
         return replace(self, fog=None)

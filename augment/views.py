@@ -79,7 +79,8 @@ def render_buffers(
         layers = own.effect.edit_scene(own, layers, camera)
     if plan.prune > 0:
         with timed("prune"):
-            layers = replace(layers, parts=prune_parts(layers.parts, scene, camera, plan.prune))
+            parts = prune_parts(layers.parts, scene, camera, plan.prune)
+            layers = replace(layers, parts=parts, unpruned=layers.parts)
     drawn = _draw(view, layers, camera)
     for own in view.effects:
         drawn = own.effect.edit_image(own, drawn, camera)

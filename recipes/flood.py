@@ -165,7 +165,7 @@ class Flood(EffectModel):
     """Bed of which no more than this share comes up through the water is left out: at 0.006 one and
     a half levels of 255, of a bed as far from the water's colour as white from black. Depth and
     classes show it."""
-    layers_px: Number = Field(default=1.0, ge=1, le=8)
+    layers_px: Number = Field(default=2.0, ge=1, le=8)
     """Width of the pixels that the bed and the mirrored view are drawn in, of the picture's; the
     bed's only where the picture alone is wanted."""
 

@@ -195,7 +195,7 @@ class Render(Section):
             5,
             tiers={"draft": 0.01, "balanced": 0.01},
         ),
-        Knob("fog_cut", (0.02, 0.002, 0.0), "splats behind so much fog are left out", 5.5),
+        Knob("fog_cut", (0.02, 0.0039, 0.0), "splats behind so much fog are left out", 5.5),
         Knob(
             "prune",
             (0.006, 0.0015, 0.0007, 0.0003, 0.0),
@@ -229,9 +229,9 @@ class Render(Section):
     radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
     """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
     picture, are left out; 0 leaves out none."""
-    fog_cut: Number = Field(default=0.002, ge=0, le=0.1)
+    fog_cut: Number = Field(default=0.0039, ge=0, le=0.1)
     """Splats of which smog lets no more than this share through are left out, and pixels finished
-    once no more of what is behind would be seen: at 0.002 half a level of 255. It counts where the
+    once no more of what is behind would be seen: at 0.0039 a level of 255. It counts where the
     picture alone is wanted: depth, classes, snow and water are drawn through any smog."""
     lod_px: Number = Field(default=0.0, ge=0, le=64)
     """Far splats of large backgrounds are merged, once a scene, in cells that are no larger than

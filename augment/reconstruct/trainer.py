@@ -303,7 +303,7 @@ def splat_inputs(
         views=part_views(poses, camera, settings, None),
         blocks=_blocks(counts),
         modes=raster_modes(settings, None, with_color=True),
-        arrays=[getattr(splats, name) for name in _FIELDS],
+        kept_alive=[getattr(splats, name) for name in _FIELDS],
     )
 
 

@@ -12,9 +12,10 @@ import torch
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, BUFFERS, RGB, RenderOutput
 from augment.render.composite import composite_sky
-from augment.render.constants import RasterSettings
+from augment.render.constants import ALPHA_MIN, RasterSettings
+from augment.render.cpu import order
 from augment.render.cpu.driver import gather_inputs, rasterize_cpu
-from augment.render.cpu.order import order_of
+from augment.render.cpu.order import CELL, order_of
 from augment.render.fog import Fog
 from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
@@ -26,6 +27,12 @@ from tests.scenes import camera_ahead, random_gaussians, random_pose, sh_of
 PLAIN = RasterSettings()
 PICTURE = frozenset({RGB, ALPHA})
 COUNT = 6000  # a dozen cells
+
+
+@pytest.fixture(autouse=True)
+def _small_scenes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have few Gaussians taken by their boxes, which costs more than it saves."""
+    monkeypatch.setattr(order, "_MIN_COUNT", 8 * CELL)
 
 
 def copy_of(gaussians: Gaussians) -> Gaussians:
@@ -91,6 +98,26 @@ def test_a_camera_reads_what_it_may_see_alone():
     assert places_read(scene, ahead, RasterSettings(), None, above) == 0
     buried = dataclasses.replace(scene, opacities=torch.zeros(len(scene)))
     assert places_read(buried, ahead) == 0
+
+
+def test_those_too_faint_for_any_view_are_not_read_and_change_no_bit():
+    scene = random_gaussians(COUNT, sh_degree=1)
+    camera, shown = camera_ahead(61, 43), scene.opacities.clone()
+    faint = torch.rand(COUNT, generator=torch.Generator().manual_seed(1)) < 0.6
+    scene.opacities[faint] = 0.9 * ALPHA_MIN
+    scene.opacities[5] = math.nan  # of which nothing is known
+    expected = draw(copy_of(scene), camera, BUFFERS)
+    places_read(drawn(scene), camera)
+    known = order_of(scene)
+    assert known is not None
+    assert COUNT - len(known.ids) == int((scene.opacities < ALPHA_MIN).sum()) > COUNT / 2
+    assert_same_bits(draw(scene, camera, BUFFERS), expected, BUFFERS)
+    again = dataclasses.replace(scene, opacities=shown)  # the same means and scales beside others
+    assert_same_bits(draw(again, camera), draw(copy_of(again), camera))
+    whole = order_of(again)
+    assert whole is not None and len(whole.ids) == COUNT
+    scene.opacities[:] = shown
+    assert_same_bits(draw(scene, camera, BUFFERS), draw(copy_of(scene), camera, BUFFERS), BUFFERS)
 
 
 def test_a_change_in_place_is_seen():

@@ -150,6 +150,21 @@ def test_other_processes_take_the_changes_over():
     )  # the same bits, whoever found them
 
 
+def test_wet_ground_mirrors_what_recorded_views_would_not_miss():
+    """From under the ground more is seen than from above: the sky would shine through."""
+    scene = open_street()
+    camera = scene.frames[0].cameras["front"].scaled(0.2)
+    dry, wet = (
+        [
+            render_view(scene, camera, Recipe(weather={"rain": rain}, render=Render(prune=error)))
+            for error in (0.0, 2e-3)
+        ]
+        for rain in ({"rate_mm_h": 10, "wetness": 0.0, "puddles": 0.0}, {"rate_mm_h": 10})
+    )
+    off = [float((b.rgb.astype(int) - a.rgb).mean()) for a, b in (dry, wet)]
+    assert abs(off[1] - off[0]) < 0.1  # levels of 255
+
+
 def test_weather_is_drawn_on_what_is_left():
     scene = open_street()
     camera = scene.frames[0].cameras["front"].scaled(0.1)

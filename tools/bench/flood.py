@@ -112,8 +112,8 @@ def inside(water: np.ndarray) -> np.ndarray:
 
 
 def analytic_error(scene: Scene, camera: Camera, fresnel: str = "exact") -> dict[str, Any]:
-    """The mirrored tier against mirrored Gaussians: still, opaque water."""
-    recipe = flood_recipe(fresnel=fresnel, **OPAQUE)
+    """The mirrored tier at full resolution against mirrored Gaussians: still, opaque water."""
+    recipe = flood_recipe(fresnel=fresnel, layers_px=1, **OPAQUE)
     picture = draw_picture(scene, camera, recipe)
     truth = mirrored_picture(scene, camera, recipe).clamp(0, 1).numpy()
     return {

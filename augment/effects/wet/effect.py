@@ -197,7 +197,7 @@ def _draw_mirror(
         replace(part, gaussians=_without_ground(part.gaussians, splats))
         if part.instance_id == 0
         else part
-        for part in layers.parts
+        for part in layers.unpruned or layers.parts  # pruned for views with the ground in them
         if not part.is_overlay
     ]
     stop = max(STOP, layers.settings.transmittance_stop)

@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,7 +62,7 @@ class Inputs:
     """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
 
     addresses, sizes, first_ids, views, blocks, orders: see project; None where every part stands in
-    its own order. modes: see layout. arrays: what the addresses point to, kept alive by this.
+    its own order. modes: see layout. kept_alive: what the addresses point to.
     """
 
     addresses: np.ndarray
@@ -70,7 +71,7 @@ class Inputs:
     views: np.ndarray
     blocks: np.ndarray
     modes: np.ndarray
-    arrays: list[np.ndarray]
+    kept_alive: list[Any]
     orders: np.ndarray | None = None
 
     @property
@@ -106,27 +107,23 @@ def gather_inputs(
 
     culled: whether blocks that the view cannot see are left out.
     """
-    arrays, addresses, orders, blocks = [], [], [], []
+    kept_alive, addresses, orders, blocks = list[Any](), [], [], []
     for number, part in enumerate(parts):
         g, count = part.gaussians, len(part.gaussians)
         order = order_of(g) if culled and part.rows is None else None
         if order is None:
-            firsts = range(0, count, layout.BLOCK)
-            kept = [(first, min(first + layout.BLOCK, count)) for first in firsts]
-            if part.rows is not None:
-                kept = _blocks(part.rows).tolist()
-            tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
-            own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+            rows = np.array([[0, count]]) if part.rows is None else part.rows
+            kept = _blocks(rows) if count > layout.BLOCK or part.rows is not None else rows
+            own = [g.means, g.quats, g.scales, g.opacities]
         else:
-            kept = order.blocks_seen(part, camera, settings, fog, clip).tolist()
+            kept = order.blocks_seen(part, camera, settings, fog, clip)
             own = [order.means, *(order.sorted(t).rows for t in (g.quats, g.scales, g.opacities))]
-            own.append(g.sh.detach().to(torch.float32).contiguous().numpy())
-            arrays.append(order.ids)
-        own += _looks(part)
-        arrays += own
-        addresses.append([array.ctypes.data for array in own])
-        orders.append(0 if order is None else order.ids.ctypes.data)
-        blocks += [(number, first, last) for first, last in kept]
+            kept_alive.append(order.ids)
+        read = [_readable(array) for array in (*own, g.sh, *_looks(part))]
+        kept_alive += read
+        addresses.append([_address(array) for array in read])
+        orders.append(0 if order is None else _address(order.ids))
+        blocks += [(number, first, last) for first, last in kept.tolist()]
     sizes = [(len(part.gaussians), part.gaussians.sh.shape[1]) for part in parts]
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, fog, clip, with_color=with_color)
@@ -138,7 +135,7 @@ def gather_inputs(
         views=views_of(parts, camera, settings, fog, clip),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=modes,
-        arrays=arrays,
+        kept_alive=kept_alive,
         orders=np.array(orders, np.uint64),
     )
 
@@ -151,18 +148,31 @@ def _blocks(rows: np.ndarray) -> np.ndarray:
     return np.stack([first, np.minimum(first + layout.BLOCK, rows[run, 1])], 1)
 
 
-def _looks(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+_READ = (torch.float32, torch.int16)
+_UNREAD = torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.int16)
+
+
+def _looks(part: PosedGaussians) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Slopes of light float32 [N, 3], colour maps float32 [C, 3, 4] and their rows int16 [N]; [1]
     of what is not read.
     """
-    slopes, maps, rows = np.zeros(1, np.float32), np.zeros(1, np.float32), np.zeros(1, np.int16)
+    slopes, maps, rows = _UNREAD
     if part.shading is not None:
-        slopes = part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
+        slopes = part.shading.slopes
     if part.color_maps is not None:
-        maps = part.color_maps.detach().to(torch.float32).contiguous().numpy()
-    if part.map_rows is not None:
-        rows = part.map_rows.contiguous().numpy()
-    return slopes, maps, rows
+        maps = part.color_maps
+    return slopes, maps, rows if part.map_rows is None else part.map_rows
+
+
+def _readable(array: Any) -> Any:
+    """The tensor or array as kernels read it: float32 or int16, row after row."""
+    if isinstance(array, np.ndarray) or (array.dtype in _READ and array.is_contiguous()):
+        return array
+    return array.to(torch.float32 if array.is_floating_point() else torch.int16).contiguous()
+
+
+def _address(array: Any) -> int:
+    return array.ctypes.data if isinstance(array, np.ndarray) else array.data_ptr()
 
 
 # ---- Work space, kept between frames: fresh pages cost as much as the work -----------------------

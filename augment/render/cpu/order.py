@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import threading
 import weakref
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -30,7 +31,9 @@ from augment.scene import Gaussians, PosedGaussians
 
 CELL = 512
 _CELLS = layout.BLOCK // CELL  # of a block
-_MIN_COUNT = 8 * CELL  # fewer Gaussians are read as quickly as their boxes
+_MIN_COUNT = 32 * CELL  # fewer Gaussians are read as quickly as their boxes
+_FAINT = 0.1  # the share of Gaussians that no view shows from which leaving them out pays
+_ORDERS = 4  # that rows of one tensor are kept in
 _LEVELS = 10  # bits of each coordinate along the curve
 _ROUNDING = 1e-5  # of all terms of a sum: a hundred times float32's
 _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
@@ -55,24 +58,27 @@ def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
         with _making:
             known = find()
             if known is None:
-                gone = weakref.ref(tensor, lambda _: _known.pop(key, None))
+                gone = weakref.ref(tensor, lambda _, forget=_known.pop: forget(key, None))
                 known = _known[key] = (gone, tensor._version, make())
     return known[2]
 
 
 class _Uses:
-    """How often an order has been asked for, and the order once that pays."""
+    """How often an order has been asked for, and the order once that pays: of means, of all; of
+    opacities, of those that may be seen.
+    """
 
     def __init__(self) -> None:
         self.count = 0
         self.order: Order | None = None
+        self.of: Order | None = None  # which that is a part of
 
 
 # ---- The order -----------------------------------------------------------------------------------
 
 
 class Order(NamedTuple):
-    """ids: int32 [N], the Gaussian at every place. means: float32 [N, 3] in this order. lows,
+    """ids: int32 [M], the Gaussian at every place. means: float32 [M, 3] in this order. lows,
     highs: float64 [C, 3], the box of every cell's means, in the part's axes.
     """
 
@@ -98,14 +104,21 @@ class Order(NamedTuple):
         # Where nothing is known, of NaN, no comparison holds, and the cell stays.
         seen = may_be_drawn(bounds, pose, camera, settings, fog, clip)
         seen &= ~(self.sorted(g.opacities).largest < np.float32(ALPHA_MIN))
-        return _blocks_of(seen, len(g))
+        return _blocks_of(seen, len(self.ids))
+
+    def without(self, faint: np.ndarray, means: np.ndarray) -> Order:
+        """The order of the others. faint: bool [N]; means: [N, 3], by number."""
+        return _in_cells(self.ids[~faint[self.ids]], means)
 
     def sorted(self, tensor: Tensor) -> Sorted:
         """The tensor's rows in this order."""
-        known = known_of(tensor, "sorted", lambda: self._sort(tensor))
-        if known.order is not self:  # the same tensor beside other means
-            known = self._sort(tensor)
-        return known
+        kept = known_of(tensor, "sorted", lambda: deque[Sorted](maxlen=_ORDERS))
+        with _making:
+            own = next((rows for rows in kept if rows.order is self), None)
+            if own is None:
+                own = self._sort(tensor)
+                kept.append(own)
+        return own
 
     def _sort(self, tensor: Tensor) -> Sorted:
         rows = tensor.detach().numpy()[self.ids]
@@ -123,7 +136,9 @@ class Sorted(NamedTuple):
 
 
 def order_of(gaussians: Gaussians) -> Order | None:
-    """The order of Gaussians that have been drawn before; None for others, and where none pays."""
+    """The order of Gaussians that have been drawn before; None for others, and where none pays.
+    Many that are too faint for any view are not in it, once they have been drawn in it.
+    """
     g = gaussians
     if len(g) < _MIN_COUNT or not all(_is_plain(t) for t in (g.means, g.quats, g.scales)):
         return None
@@ -132,7 +147,22 @@ def order_of(gaussians: Gaussians) -> Order | None:
         uses.count += 1
         if uses.count > 1 and uses.order is None and _is_plain(g.opacities):
             uses.order = _find_order(g.means.detach().numpy())
-        return uses.order
+        return None if uses.order is None else _order_of_visible(g, uses)
+
+
+def _order_of_visible(g: Gaussians, of_all: _Uses) -> Order | None:
+    if not _is_plain(g.opacities):
+        return of_all.order
+    uses = known_of(g.opacities, "order", _Uses)
+    uses.count += 1
+    if uses.count == 1 or of_all.order is None:
+        return of_all.order
+    if uses.order is None or uses.of is not of_all.order:
+        uses.of = uses.order = of_all.order
+        faint = g.opacities.detach().numpy() < np.float32(ALPHA_MIN)
+        if _FAINT * len(faint) < np.count_nonzero(faint) < len(faint):
+            uses.order = of_all.order.without(faint, g.means.detach().numpy())
+    return uses.order
 
 
 def _is_plain(tensor: Tensor) -> bool:
@@ -153,7 +183,10 @@ def _find_order(means: np.ndarray) -> Order:
         steps = np.clip((means - low) / side, 0, (1 << _LEVELS) - 1)
     steps = np.where(finite[:, None], steps, 0).astype(np.uint32)
     along = _spread(steps[:, 0]) | _spread(steps[:, 1]) << 1 | _spread(steps[:, 2]) << 2
-    ids = np.argsort(along, kind="stable").astype(np.int32)
+    return _in_cells(np.argsort(along, kind="stable").astype(np.int32), means)
+
+
+def _in_cells(ids: np.ndarray, means: np.ndarray) -> Order:
     for first in range(0, len(ids), CELL):
         ids[first : first + CELL].sort()  # colours are read in the scene's own order
     rows, starts = means[ids], np.arange(0, len(ids), CELL)
