@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -33,7 +32,6 @@ CELL = 512
 _CELLS = layout.BLOCK // CELL  # of a block
 _MIN_COUNT = 32 * CELL  # fewer Gaussians are read as quickly as their boxes
 _FAINT = 0.1  # the share of Gaussians that no view shows from which leaving them out pays
-_ORDERS = 4  # that rows of one tensor are kept in
 _LEVELS = 10  # bits of each coordinate along the curve
 _ROUNDING = 1e-5  # of all terms of a sum: a hundred times float32's
 _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
@@ -41,16 +39,19 @@ _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
 # ---- What is known of tensors for as long as they live and stay as they are ----------------------
 
 Value = TypeVar("Value")
-_known: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]] = {}
+Known = dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]]
+_known: Known = {}
 _making = threading.RLock()  # views drawn at once want the same
 
 
-def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
-    """What `make` gave for the tensor under this name; made anew after a change in place."""
+def known_of(tensor: Tensor, name: str, make: Callable[[], Value], kept: Known = _known) -> Value:
+    """What `make` gave for the tensor under this name; made anew after a change in place. kept: by
+    whom; the module where it is left out.
+    """
     key = (id(tensor), name)
 
     def find() -> tuple[weakref.ref[Tensor], int, Any] | None:
-        known = _known.get(key)
+        known = kept.get(key)
         return known if known and known[0]() is tensor and known[1] == tensor._version else None
 
     known = find()
@@ -58,8 +59,8 @@ def known_of(tensor: Tensor, name: str, make: Callable[[], Value]) -> Value:
         with _making:
             known = find()
             if known is None:
-                gone = weakref.ref(tensor, lambda _, forget=_known.pop: forget(key, None))
-                known = _known[key] = (gone, tensor._version, make())
+                gone = weakref.ref(tensor, lambda _, forget=kept.pop: forget(key, None))
+                known = kept[key] = (gone, tensor._version, make())
     return known[2]
 
 
@@ -79,13 +80,14 @@ class _Uses:
 
 class Order(NamedTuple):
     """ids: int32 [M], the Gaussian at every place. means: float32 [M, 3] in this order. lows,
-    highs: float64 [C, 3], the box of every cell's means, in the part's axes.
+    highs: float64 [C, 3], the box of every cell's means, in the part's axes. kept: rows of tensors.
     """
 
     ids: np.ndarray
     means: np.ndarray
     lows: np.ndarray
     highs: np.ndarray
+    kept: Known
 
     def blocks_seen(
         self,
@@ -112,25 +114,18 @@ class Order(NamedTuple):
 
     def sorted(self, tensor: Tensor) -> Sorted:
         """The tensor's rows in this order."""
-        kept = known_of(tensor, "sorted", lambda: deque[Sorted](maxlen=_ORDERS))
-        with _making:
-            own = next((rows for rows in kept if rows.order is self), None)
-            if own is None:
-                own = self._sort(tensor)
-                kept.append(own)
-        return own
+        return known_of(tensor, "sorted", lambda: self._sort(tensor), self.kept)
 
     def _sort(self, tensor: Tensor) -> Sorted:
         rows = tensor.detach().numpy()[self.ids]
         largest = rows if rows.ndim == 1 else rows.max(1)
         starts = np.arange(0, len(rows), CELL)
-        return Sorted(self, rows, np.maximum.reduceat(largest, starts).astype(np.float64))
+        return Sorted(rows, np.maximum.reduceat(largest, starts).astype(np.float64))
 
 
 class Sorted(NamedTuple):
     """rows: of a tensor in the order. largest: float64 [C], the largest number of each cell."""
 
-    order: Order
     rows: np.ndarray
     largest: np.ndarray
 
@@ -191,7 +186,7 @@ def _in_cells(ids: np.ndarray, means: np.ndarray) -> Order:
         ids[first : first + CELL].sort()  # colours are read in the scene's own order
     rows, starts = means[ids], np.arange(0, len(ids), CELL)
     bounds = (f.reduceat(rows, starts, axis=0).astype(np.float64) for f in (np.minimum, np.maximum))
-    return Order(ids, rows, *bounds)
+    return Order(ids, rows, *bounds, {})
 
 
 def _spread(bits: np.ndarray) -> np.ndarray:
