@@ -8,9 +8,10 @@ rasteriser's backward pass adds up over a view. A splat's change in a view is
 
 and counts by the view that would change most. LEAST_CONTRAST stands for what changes of both signs
 hide, and for the changes that neighbours make when they go together. Those that change least go
-first, until what they change adds up to the error that is allowed in some view. (Fan et al. 2024,
-"LightGaussian", and Niemeyer et al. 2024, "RadSplat", leave out by weight alone, which at the same
-error leaves out less.)
+first, until what they change adds up to the error that is allowed in some view. After each of the
+ROUNDS the views are looked at without what has gone, since what it covered counts more then: a far
+front of many small splats would go as a whole. (Fan et al. 2024, "LightGaussian", and Niemeyer et
+al. 2024, "RadSplat", leave out by weight alone, which at the same error leaves out less.)
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from augment.cameras import Camera
 from augment.lod import keeps_levels
@@ -30,15 +31,25 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
 from augment.scene import Gaussians, PosedGaussians, Scene
 
-MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 48, 320  # that are looked at
+MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 24, 320  # that are looked at
 MAX_NUMBERS = 200_000_000  # of views and splats: fewer views of larger backgrounds
 # From farther away than this from all recorded cameras, a view may show what none of them did.
 FARTHEST_M = 2.0
 LUMA = (0.299, 0.587, 0.114)
 SKY = 0.7  # luma behind all splats
 LEAST_CONTRAST = 0.05
+ROUNDS = (
+    0.0002,
+    0.0004,
+    0.0008,
+    0.0016,
+    0.0032,
+    np.inf,
+)  # the errors up to which splats go in each
 _ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
 _ERRORS = ("errors without splats",)
+
+Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]  # which splats, what each changes
 
 
 def prune_parts(
@@ -102,28 +113,42 @@ def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
 def _find_errors(scene: Scene) -> Float[np.ndarray, "N"]:
     from augment.render.cpu.driver import Scratch
 
-    count, scratch = len(scene.background), Scratch()
-    opaque = scene.background.opacities.detach().cpu().numpy() >= _ALPHA_MAX
-    views = [_changes_in(scene, camera, opaque, scratch) for camera in _views(scene)]
-    most = np.full(count, np.inf, np.float32)
-    for ids, changes in views:
-        known = most[ids]
-        most[ids] = np.maximum(np.where(np.isinf(known), 0, known), changes)
-    order = np.argsort(most, kind="stable")
-    sums = np.zeros(count)
-    for ids, changes in views:
-        own = np.zeros(count)
-        own[ids] = changes
-        np.maximum(sums, own[order].cumsum(), out=sums)
-    errors = np.full(count, np.inf, np.float32)
-    framed = np.isfinite(most[order])
-    errors[order[framed]] = sums[framed]
+    scratch = Scratch()
+    opacities = scene.background.opacities.detach().cpu().clone()
+    opaque, errors = opacities.numpy() >= _ALPHA_MAX, np.full(len(opacities), np.inf, np.float32)
+    cameras = _views(scene)
+    gone = [0.0] * len(cameras)  # what has gone changes in each view
+    for most in ROUNDS if cameras else ():
+        rest = replace(scene, background=replace(scene.background, opacities=opacities))
+        views = [_changes_in(rest, camera, opaque, scratch) for camera in cameras]
+        order = _least_first(views, np.isinf(errors))
+        sums = np.zeros(len(order))
+        for (ids, changes), before in zip(views, gone, strict=True):
+            own = np.zeros(len(errors))
+            own[ids] = changes
+            np.maximum(sums, before + own[order].cumsum(), out=sums)
+        goes = order[: np.searchsorted(sums, most, side="right")]
+        errors[goes] = sums[: len(goes)]
+        opacities[torch.from_numpy(goes)] = 0.0
+        own = np.zeros(len(errors), bool)
+        own[goes] = True
+        gone = [
+            before + float(changes[own[ids]].sum(dtype=np.float64))
+            for (ids, changes), before in zip(views, gone, strict=True)
+        ]
     return errors
 
 
-def _changes_in(
-    scene: Scene, camera: Camera, opaque: np.ndarray, scratch: Any
-) -> tuple[Int32[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+def _least_first(views: Sequence[Changes], which: Bool[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:
+    """Those of `which` that a view has in its frame, by the most that they change in any."""
+    most = np.full(len(which), -1, np.float32)
+    for ids, changes in views:
+        most[ids] = np.maximum(most[ids], changes)
+    framed = np.flatnonzero(which & (most >= 0))
+    return framed[np.argsort(most[framed], kind="stable")]
+
+
+def _changes_in(scene: Scene, camera: Camera, opaque: np.ndarray, scratch: Any) -> Changes:
     """The background's splats in the camera's frame, and each one's change of the view's mean."""
     from augment.render.cpu.backward import record
     from augment.render.cpu.driver import gather_inputs

@@ -198,7 +198,7 @@ class Render(Section):
         Knob("fog_cut", (0.02, 0.0039, 0.0), "splats behind so much fog are left out", 5.5),
         Knob(
             "prune",
-            (0.006, 0.0015, 0.0007, 0.0003, 0.0),
+            (0.006, 0.001, 0.0007, 0.0004, 0.0),
             "splats that no view would miss are left out",
             1.5,
         ),

@@ -49,7 +49,8 @@ def luma(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     return seen.double() @ torch.tensor(prune.LUMA, dtype=torch.float64)
 
 
-def test_changes_are_those_of_pictures_without_the_splat():
+def test_changes_are_those_of_pictures_without_the_splat(monkeypatch):
+    monkeypatch.setattr(prune, "ROUNDS", (np.inf,))
     splats = random_gaussians(40, seed=3, sh_degree=1)
     splats = dataclasses.replace(splats, opacities=splats.opacities.clamp(0.02, 0.9))
     camera = camera_ahead(64, 48, 50.0)
@@ -104,6 +105,22 @@ def test_the_mean_change_follows_what_was_asked_for():
         assert abs(float((change @ torch.tensor(prune.LUMA)).mean())) <= 2.5 * asked
         errors.append(float(change.abs().mean()))
     assert 0 < errors[0] < errors[1] < errors[2]
+
+
+def test_a_front_of_small_splats_does_not_go_as_a_whole(monkeypatch):
+    """None of them is missed while the others cover what is behind it."""
+    x, y, z = np.meshgrid(np.linspace(20, 20.4, 8), *[np.linspace(-2, 2, 21)] * 2)
+    places = zip(x.flat, y.flat, z.flat, strict=True)
+    front = stack(*(one_gaussian(at, 0.08, 0.6) for at in places))
+    camera, error, changes, stay = camera_ahead(64, 48, 50.0), 3e-3, list[float](), list[bool]()
+    for rounds in ((np.inf,), prune.ROUNDS):
+        monkeypatch.setattr(prune, "ROUNDS", rounds)
+        stays = torch.from_numpy(prune.errors_of(scene_of(front, camera)) > error)
+        left = dataclasses.replace(front, opacities=torch.where(stays, 0.6, 0.0))
+        changes.append(abs(float((luma(left, camera) - luma(front, camera)).mean())))
+        stay.append(bool(stays.any()))
+    assert stay == [False, True]
+    assert changes[1] < 1.6 * error < 2.2 * error < changes[0]
 
 
 def test_views_in_levels_change_nothing_for_those_after_them():
