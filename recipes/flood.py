@@ -99,7 +99,13 @@ class Flood(EffectModel):
         ("waves", "wind ripples"),
     )
     knobs = (
-        Knob("reflection", ("sky", "screen_space", "mirrored"), "what water reflects", 1),
+        Knob(
+            "reflection",
+            ("sky", "screen_space", "mirrored"),
+            "what water reflects",
+            1,
+            tiers={"draft": "screen_space"},
+        ),
         Knob(
             "waves.count",
             (6, 12, 24),
@@ -108,7 +114,13 @@ class Flood(EffectModel):
             works=lambda it: it.waves.is_drawn,
         ),
         Knob("bed_cut", (0.03, 0.006, 0.001), "bed that hardly shows through water", 6),
-        Knob("layers_px", (4.0, 2.0, 1.0), "width of the bed's and the mirrored view's pixels", 3),
+        Knob(
+            "layers_px",
+            (4.0, 2.0, 1.0),
+            "width of the bed's and the mirrored view's pixels",
+            3,
+            tiers={"draft": 4.0, "balanced": 2.0},
+        ),
         Knob("fresnel", ("schlick", "exact"), "share of reflected light", 8),
     )
     columns = (

@@ -28,12 +28,19 @@ class Rain(EffectModel):
         ("puddles", "puddle standing_water"),
     )
     knobs = (
-        Knob("min_width_px", (1.0, 0.5, 0.35, 0.25), "drops drawn one by one; the rest is veil", 7),
+        Knob(
+            "min_width_px",
+            (1.0, 0.5, 0.35, 0.25),
+            "drops drawn one by one; the rest is veil",
+            7,
+            tiers={"draft": 0.5, "balanced": 0.5},
+        ),
         Knob(
             "mirror_px",
             (8.0, 4.0, 2.0),
             "resolution of what wet ground mirrors",
             6.5,
+            tiers={"draft": 4.0},
             works=lambda it: it.ground_wetness > 0,
         ),
     )

@@ -193,14 +193,21 @@ class Render(Section):
             (0.05, 0.02, 0.01, 1e-3, 1e-4),
             "light behind it is given up",
             5,
-            tiers={"draft": 0.01, "balanced": 0.01},
+            tiers={"draft": 0.02, "balanced": 0.02},
         ),
-        Knob("fog_cut", (0.02, 0.0039, 0.0), "splats behind so much fog are left out", 5.5),
+        Knob(
+            "fog_cut",
+            (0.02, 0.0039, 0.0),
+            "splats behind so much fog are left out",
+            5.5,
+            tiers={"draft": 0.02, "balanced": 0.0039},
+        ),
         Knob(
             "prune",
             (0.006, 0.001, 0.0007, 0.0004, 0.0),
             "splats that no view would miss are left out",
             1.5,
+            tiers={"draft": 0.006, "balanced": 0.0007},
         ),
         Knob("sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics", 6),
     )

@@ -50,13 +50,7 @@ class Snow(EffectModel):
     )
     knobs = (
         Knob("cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path", 2),
-        Knob(
-            "shading",
-            ("per_splat", "per_pixel"),
-            "light on the snow",
-            3,
-            tiers={"draft": "per_splat"},
-        ),
+        Knob("shading", ("per_splat", "per_pixel"), "light on the snow", 3),
     )
     columns = (
         Column(

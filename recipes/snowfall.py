@@ -16,7 +16,13 @@ class Snowfall(EffectModel):
 
     meant_by = (("rate_mm_h", "snow_rate snowfall_rate"), ("turbulence_mps", "turbulence gusts"))
     knobs = (
-        Knob("min_width_px", (2.0, 1.0, 0.5, 0.35), "flakes drawn one by one; the rest is veil", 8),
+        Knob(
+            "min_width_px",
+            (2.0, 1.0, 0.5, 0.35),
+            "flakes drawn one by one; the rest is veil",
+            8,
+            tiers={"draft": 1.0},
+        ),
     )
     columns = (
         Column(

@@ -536,12 +536,18 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
             fast_first = useful([*known, Cost(knob.reference, 100.0, 0.0)])[::-1]
             # What is beyond the bound alone need not be rendered with others.
             ladders[path] = [cost for cost in fast_first if cost.flip <= bound]
-    by_time = sorted(ladders, key=lambda path: min(cost.ms for cost in ladders[path]))
+    by_time = sorted(ladders, key=lambda path: _saved(rows, path, ladders[path]), reverse=True)
     chosen = search(
         {path: [cost.value for cost in ladders[path]] for path in by_time},
         lambda settings: whole_flip(rows, settings) <= bound,
     )
     return _moved(chosen, KNOBS)
+
+
+def _saved(rows: Sequence[Row], path: str, costs: Sequence[Cost]) -> float:
+    """The most that a value of the knob saves of all recipes: few have some knobs."""
+    of_values = (_of_value(rows, path, cost.value) for cost in costs)
+    return max(-sum(math.log(row["over_reference"]) for row in own) for own in of_values)
 
 
 def value_cost(rows: Sequence[Row], path: str, value: Value) -> Cost | None:
