@@ -187,7 +187,13 @@ class Render(Section):
             tiers={"draft": 0.75},
         ),
         Knob("radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out", 4),
-        Knob("lod_px", (2.0, 1.0, 0.5, 0.0), "far splats are merged in cells as large", 13),
+        Knob(
+            "lod_px",
+            (2.0, 1.0, 0.5, 0.0),
+            "far splats are merged in cells as large",
+            13,
+            chosen=False,  # it saves in scenes of many millions, and there nothing is pruned
+        ),
         Knob(
             "transmittance_stop",
             (0.05, 0.02, 0.01, 1e-3, 1e-4),
