@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int32
+from tqdm import tqdm
 
 from augment.cameras import Camera
 from augment.lod import keeps_levels
@@ -66,18 +67,18 @@ def prune_parts(
     )
 
 
-def share_errors(scene: Scene) -> None:
-    """Find the errors now, so that other processes take them over."""
+def share_errors(scene: Scene, *, progress: bool = False) -> None:
+    """Find the errors now, so that other processes take them over. progress: a bar on stderr."""
     if not keeps_levels(scene.background):
-        memo_of(scene).put(_ERRORS, errors_of(scene), shared=True)
+        memo_of(scene).put(_ERRORS, errors_of(scene, progress=progress), shared=True)
 
 
-def errors_of(scene: Scene) -> Float[np.ndarray, "N"]:
+def errors_of(scene: Scene, *, progress: bool = False) -> Float[np.ndarray, "N"]:
     """The changes by each splat of the background and all that change less, added up in the worst
     recorded view, share of white, float32; infinite where no view has it in its frame. Found once a
     scene.
     """
-    return memo_of(scene).get(_ERRORS, lambda: _find_errors(scene))
+    return memo_of(scene).get(_ERRORS, lambda: _find_errors(scene, progress))
 
 
 def _is_background(part: PosedGaussians, scene: Scene) -> bool:
@@ -110,33 +111,40 @@ def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
     return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
 
 
-def _find_errors(scene: Scene) -> Float[np.ndarray, "N"]:
+def _find_errors(scene: Scene, progress: bool) -> Float[np.ndarray, "N"]:
     from augment.render.cpu.driver import Scratch
 
     scratch = Scratch()
     opacities = scene.background.opacities.detach().cpu().clone()
     opaque, errors = opacities.numpy() >= _ALPHA_MAX, np.full(len(opacities), np.inf, np.float32)
     cameras = _views(scene)
-    gone = [0.0] * len(cameras)  # what has gone changes in each view
-    for most in ROUNDS if cameras else ():
-        rest = replace(scene, background=replace(scene.background, opacities=opacities))
-        views = [_changes_in(rest, camera, opaque, scratch) for camera in cameras]
-        order = _least_first(views, np.isinf(errors))
-        sums = np.zeros(len(order))
-        for (ids, changes), before in zip(views, gone, strict=True):
-            own = np.zeros(len(errors))
-            own[ids] = changes
-            np.maximum(sums, before + own[order].cumsum(), out=sums)
-        goes = order[: np.searchsorted(sums, most, side="right")]
-        errors[goes] = sums[: len(goes)]
-        opacities[torch.from_numpy(goes)] = 0.0
-        own = np.zeros(len(errors), bool)
-        own[goes] = True
-        gone = [
-            before + float(changes[own[ids]].sum(dtype=np.float64))
-            for (ids, changes), before in zip(views, gone, strict=True)
-        ]
+    gone = np.zeros(len(cameras))  # what has gone changes in each view
+    rounds = ROUNDS if cameras else ()
+    steps, told = len(rounds) * len(cameras), "finding splats to leave out"
+    with tqdm(desc=told, total=steps, unit="view", disable=not progress) as bar:
+        for most in rounds:
+            views = list[Changes]()
+            rest = replace(scene, background=replace(scene.background, opacities=opacities))
+            for camera in cameras:
+                views.append(_changes_in(rest, camera, opaque, scratch))
+                bar.update()
+            order = _least_first(views, np.isinf(errors))
+            sums = np.zeros(len(order))
+            for view, before in zip(views, gone, strict=True):
+                np.maximum(sums, before + _of_all(view, len(errors))[order].cumsum(), out=sums)
+            goes = order[: np.searchsorted(sums, most, side="right")]
+            errors[goes] = sums[: len(goes)]
+            opacities[torch.from_numpy(goes)] = 0.0
+            gone += [_of_all(view, len(errors))[goes].sum() for view in views]
     return errors
+
+
+def _of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:
+    """What each of all splats changes, float64; 0 where it is not in the frame."""
+    ids, changes = view
+    own = np.zeros(count)
+    own[ids] = changes
+    return own
 
 
 def _least_first(views: Sequence[Changes], which: Bool[np.ndarray, "N"]) -> Int[np.ndarray, "M"]:

@@ -40,7 +40,7 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
         if effect.shares_files or not only_files:
             effect.share(job)
     if not only_files and any(recipe.render.prune > 0 for recipe in job.recipes):
-        share_errors(job.scene)
+        share_errors(job.scene, progress=job.progress)
 
 
 def add_effect(effect: Effect) -> None:
