@@ -16,8 +16,11 @@ al. 2024, "RadSplat", leave out by weight alone, which at the same error leaves 
 
 from __future__ import annotations
 
+import math
+import threading
+from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +33,7 @@ from augment.lod import keeps_levels
 from augment.memo import memo_of
 from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
+from augment.render.threads import divided_threads, views_at_once
 from augment.scene import Gaussians, PosedGaussians, Scene
 
 MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 24, 320  # that are looked at
@@ -49,6 +53,7 @@ ROUNDS = (
 )  # the errors up to which splats go in each
 _ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
 _ERRORS = ("errors without splats",)
+_finding = threading.RLock()  # views drawn at once want the same
 
 Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]  # which splats, what each changes
 
@@ -67,18 +72,26 @@ def prune_parts(
     )
 
 
-def share_errors(scene: Scene, *, progress: bool = False) -> None:
-    """Find the errors now, so that other processes take them over. progress: a bar on stderr."""
+def share_errors(scene: Scene, most: float = math.inf, *, progress: bool = False) -> None:
+    """Find the errors up to `most` now, so that other processes take them over."""
     if not keeps_levels(scene.background):
-        memo_of(scene).put(_ERRORS, errors_of(scene, progress=progress), shared=True)
+        errors_of(scene, most, progress=progress)
+        memo_of(scene).put(_ERRORS, _found_of(scene), shared=True)
 
 
-def errors_of(scene: Scene, *, progress: bool = False) -> Float[np.ndarray, "N"]:
+def errors_of(
+    scene: Scene, most: float = math.inf, *, progress: bool = False
+) -> Float[np.ndarray, "N"]:
     """The changes by each splat of the background and all that change less, added up in the worst
-    recorded view, share of white, float32; infinite where no view has it in its frame. Found once a
-    scene.
+    recorded view, share of white, float32; infinite where no view has it in its frame, and where
+    the sum is beyond `most`, as far as nobody has asked for more. Found once a scene. progress: a
+    bar on stderr.
     """
-    return memo_of(scene).get(_ERRORS, lambda: _find_errors(scene, progress))
+    found = _found_of(scene)
+    with _finding:
+        if found.rounds < len(ROUNDS) and (not found.rounds or ROUNDS[found.rounds - 1] < most):
+            _find_errors(scene, found, most, progress)
+    return found.errors
 
 
 def _is_background(part: PosedGaussians, scene: Scene) -> bool:
@@ -98,7 +111,7 @@ def _centres_of(scene: Scene) -> Float[np.ndarray, "C 3"]:
 
 
 def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
-    own, errors = part.gaussians.opacities, errors_of(scene)
+    own, errors = part.gaussians.opacities, errors_of(scene, error)
 
     def prune() -> tuple[np.ndarray, torch.Tensor]:
         is_missed = torch.from_numpy(errors > error).to(own.device)
@@ -111,32 +124,67 @@ def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
     return replace(part, gaussians=replace(part.gaussians, opacities=opacities))
 
 
-def _find_errors(scene: Scene, progress: bool) -> Float[np.ndarray, "N"]:
+@dataclass(eq=False)
+class _Found:
+    """errors, as of `errors_of`; opacities [N], 0 of what has gone; gone: what that changes in each
+    view; rounds: how many there have been.
+    """
+
+    errors: np.ndarray
+    opacities: torch.Tensor
+    gone: np.ndarray
+    rounds: int = 0
+
+    def leave_out(self, views: Sequence[Changes]) -> None:
+        """One more round, by what each splat that is left changes in each view."""
+        count = len(self.errors)
+        order = _least_first(views, np.isinf(self.errors))
+        sums = np.zeros(len(order))
+        for view, gone in zip(views, self.gone, strict=True):
+            np.maximum(sums, gone + _of_all(view, count)[order].cumsum(), out=sums)
+        goes = order[: np.searchsorted(sums, ROUNDS[self.rounds], side="right")]
+        self.errors[goes] = sums[: len(goes)]
+        self.opacities[torch.from_numpy(goes)] = 0.0
+        self.gone += [_of_all(view, count)[goes].sum() for view in views]
+        self.rounds += 1
+
+
+def _found_of(scene: Scene) -> _Found:
+    def begin() -> _Found:
+        opacities = scene.background.opacities.detach().cpu().clone()
+        errors = np.full(len(opacities), np.inf, np.float32)
+        return _Found(errors, opacities, np.zeros(len(_views(scene))))
+
+    return memo_of(scene).get(_ERRORS, begin)
+
+
+def _find_errors(scene: Scene, found: _Found, most: float, progress: bool) -> None:
     from augment.render.cpu.driver import Scratch
 
-    scratch = Scratch()
-    opacities = scene.background.opacities.detach().cpu().clone()
-    opaque, errors = opacities.numpy() >= _ALPHA_MAX, np.full(len(opacities), np.inf, np.float32)
-    cameras = _views(scene)
-    gone = np.zeros(len(cameras))  # what has gone changes in each view
-    rounds = ROUNDS if cameras else ()
-    steps, told = len(rounds) * len(cameras), "finding splats to leave out"
+    cameras, spaces = _views(scene), threading.local()
+    opaque = scene.background.opacities.detach().cpu().numpy() >= _ALPHA_MAX
+    last = 1 + min(bisect_left(ROUNDS, most), len(ROUNDS) - 1) if cameras else 0
+    steps, told = max(last - found.rounds, 0) * len(cameras), "finding splats to leave out"
+    count = min(views_at_once(len(opaque)), len(cameras))
+    pool = divided_threads(count) if count > 1 else None
     with tqdm(desc=told, total=steps, unit="view", disable=not progress) as bar:
-        for most in rounds:
-            views = list[Changes]()
-            rest = replace(scene, background=replace(scene.background, opacities=opacities))
-            for camera in cameras:
-                views.append(_changes_in(rest, camera, opaque, scratch))
-                bar.update()
-            order = _least_first(views, np.isinf(errors))
-            sums = np.zeros(len(order))
-            for view, before in zip(views, gone, strict=True):
-                np.maximum(sums, before + _of_all(view, len(errors))[order].cumsum(), out=sums)
-            goes = order[: np.searchsorted(sums, most, side="right")]
-            errors[goes] = sums[: len(goes)]
-            opacities[torch.from_numpy(goes)] = 0.0
-            gone += [_of_all(view, len(errors))[goes].sum() for view in views]
-    return errors
+
+        def look(camera: Camera) -> Changes:
+            if not hasattr(spaces, "scratch"):
+                spaces.scratch = Scratch()
+            return _changes_in(rest, camera, opaque, spaces.scratch)
+
+        try:
+            while found.rounds < last:
+                own = replace(scene.background, opacities=found.opacities)
+                rest, views = replace(scene, background=own), list[Changes]()
+                for view in (pool.map if pool else map)(look, cameras):
+                    views.append(view)
+                    bar.update()
+                found.leave_out(views)
+        finally:
+            if pool:
+                pool.shutdown(cancel_futures=True)
 
 
 def _of_all(view: Changes, count: int) -> Float[np.ndarray, "N"]:

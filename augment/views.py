@@ -25,7 +25,7 @@ from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
-from augment.render.threads import divided_threads, serves_several, thread_count
+from augment.render.threads import divided_threads, views_at_once
 from augment.scene import PosedGaussians, Scene
 from augment.timing import timed
 from augment.trust import trust_mask
@@ -294,9 +294,6 @@ class PendingView:
 # On the CPU some work of a view cannot be divided, and threads that share a view wait for each
 # other: where each has a view of its own, all cores are busy. Every thread has its work space then.
 
-SPACE_OF_SPLAT = 110  # bytes of it
-MAX_SPACE = 1 << 29  # bytes of all beyond the first
-
 
 class ViewPool:
     """Begins views of a scene, several at once on threads of their own; on a GPU, or where there is
@@ -307,9 +304,8 @@ class ViewPool:
     def __init__(self, scene: Scene, backend: str = AUTO, views: int = sys.maxsize) -> None:
         backend = choose_backend(backend, scene) if backend == AUTO else backend
         self.ahead, self._threads = int(renders_on_gpu(backend)), None
-        if backend == CPU and serves_several():
-            space = SPACE_OF_SPLAT * sum(map(len, scene.all_gaussians))
-            count = min(views, thread_count(), 1 + MAX_SPACE // space)
+        if backend == CPU:
+            count = min(views, views_at_once(sum(map(len, scene.all_gaussians))))
             if count > 1:
                 self.ahead, self._threads = count, divided_threads(count)
 

@@ -39,8 +39,9 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
     for effect in EFFECTS:
         if effect.shares_files or not only_files:
             effect.share(job)
-    if not only_files and any(recipe.render.prune > 0 for recipe in job.recipes):
-        share_errors(job.scene, progress=job.progress)
+    error = max((recipe.render.prune for recipe in job.recipes), default=0)
+    if error > 0 and not only_files:
+        share_errors(job.scene, error, progress=job.progress)
 
 
 def add_effect(effect: Effect) -> None:

@@ -116,6 +116,17 @@ def serves_several() -> bool:
     return select_thread_pool() != _ONE_CALLER
 
 
+SPACE_OF_SPLAT = 110  # bytes of the work space that a thread has, which draws views of its own
+MAX_SPACE = 1 << 29  # bytes of all beyond the first
+
+
+def views_at_once(gaussians: int) -> int:
+    """How many views of so many Gaussians this thread's cores draw at a time, a thread each."""
+    if not serves_several():
+        return 1
+    return min(thread_count(), 1 + MAX_SPACE // (SPACE_OF_SPLAT * max(gaussians, 1)))
+
+
 def divided_threads(count: int) -> ThreadPoolExecutor:
     """`count` threads for whole tasks, that divide what `thread_count` gives to the calling one."""
     total, torch_threads = thread_count(), torch.get_num_threads()

@@ -16,6 +16,7 @@ from augment.lod import MIN_SPLATS
 from augment.memo import memo_of
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
+from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_buffers, render_view
@@ -121,6 +122,23 @@ def test_a_front_of_small_splats_does_not_go_as_a_whole(monkeypatch):
         stay.append(bool(stays.any()))
     assert stay == [False, True]
     assert changes[1] < 1.6 * error < 2.2 * error < changes[0]
+
+
+def test_more_is_found_where_more_is_asked_for():
+    scene = scene_of(random_gaussians(3000, seed=5, sh_degree=0), camera_ahead(64, 48, 50.0))
+    for threads in (1, 2):
+        limit_threads(threads)
+        try:
+            whole, slowly = prune.errors_of(dataclasses.replace(scene)), dataclasses.replace(scene)
+            part = prune.errors_of(slowly, 3e-4).copy()
+            assert prune.errors_of(slowly, 1e-4) is prune.errors_of(slowly, 3e-4)
+            np.testing.assert_array_equal(part, np.where(part <= 4e-4, whole, np.inf))
+            assert (part[whole <= 3e-4] <= 3e-4).all() and np.isinf(part).sum() > np.isinf(
+                whole
+            ).sum()
+            np.testing.assert_array_equal(prune.errors_of(slowly), whole)
+        finally:
+            limit_threads(None)
 
 
 def test_views_in_levels_change_nothing_for_those_after_them():
