@@ -229,7 +229,7 @@ def _recorded(scene: Scene) -> list[Camera]:
 def _views(scene: Scene) -> list[Camera]:
     """Spread over all recorded images, small."""
     cameras = _recorded(scene)
-    room = max(MIN_VIEWS, MAX_NUMBERS // len(scene.background))
+    room = max(MIN_VIEWS, MAX_NUMBERS // max(len(scene.background), 1))
     count = min(MAX_VIEWS, room, len(cameras))
     places = np.linspace(0, len(cameras) - 1, count).round().astype(int)
     chosen = [cameras[place] for place in places if not cameras[place].is_orthographic]

@@ -200,6 +200,17 @@ def test_wet_ground_mirrors_what_recorded_views_would_not_miss():
     assert abs(off[1] - off[0]) < 0.1  # levels of 255
 
 
+def test_scenes_of_vehicles_alone_are_drawn_whole():
+    street = open_street()
+    nothing = street.background.select(torch.zeros(0, dtype=torch.int64))
+    scene = dataclasses.replace(street, background=nothing)
+    camera = scene.frames[0].cameras["front"].scaled(0.1)
+    recipes = [Recipe(render=Render(prune=error)) for error in (0.0, 1e-3)]
+    share_effects(Sharing(scene, recipes))
+    whole, left = (render_view(scene, camera, recipe).rgb for recipe in recipes)
+    np.testing.assert_array_equal(whole, left)
+
+
 def test_weather_is_drawn_on_what_is_left():
     scene = open_street()
     camera = scene.frames[0].cameras["front"].scaled(0.1)
