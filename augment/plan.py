@@ -17,6 +17,7 @@ from augment.bounds import actor_boxes, owners_seen
 from augment.cameras import Camera
 from augment.effects.effect import DRAWING, PICTURE, SCENE, Active, Effect, Placed, Sight, Step
 from augment.lod import check_background
+from augment.prune import pruned_share
 from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
@@ -135,7 +136,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             fog_cut=render.fog_cut,
             lod_px=render.lod_px,
         ),
-        prune=0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune,
+        prune=pruned_share(render),
         buffers=buffers,
         image_buffers=frozenset(image_buffers),
         bare_buffers=frozenset(bare_buffers),

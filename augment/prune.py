@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32
 from tqdm import tqdm
 
+from augment.base_photo import RECORDED
 from augment.cameras import Camera
 from augment.lod import keeps_levels
 from augment.memo import memo_of
@@ -35,6 +36,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
 from augment.render.threads import divided_threads, views_at_once
 from augment.scene import Gaussians, PosedGaussians, Scene
+from recipes.schema import Render
 
 MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 24, 320  # that are looked at
 MAX_NUMBERS = 200_000_000  # of views and splats: fewer views of larger backgrounds
@@ -43,19 +45,18 @@ FARTHEST_M = 2.0
 LUMA = (0.299, 0.587, 0.114)
 SKY = 0.7  # luma behind all splats
 LEAST_CONTRAST = 0.05
-ROUNDS = (
-    0.0002,
-    0.0004,
-    0.0008,
-    0.0016,
-    0.0032,
-    np.inf,
-)  # the errors up to which splats go in each
+# The errors up to which splats go in each.
+ROUNDS = (0.0002, 0.0004, 0.0008, 0.0016, 0.0032, math.inf)
 _ALPHA_MAX = 0.9999  # nothing is known of what is behind a splat whose alpha is clamped
 _ERRORS = ("errors without splats",)
 _finding = threading.RLock()  # views drawn at once want the same
 
 Changes = tuple[Int32[np.ndarray, "_"], Float[np.ndarray, "_"]]  # which splats, what each changes
+
+
+def pruned_share(render: Render) -> float:
+    """The recipe's, or 0 where nothing is pruned: of merged splats and on recorded images."""
+    return 0.0 if render.base == RECORDED or render.lod_px > 0 else render.prune
 
 
 def prune_parts(
@@ -87,10 +88,10 @@ def errors_of(
     the sum is beyond `most`, as far as nobody has asked for more. Found once a scene. progress: a
     bar on stderr.
     """
-    found = _found_of(scene)
+    found, rounds = _found_of(scene), min(bisect_left(ROUNDS, most) + 1, len(ROUNDS))
     with _finding:
-        if found.rounds < len(ROUNDS) and (not found.rounds or ROUNDS[found.rounds - 1] < most):
-            _find_errors(scene, found, most, progress)
+        if found.rounds < rounds:
+            _find_errors(scene, found, rounds, progress)
     return found.errors
 
 
@@ -126,12 +127,11 @@ def _pruned(part: PosedGaussians, scene: Scene, error: float) -> PosedGaussians:
 
 @dataclass(eq=False)
 class _Found:
-    """errors, as of `errors_of`; opacities [N], 0 of what has gone; gone: what that changes in each
-    view; rounds: how many there have been.
+    """errors, as of `errors_of`, finite of what has gone; gone: what that changes in each view;
+    rounds: how many there have been.
     """
 
     errors: np.ndarray
-    opacities: torch.Tensor
     gone: np.ndarray
     rounds: int = 0
 
@@ -144,27 +144,26 @@ class _Found:
             np.maximum(sums, gone + _of_all(view, count)[order].cumsum(), out=sums)
         goes = order[: np.searchsorted(sums, ROUNDS[self.rounds], side="right")]
         self.errors[goes] = sums[: len(goes)]
-        self.opacities[torch.from_numpy(goes)] = 0.0
         self.gone += [_of_all(view, count)[goes].sum() for view in views]
         self.rounds += 1
 
 
 def _found_of(scene: Scene) -> _Found:
     def begin() -> _Found:
-        opacities = scene.background.opacities.detach().cpu().clone()
-        errors = np.full(len(opacities), np.inf, np.float32)
-        return _Found(errors, opacities, np.zeros(len(_views(scene))))
+        errors = np.full(len(scene.background), np.inf, np.float32)
+        return _Found(errors, np.zeros(len(_views(scene))))
 
     return memo_of(scene).get(_ERRORS, begin)
 
 
-def _find_errors(scene: Scene, found: _Found, most: float, progress: bool) -> None:
+def _find_errors(scene: Scene, found: _Found, rounds: int, progress: bool) -> None:
+    """Until there have been so many rounds."""
     from augment.render.cpu.driver import Scratch
 
     cameras, spaces = _views(scene), threading.local()
-    opaque = scene.background.opacities.detach().cpu().numpy() >= _ALPHA_MAX
-    last = 1 + min(bisect_left(ROUNDS, most), len(ROUNDS) - 1) if cameras else 0
-    steps, told = max(last - found.rounds, 0) * len(cameras), "finding splats to leave out"
+    opacities = scene.background.opacities.detach().cpu()
+    opaque = opacities.numpy() >= _ALPHA_MAX
+    steps, told = (rounds - found.rounds) * len(cameras), "finding splats to leave out"
     count = min(views_at_once(len(opaque)), len(cameras))
     pool = divided_threads(count) if count > 1 else None
     with tqdm(desc=told, total=steps, unit="view", disable=not progress) as bar:
@@ -175,8 +174,9 @@ def _find_errors(scene: Scene, found: _Found, most: float, progress: bool) -> No
             return _changes_in(rest, camera, opaque, spaces.scratch)
 
         try:
-            while found.rounds < last:
-                own = replace(scene.background, opacities=found.opacities)
+            while found.rounds < rounds:
+                left = torch.where(torch.from_numpy(np.isinf(found.errors)), opacities, 0.0)
+                own = replace(scene.background, opacities=left)
                 rest, views = replace(scene, background=own), list[Changes]()
                 for view in (pool.map if pool else map)(look, cameras):
                     views.append(view)

@@ -11,7 +11,7 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
-from augment.prune import share_errors
+from augment.prune import pruned_share, share_errors
 from recipes.schema import add_section, remove_section
 
 # Style colours what stands in the weather, rain wets it; then come the air before it, snow on it,
@@ -39,7 +39,7 @@ def share_effects(job: Sharing, *, only_files: bool = False) -> None:
     for effect in EFFECTS:
         if effect.shares_files or not only_files:
             effect.share(job)
-    error = max((recipe.render.prune for recipe in job.recipes), default=0)
+    error = max((pruned_share(recipe.render) for recipe in job.recipes), default=0)
     if error > 0 and not only_files:
         share_errors(job.scene, error, progress=job.progress)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -118,6 +120,21 @@ def test_those_too_faint_for_any_view_are_not_read_and_change_no_bit():
     assert whole is not None and len(whole.ids) == COUNT
     scene.opacities[:] = shown
     assert_same_bits(draw(scene, camera, BUFFERS), draw(copy_of(scene), camera, BUFFERS), BUFFERS)
+
+
+def test_rows_go_with_their_order():
+    scene = random_gaussians(COUNT)
+    own = order_of(drawn(scene))
+    assert own is not None
+    another = own.without(scene.opacities.numpy() < 0.5, scene.means.numpy())
+    rows = weakref.ref(another.sorted(scene.scales).rows)
+    gc.disable()
+    try:
+        assert rows() is not None
+        del another
+        assert rows() is None
+    finally:
+        gc.enable()
 
 
 def test_a_change_in_place_is_seen():

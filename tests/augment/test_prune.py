@@ -121,6 +121,7 @@ def test_a_front_of_small_splats_does_not_go_as_a_whole(monkeypatch):
         changes.append(abs(float((luma(left, camera) - luma(front, camera)).mean())))
         stay.append(bool(stays.any()))
     assert stay == [False, True]
+    # 1.5 and 2.3 times: sums of single changes know nothing of neighbours that go in one round.
     assert changes[1] < 1.6 * error < 2.2 * error < changes[0]
 
 
@@ -133,9 +134,8 @@ def test_more_is_found_where_more_is_asked_for():
             part = prune.errors_of(slowly, 3e-4).copy()
             assert prune.errors_of(slowly, 1e-4) is prune.errors_of(slowly, 3e-4)
             np.testing.assert_array_equal(part, np.where(part <= 4e-4, whole, np.inf))
-            assert (part[whole <= 3e-4] <= 3e-4).all() and np.isinf(part).sum() > np.isinf(
-                whole
-            ).sum()
+            assert (part[whole <= 3e-4] <= 3e-4).all()
+            assert np.isinf(part).sum() > np.isinf(whole).sum()
             np.testing.assert_array_equal(prune.errors_of(slowly), whole)
         finally:
             limit_threads(None)
@@ -164,12 +164,12 @@ def test_nothing_is_looked_for_where_nothing_is_left_out(render: Render):
     scene, camera = street_of_walls()
     recipe = Recipe(render=render)
     share_effects(Sharing(scene, [recipe]))
-    if render.prune == 0:
-        assert not memo_of(scene).shared()
+    assert not memo_of(scene).shared()
     plan = make_plan(recipe, scene)
     assert plan.prune == 0
     left = render_buffers(scene, camera, plan, backend="cpu").parts[0].gaussians.opacities
     assert left is scene.background.opacities
+    assert prune.pruned_share(Render(prune=0.1, base="recorded")) == 0
 
 
 def test_other_processes_take_the_changes_over():
@@ -196,8 +196,9 @@ def test_wet_ground_mirrors_what_recorded_views_would_not_miss():
         ]
         for rain in ({"rate_mm_h": 10, "wetness": 0.0, "puddles": 0.0}, {"rate_mm_h": 10})
     )
-    off = [float((b.rgb.astype(int) - a.rgb).mean()) for a, b in (dry, wet)]
-    assert abs(off[1] - off[0]) < 0.1  # levels of 255
+    low = slice(camera.height // 2, None)  # where the ground is
+    off = [float(np.abs(b.rgb[low].astype(int) - a.rgb[low]).mean()) for a, b in (dry, wet)]
+    assert 0 < off[1] < 1.5 * off[0]  # 1.1 times; 2.05 where the mirror lacks what is left out
 
 
 def test_scenes_of_vehicles_alone_are_drawn_whole():

@@ -340,6 +340,18 @@ def test_the_rule_takes_what_saves_most_within_the_bound():
             {STOP: 0.01, CLIP: 1.0},
         ),
         (
+            "of all recipes: what saves more of one comes later",
+            table(
+                clean=[row(STOP, 0.01, 0.8, 0.01)],
+                snow=[
+                    row(STOP, 0.01, 0.8, 0.01),
+                    row(CLIP, 2.0, 0.7, 0.01),
+                    whole(0.03, 0.01, 2.0),
+                ],
+            ),
+            {STOP: 0.01},
+        ),
+        (
             "times of values that change nothing are noise",
             table(
                 clean=[row(STOP, 0.05, 0.5, 0.0), row(CLIP, 2.0, 0.5, 0.0)],

@@ -39,16 +39,27 @@ _BLUR_PX = 3.0  # 1.9 of it is the blur, as in augment.bounds
 # ---- What is known of tensors for as long as they live and stay as they are ----------------------
 
 Value = TypeVar("Value")
-Known = dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]]
-_known: Known = {}
+
+
+class Known(dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Any]]):
+    """Of tensors, by id and name. What tensors hold refers to it weakly: whoever forgets it frees
+    it at once.
+    """
+
+
+_known = Known()
 _making = threading.RLock()  # views drawn at once want the same
 
 
 def known_of(tensor: Tensor, name: str, make: Callable[[], Value], kept: Known = _known) -> Value:
-    """What `make` gave for the tensor under this name; made anew after a change in place. kept: by
-    whom; the module where it is left out.
+    """What `make` gave for the tensor under this name; made anew after a change in place. kept:
+    where it is looked for, and stays.
     """
-    key = (id(tensor), name)
+    key, owner = (id(tensor), name), weakref.ref(kept)
+
+    def forget(_: weakref.ref[Tensor]) -> None:
+        if (those := owner()) is not None:
+            those.pop(key, None)
 
     def find() -> tuple[weakref.ref[Tensor], int, Any] | None:
         known = kept.get(key)
@@ -59,8 +70,7 @@ def known_of(tensor: Tensor, name: str, make: Callable[[], Value], kept: Known =
         with _making:
             known = find()
             if known is None:
-                gone = weakref.ref(tensor, lambda _, forget=kept.pop: forget(key, None))
-                known = kept[key] = (gone, tensor._version, make())
+                known = kept[key] = (weakref.ref(tensor, forget), tensor._version, make())
     return known[2]
 
 
@@ -186,7 +196,7 @@ def _in_cells(ids: np.ndarray, means: np.ndarray) -> Order:
         ids[first : first + CELL].sort()  # colours are read in the scene's own order
     rows, starts = means[ids], np.arange(0, len(ids), CELL)
     bounds = (f.reduceat(rows, starts, axis=0).astype(np.float64) for f in (np.minimum, np.maximum))
-    return Order(ids, rows, *bounds, {})
+    return Order(ids, rows, *bounds, Known())
 
 
 def _spread(bits: np.ndarray) -> np.ndarray:
