@@ -333,7 +333,7 @@ def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
         page.wait_for(lambda: page.widgets["frame"][0]["value"] == 1, "the next frame")
         page.press("Measure the tiers on this view")
         page.wait_for(
-            lambda: any("| reference |" in str(w) for ws in page.widgets.values() for w in ws),
+            lambda: any("<td>reference</td>" in str(w) for ws in page.widgets.values() for w in ws),
             "the tiers",
         )
 

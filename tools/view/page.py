@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from augment.cameras import Camera, Frame
+from augment.errors import ClimateGSError
 from augment.geometry import quat_from_rotmat
 from augment.scene import Scene
 from augment.trust import unfitted_cameras
@@ -23,7 +24,7 @@ from recipes.fields import found
 from recipes.load import describe_preset, preset_names
 from recipes.schema import TIERS, Recipe
 from tools.view.controls import Control, Group, effect_groups, group_of
-from tools.view.edits import Edits, as_yaml, free_path
+from tools.view.edits import Edits, as_yaml, create_file
 from tools.view.fields import NONE, Field
 from tools.view.pictures import (
     PICTURE,
@@ -33,6 +34,8 @@ from tools.view.pictures import (
     place_in_window,
     what_can_be_shown,
 )
+from tools.view.text import STYLE, paragraph, printable
+from tools.view.widgets import options_of, value_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -48,8 +51,9 @@ LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera aro
 FRAME_S = 0.09  # what a picture may take while something moves
 FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
 MAX_NAME = 64
-_TEXT = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
-_ERROR = f"color:#c92a2a;{_TEXT}"
+MAX_TASKS = 8  # of a page that wait to be done
+MAX_ASPECT = 8.0  # of a window, width by height or height by width
+_ERROR = "color:#c92a2a"
 
 
 @dataclass(frozen=True)
@@ -168,7 +172,8 @@ class Page:
     @property
     def aspect(self) -> float:
         width, height = self._window
-        return width / height if width and height else 16 / 9
+        aspect = width / height if width and height else 16 / 9
+        return min(max(aspect, 1 / MAX_ASPECT), MAX_ASPECT)
 
     @property
     def window_height(self) -> int:
@@ -186,6 +191,8 @@ class Page:
 
     def do(self, task: Callable[[], None]) -> None:
         """Have the viewer's thread do something between two pictures."""
+        if len(self.progress.tasks) >= MAX_TASKS:
+            raise ClimateGSError(f"{MAX_TASKS} tasks wait to be done: press it again after them")
         with self.viewer.changed:
             self.progress.tasks.append(task)
             self.viewer.changed.notify()
@@ -210,9 +217,7 @@ class Page:
 
     def _on_upload(self, control: Control, name: str, content: bytes) -> None:
         safe = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).name)[-MAX_NAME:].lstrip(".") or "file"
-        path = free_path(self.viewer.out / "uploads", safe)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        path = create_file(self.viewer.out / "uploads", Path(safe).stem, Path(safe).suffix, content)
         relative = str(path.relative_to(self.viewer.out))
         edits = self.wish.edits.with_values({control.path: as_yaml(relative)})
         others = tuple(c.path for g in self.groups for c in g.walk() if c.nullable and c != control)
@@ -221,11 +226,8 @@ class Page:
         self.edit(edits.giving_way(control.path, others), show=True)
 
     def _on_open(self, name: str, content: bytes) -> None:
-        stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME] or "recipe"
-        path = free_path(self.viewer.out / "opened", stem, ".yaml").with_suffix(".yaml")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-        self._take(str(path))
+        stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME].lstrip(".") or "recipe"
+        self._take(str(create_file(self.viewer.out / "opened", stem, ".yaml", content)))
 
     def _take(self, source: str) -> None:
         """Another recipe, without changes."""
@@ -300,7 +302,7 @@ class Page:
         gui = self.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()  # beside the picture
-        gui.set_panel_label(f"ClimateGS: {self.viewer.scene.name}")
+        gui.set_panel_label(printable(f"ClimateGS: {self.viewer.scene.name}"))
         self._status = gui.add_html("")
         self._error = gui.add_html("", visible=False)
         tabs = gui.add_tab_group()
@@ -315,7 +317,7 @@ class Page:
             for group in self.groups[-2:]:
                 self._build_group(group)
         with tabs.add_tab("Plan"):
-            self._plan = gui.add_markdown("")
+            self._plan = gui.add_html("")
         with tabs.add_tab("Save"):
             self._build_save()
 
@@ -323,15 +325,16 @@ class Page:
         gui, names = self.gui, preset_names()
         hint = "; ".join(f"{name}: {describe_preset(name)}" for name in names)
         source = self.wish.edits.source
-        options = names if source in names else (source, *names)
-        preset = gui.add_dropdown("preset", options, initial_value=source, hint=hint)
+        sources = options_of(names if source in names else (source, *names))
+        word = next(word for word, name in sources.items() if name == source)
+        preset = gui.add_dropdown("preset", tuple(sources), initial_value=word, hint=hint)
         opened = gui.add_upload_button("Open a recipe", mime_type=".yaml,.yml")
         undo = gui.add_button("Undo all changes")
         self._seed = gui.add_number("seed", 0, min=0, max=2**53 - 1, step=1)
         hint = "Which draw from the recipe's ranges."
         self._variant = gui.add_number("variant", 0, min=0, max=2**31 - 1, step=1, hint=hint)
 
-        self._when(preset, self._take)
+        self._when(preset, lambda word: self._take(sources[word]))
         self._when(undo, lambda _: self._take(self.wish.edits.source), "on_click")
         self._when(opened, lambda file: self._on_open(file.name, file.content), "on_upload")
         self._when(self._seed, lambda number: self._set("seed", int(number)))
@@ -372,17 +375,20 @@ class Page:
         hint = "Which frame of the drive, counted from 0."
         self._time = gui.add_slider("frame", 0, last, 1, 0, hint=hint, disabled=len(frames) == 1)
         play = gui.add_checkbox("play", False)
-        camera = gui.add_dropdown("camera", self.viewer.scene.camera_names)
-        camera.value = self.wish.camera
+        cameras = options_of(self.viewer.scene.camera_names)
+        word = next(word for word, name in cameras.items() if name == self.wish.camera)
+        camera = gui.add_dropdown("camera", tuple(cameras), initial_value=word)
         back = gui.add_button("Back to the camera")
         shows = gui.add_dropdown("shows", what_can_be_shown())
-        gui.add_markdown(
-            "Fly: drag to turn, right drag to move, wheel to go ahead; **W A S D**, **Q E** and "
-            "the arrow keys."
+        gui.add_html(
+            paragraph(
+                "Fly: drag to turn, right drag to move, wheel to go ahead; W A S D, Q E and the "
+                "arrow keys."
+            )
         )
 
         self._when(self._time, self.go_to_frame)
-        self._when(camera, self._land)
+        self._when(camera, lambda word: self._land(cameras[word]))
         self._when(back, lambda _: self._land(self.wish.camera), "on_click")
         with gui.add_folder("before and after"):
             self._toggle("split", "is_split", "Left of the line the scene without its weather.")
@@ -413,7 +419,7 @@ class Page:
             if event.client is None:  # not people, but `_show_values`
                 return
             try:
-                act(event.target.value)
+                act(value_of(event.target))
             except Exception as error:
                 self.viewer.report(self, error)
 
@@ -424,7 +430,7 @@ class Page:
         hint = "Settings of all that trades speed for accuracy and that the recipe does not give."
         self._tier = gui.add_dropdown("tier", (NONE, *TIERS, "reference"), hint=hint)
         measure = gui.add_button("Measure the tiers on this view")
-        self._tiers = gui.add_markdown("")
+        self._tiers = gui.add_html("")
 
         self._when(self._tier, self._choose_tier)
         self._when(measure, lambda _: self._measure(), "on_click")
@@ -433,15 +439,15 @@ class Page:
         self.edit(self.wish.edits.with_tier(None if word == NONE else word), show=True)
 
     def _measure(self) -> None:
-        self._tiers.content = "measuring"
         self.do(lambda: self.viewer.measure_tiers(self))
+        self._tiers.content = paragraph("measuring")
 
     def _build_save(self) -> None:
         gui = self.gui
         self._name = gui.add_text("name", "my-weather", hint="Of the recipe and of its files.")
         recipe = gui.add_button("Save recipe")
         picture = gui.add_button("Save picture")
-        gui.add_markdown(f"Into the folder `{self.viewer.out}`. Nothing is replaced.")
+        gui.add_html(paragraph(f"Into the folder {self.viewer.out}. Nothing is replaced."))
         self._saved = gui.add_html("")
         self._command = gui.add_html("")
 
@@ -452,7 +458,7 @@ class Page:
         self.do(lambda: self.viewer.save(self, self._name.value, with_picture=with_picture))
 
     def go_to_frame(self, number: int) -> None:
-        self.ask(frame=number)
+        self.ask(frame=min(number, len(self.viewer.frames) - 1))
         if self.wish.pose is None:
             self._to_camera()
 
@@ -475,32 +481,33 @@ class Page:
     # ---- Shown by the viewer's thread ------------------------------------------------------------
 
     def show_status(self, text: str) -> None:
-        self._status.content = f'<b style="padding:0 0.7em">{html.escape(text)}</b>'
+        self._status.content = paragraph(text, bold=True)
 
     def show_error(self, text: str | None) -> None:
         """None: there is none any more."""
         if text is None and not self._error.visible:
             return
-        lines = "<br>".join(map(html.escape, (text or "").splitlines()))
-        self._error.content = f'<div style="{_ERROR}">{lines}</div>'
+        self._error.content = paragraph(text or "", style=_ERROR)
         self._error.visible = text is not None
 
-    def show_plan(self, text: str) -> None:
-        if self._plan.content != text:
-            self._plan.content = text
+    def show_plan(self, content: str) -> None:
+        """Show HTML of a table."""
+        if self._plan.content != content:
+            self._plan.content = content
 
-    def show_tiers(self, text: str) -> None:
-        self._tiers.content = text
+    def show_tiers(self, content: str) -> None:
+        """Show HTML of a table."""
+        self._tiers.content = content
 
     def show_saved(self, text: str, command: str) -> None:
-        self._saved.content = f'<p style="{_TEXT}">{html.escape(text)}</p>'
+        self._saved.content = paragraph(text)
         self.show_command(command)
 
     def show_command(self, command: str) -> None:
         content = (
-            f'<div style="{_TEXT}">'
+            f'<div style="{STYLE}">'
             '<textarea readonly rows="6" style="width:100%;font:11px monospace">'
-            f"{html.escape(command)}</textarea>"
+            f"{html.escape(printable(command))}</textarea>"
             '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.value)">'
             "Copy command</button></div>"
         )
@@ -533,7 +540,7 @@ class Page:
                 continue  # the window looks out of it
             pose = camera.world_from_camera
             self._overlays[name] = api.add_camera_frustum(
-                f"/cameras/{name}",
+                f"/cameras/{printable(name)}",
                 fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
                 aspect=camera.width / camera.height,
                 scale=0.5,

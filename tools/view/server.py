@@ -7,6 +7,7 @@ waits in its own connection, and a closed one is forgotten.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
@@ -18,7 +19,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -30,18 +31,18 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.jobs.atomic import write_atomic
 from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
 from augment.scene import Scene
 from augment.timing import stopwatch
 from augment.views import render_view
-from recipes.errors import RecipeError
+from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
-from tools.view.edits import Edits, free_path, save_recipe, without_weather
+from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
+from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather, write_new
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
@@ -54,6 +55,7 @@ from tools.view.pictures import (
     recipe_to_show,
     split,
 )
+from tools.view.text import table
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -61,7 +63,8 @@ if TYPE_CHECKING:
     from tools.cli import ViewOptions
 
 _LOG = logging.getLogger(__name__)
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+EVERY_ADDRESS = ("0.0.0.0", "::", "")  # that a server may be told to listen at
+MAX_PIXELS = 2**25  # of a picture that is drawn for a page: as many as 8K video has
 JOIN_S = 10.0  # that the picture being drawn gets when the server ends
 
 
@@ -84,10 +87,12 @@ def view_scene(options: ViewOptions) -> int:
 def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) -> int:
     with serve(viser, viewer, options.host, options.port) as url:
         print(f"{options.scene}: {url}   (Ctrl-C ends it)", flush=True)
-        if options.host not in LOOPBACK:
+        if not is_loopback(options.host):
             print_note(
-                f"note: whoever reaches {options.host} sees what is shown here, and can have files "
-                f"written to {options.out}: there is no password"
+                f"note: whoever has this address, with its token, sees what is shown here and can "
+                f"have files written to {options.out}. It goes over the network unencrypted: where "
+                f"others can listen, serve at 127.0.0.1 and use `ssh -L {urlsplit(url).port}:"
+                f"localhost:{urlsplit(url).port}`"
             )
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
@@ -101,7 +106,9 @@ class Pages(Protocol):
 
     def stop(self) -> None: ...
 
-    def open_page(self, client: ClientHandle) -> None: ...
+    def open_page(self, client: ClientHandle) -> Callable[[str], None]:
+        """Return what says on the page what the server has refused."""
+        ...
 
     def close_page(self, client: ClientHandle) -> None: ...
 
@@ -126,11 +133,19 @@ def import_viser() -> Any:
 
 @contextlib.contextmanager
 def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
-    """Pages at an address, as long as it lasts; its URL. The next free port, where one is taken.
+    """Serve pages at an address within the block, which gets their URL with its token.
+
+    Args:
+        viser: The module.
+        viewer: What is served.
+        host: An address of this machine.
+        port: Or the next that is free.
 
     Raises:
         ClimateGSError: the address is none of this machine's.
     """
+    from tools.view.messages import MAX_MESSAGE_BYTES, PageConnection  # has viser's libraries
+
     try:
         family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -142,39 +157,49 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
         ) from error
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    access = Access(is_local=is_loopback(str(address[0])))
+    options = {"create_connection": PageConnection, "max_size": MAX_MESSAGE_BYTES}
     with contextlib.redirect_stdout(io.StringIO()):  # it says what we say
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+        server = start_server(viser, access, host, port, **options)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)  # before a page is there
+    loop = server.get_event_loop()
+    loop.call_soon_threadsafe(loop.set_exception_handler, _note_exception)
     viewer.start()
 
     @server.on_client_connect
     async def _(client: ClientHandle) -> None:
         connection = server._websock_server._live_connections[client.client_id]
-        if _is_ours(connection.request.headers, host):
-            viewer.open_page(client)
-        else:
-            await connection.close(1008, "pages of other sites have no business here")
+        try:
+            connection.report = viewer.open_page(client)
+        except Exception as error:
+            _LOG.error("%s", "".join(traceback.format_exception(error)))
+            await connection.close(1011, "the page cannot be made; the server's log says why")
 
     @server.on_client_disconnect
     async def _(client: ClientHandle) -> None:
         viewer.close_page(client)
 
-    shown = "localhost" if host in LOOPBACK else host
+    name = "localhost" if is_loopback(host) or host in EVERY_ADDRESS else host
+    name = f"[{name}]" if ":" in name else name
     try:
-        yield f"http://{shown}:{server.get_port()}"
+        yield f"http://{name}:{server.get_port()}/?{TOKEN_FIELD}={access.token}"
     finally:
         viewer.stop()
         _stop(server)
 
 
-def _is_ours(headers: Any, host: str) -> bool:
-    """Whether a connection comes from our own page, or from no browser. Any site that someone
-    visits can have the browser connect to this machine, also by a name that it points here.
+def _note_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Say in one line that a message of a page ended in an exception: viser casts the values of
+    widgets before anything checks them.
     """
-    origin, asked = headers.get("Origin"), headers.get("Host", "")
-    if origin is None:
-        return True
-    name = urlsplit(f"//{asked}").hostname
-    return urlsplit(origin).netloc == asked and (host not in LOOPBACK or name in LOOPBACK)
+    error = context.get("exception")
+    if error is None:
+        loop.default_exception_handler(context)
+        return
+    _LOG.warning(
+        "a message of a page is passed over: %s: %s", type(error).__name__, short(str(error))
+    )
+    _LOG.debug("it came from here", exc_info=error)
 
 
 def _stop(server: ViserServer) -> None:
@@ -204,11 +229,12 @@ class Viewer:
             self.changed.notify()
         self._thread.join(JOIN_S)
 
-    def open_page(self, client: ClientHandle) -> None:
+    def open_page(self, client: ClientHandle) -> Callable[[str], None]:
         page = Page(self, client)
         with self.changed:
             self.pages.append(page)
             self.changed.notify()
+        return page.show_error
 
     def close_page(self, client: ClientHandle) -> None:
         with self.changed:
@@ -360,13 +386,20 @@ class Viewer:
         return shown, seconds
 
     def _factor(self, page: Page, wish: Wish, recipe: Recipe, camera: Camera) -> float:
-        """How much smaller than the recipe's picture the window is."""
-        if wish.every_pixel:
-            return 1.0
-        height = camera.height * recipe.render.scale
+        """How much smaller than the recipe's picture the window is.
+
+        Raises:
+            ClimateGSError: every pixel is asked for, and there are too many.
+        """
+        scale = recipe.render.scale
+        width, height = camera.width, camera.height
         if wish.pose is None:
-            height *= place_in_window(camera, page.aspect).size[1] / camera.height
-        return min(1.0, page.window_height / height)
+            width, height = place_in_window(camera, page.aspect).size
+        if wish.every_pixel:
+            check_size(width * scale, height * scale)
+            return 1.0
+        fitting = math.sqrt(MAX_PIXELS / (width * height)) / scale
+        return min(1.0, page.window_height / (height * scale), fitting)
 
     def _finish(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, seconds: dict[str, float]
@@ -381,12 +414,8 @@ class Viewer:
             page.show_overlays(wish, points)
             page.overlaid = key
         steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
-        lines = [
-            f"| {'**' if step.runs else ''}{step.name}{'**' if step.runs else ''} | "
-            f"{_milliseconds(seconds.get(step.name))} | {step.why} |".replace("\n", " ")
-            for step in steps
-        ]
-        page.show_plan("\n".join(["| pass | ms | why, or why not |", "|---|---|---|", *lines]))
+        rows = [(step.name, _milliseconds(seconds.get(step.name)), step.why) for step in steps]
+        page.show_plan(table(("pass", "ms", "why, or why not"), rows, [s.runs for s in steps]))
         page.show_command(self._command(page, wish))
 
     @contextlib.contextmanager
@@ -408,6 +437,8 @@ class Viewer:
         """The time of the view at rest in each tier, and how far it is from reference."""
         wish = page.wish
         camera = page.camera_of(wish)
+        scale = page.recipe(wish.edits).render.scale
+        check_size(camera.width * scale, camera.height * scale)
         pictures: dict[str, tuple[float, np.ndarray]] = {}
         for tier in (*TIERS, "reference"):
             recipe = wish.edits.with_tier(tier).recipe()
@@ -420,21 +451,29 @@ class Viewer:
                 times.append(time.perf_counter() - started)
             pictures[tier] = (min(times), rgb)
         best = pictures["reference"][1].astype(float)
-        lines = ["| tier | size | ms | mean difference, of 255 |", "|---|---|---|---|"]
+        rows = []
         for tier, (seconds, rgb) in pictures.items():
             height, width = rgb.shape[:2]
             enlarged = cv2.resize(rgb, best.shape[1::-1], interpolation=cv2.INTER_CUBIC)
             off = f"{np.abs(enlarged - best).mean():.2f}"
-            lines.append(f"| {tier} | {width} x {height} | {1000 * seconds:.0f} | {off} |")
-        page.show_tiers("\n".join(lines))
+            rows.append((tier, f"{width} x {height}", f"{1000 * seconds:.0f}", off))
+        page.show_tiers(table(("tier", "size", "ms", "mean difference, of 255"), rows))
 
     def save(self, page: Page, name: str, *, with_picture: bool) -> None:
         """The recipe, with a picture where asked for; and, of a flight, its camera."""
         wish = page.wish
-        named = Recipe.model_validate({**page.recipe(wish.edits).model_dump(), "name": name})
+        named = renamed(page.recipe(wish.edits), name)
+        if with_picture:
+            camera, scale = page.camera_of(wish), named.render.scale
+            check_size(camera.width * scale, camera.height * scale)
         endings = (".yaml", ".camera.json", f".{named.output.image}")
-        path = free_path(self.out, name, *endings)
-        save_recipe(named, path.with_name(path.name + ".yaml"))
+        path = None
+        while path is None:
+            path = free_path(self.out, name, *endings)
+            try:
+                save_recipe(named, path.with_name(path.name + ".yaml"))
+            except FileExistsError:  # since we looked
+                path = None
         written = [path.name + ".yaml"]
         camera, where = page.recorded_camera(wish), self._where(wish, camera_path=None)
         if wish.pose is not None:
@@ -448,7 +487,7 @@ class Viewer:
         if with_picture:
             view = render_view(self.scene, camera, named, backend=self.backend)
             picture = path.with_name(f"{path.name}.{named.output.image}")
-            write_atomic(picture, encode_image(view.rgb, named.output))
+            write_new(picture, encode_image(view.rgb, named.output))
             written.append(picture.name)
         source = shlex.quote(str(path.with_name(path.name + ".yaml")))
         out = shlex.quote(str(path.with_name(path.name + "-images")))
@@ -469,7 +508,7 @@ class Viewer:
             "camera": camera.name,
             "world_from_camera": pose.tolist(),
         }
-        write_atomic(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
+        write_new(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
     def _where(self, wish: Wish, camera_path: Path | None) -> str:
         """The scene and the view in words of the command line."""
@@ -487,6 +526,20 @@ class Viewer:
             what = "a flight" if wish.pose is not None else "an uploaded file"
             return f"# {what}: save the recipe first, and the command will stand here"
         return wish.edits.command(f"{self._where(wish, None)} --out out/view")
+
+
+def check_size(width: float, height: float) -> None:
+    """Check that a picture is not too large to be drawn for a page.
+
+    Raises:
+        ClimateGSError: it has more than MAX_PIXELS.
+    """
+    if width * height > MAX_PIXELS:
+        raise ClimateGSError(
+            f"the picture has {width:.0f} x {height:.0f} pixels; a page has at most "
+            f"{MAX_PIXELS / 1e6:.0f} million drawn: lower render.scale, or look through a smaller "
+            f"angle"
+        )
 
 
 class _Outdated(Exception):
