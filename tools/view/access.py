@@ -80,7 +80,8 @@ class Access:
             host: The request's `Host`, which `refusal` has checked.
             port: As for `refusal`.
         """
-        # MDX, in which texts of others could hold code, would need 'unsafe-eval'.
+        # MDX, in which texts of others could hold code, would need 'unsafe-eval', and so would
+        # viser's splats, which pages do not use.
         policy = {
             "default-src": "'self' data: blob:",
             "script-src": "'unsafe-inline' 'wasm-unsafe-eval' blob:",

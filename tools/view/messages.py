@@ -19,9 +19,13 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import msgspec
+import viser
 import zstandard
 from msgspec import Meta
 from websockets.asyncio.server import ServerConnection
+
+from augment.errors import ClimateGSError
+from tools.view.widgets import value_of
 
 MAX_MESSAGE_BYTES = 2**20  # of one message; a browser cuts files into parts of half as much
 MAX_UPLOAD_BYTES = 64 * 2**20  # of the files that a page has begun to upload
@@ -179,11 +183,13 @@ class Uploads:
 class PageConnection(ServerConnection):
     """A page's connection, of which viser gets only the messages that a page may send.
 
-    `report`, once there is a page, says on it what was refused.
+    Once there is a page, `widget_of` gives viser's handle of a widget by its name in messages, and
+    `report` says on the page what was refused.
     """
 
     def __init__(self, *args: Any, **own: Any) -> None:
         super().__init__(*args, **own)
+        self.widget_of: Callable[[str], Any] = lambda _: None
         self.report: Callable[[str], None] = _LOG.debug
         self._uploads = Uploads(lambda text: self.report(text))
         self._ready: deque[bytes] = deque()
@@ -194,7 +200,7 @@ class PageConnection(ServerConnection):
         while not self._ready:
             data = await super().recv(decode)
             try:
-                message = read_message(data)
+                admitted = await self._admitted(read_message(data))
             except ValueError as error:
                 _LOG.debug("a message of a page is passed over: %s", error)
                 if isinstance(data, bytes) and GuiUpdateMessage.__name__.encode() in data[:256]:
@@ -202,12 +208,29 @@ class PageConnection(ServerConnection):
                         f"the page's value was not taken: numbers are finite, and a text has at "
                         f"most {MAX_TEXT} characters"
                     )
-                continue
-            admitted: list[PageMessage] = [message]
-            if isinstance(message, FileTransferStartUpload | FileTransferPart):
-                admitted = await self._take_upload(message)
-            self._ready.extend(map(msgspec.msgpack.encode, admitted))
+            except ClimateGSError as error:
+                self.report(str(error))
+            else:
+                self._ready.extend(map(msgspec.msgpack.encode, admitted))
         return self._ready.popleft()
+
+    async def _admitted(self, message: PageMessage) -> list[PageMessage]:
+        """Return what of a message is passed on.
+
+        Raises:
+            ClimateGSError: the widget that it names cannot have the value.
+        """
+        if isinstance(message, ViewerCameraMessage):
+            return [message]
+        if isinstance(message, GuiUpdateMessage):
+            widget = self.widget_of(message.uuid)
+            if widget is None or isinstance(widget, viser.GuiUploadButtonHandle):
+                return []
+            value = value_of(widget, message.updates.value)
+            return [GuiUpdateMessage(message.uuid, Updates(value))]
+        widget = self.widget_of(message.source_component_uuid)
+        is_upload = isinstance(widget, viser.GuiUploadButtonHandle)
+        return await self._take_upload(message) if is_upload else []
 
     async def _take_upload(
         self, message: FileTransferStartUpload | FileTransferPart

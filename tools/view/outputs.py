@@ -10,21 +10,25 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from augment.errors import ClimateGSError, OutputError
+from augment.errors import OutputError
+from augment.files.image_size import image_header
 from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.jobs.layout import mask_names, resolve_inside
 from augment.jobs.manifest import MANIFEST, OK, Row, read_finished, weather_columns
 from augment.jobs.store import Store, open_store
+from recipes.files import open_file
 from recipes.schema import columns_of_effects
 from tools.view.fields import NONE
 from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
 from tools.view.text import paragraph, printable, table
-from tools.view.widgets import options_of, value_of
+from tools.view.widgets import options_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle
 
 STEPS = 200  # of a slider of numbers
+MAX_PIXELS = 2**27  # of an image that is shown
+MAX_BYTES = 2**29  # of its file
 MIN_RANGE = 1e-30  # between the ends of a slider of numbers
 MAX_ASPECT = 8.0  # of a window, width by height or height by width
 
@@ -79,11 +83,14 @@ class OutputViewer:
         relative = row[f"{shows}_path"]
         if not relative:
             raise OutputError(f"{row['variant']} has no {shows} images")
-        here = self.store.local_dir
         try:
-            data = (
-                resolve_inside(here, relative).read_bytes() if here else self.store.read(relative)
-            )
+            data = self._read(relative)
+            header = image_header(data)
+            if header is not None and header.width * header.height > MAX_PIXELS:
+                raise ValueError(
+                    f"it says that it has {header.width} x {header.height} pixels; at most "
+                    f"{MAX_PIXELS / 1e6:.0f} million are shown"
+                )
             if shows == "image":
                 return decode_image(data)
             if shows == "depth":
@@ -94,6 +101,17 @@ class OutputViewer:
         except (OSError, ValueError) as error:
             raise OutputError(f"cannot read {self.store.uri}/{relative}: {error}") from error
         return color_classes(numbers) if shows == "semantic" else np.stack([numbers] * 3, -1)
+
+    def _read(self, relative: str) -> bytes:
+        """The bytes of a file that the manifest names."""
+        here = self.store.local_dir
+        if here is None:
+            return self.store.read(relative)
+        with open_file(resolve_inside(here, relative)) as file:  # not of a pipe, which may wait
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES // 2**20} MiB")
+        return data
 
     def start(self) -> None:
         """Pages draw for themselves."""
@@ -164,25 +182,10 @@ class OutputPage:
         return part
 
     def _when(self, part: Any, act: Callable[[], None]) -> None:
-        """Have `act` called when people change a widget, which keeps its value if the new one is
-        none that it can have.
-        """
-        value = part.value
-
         @part.on_update
         async def _(event: Any) -> None:
-            nonlocal value
-            if event.client is None:
-                return
-            try:
-                if isinstance(value, tuple) and len(part.value) != len(value):
-                    raise ClimateGSError(f"{part.label}: it has {len(value)} numbers")
-                value = value_of(part)
-            except ClimateGSError as error:
-                part.value = value
-                self.show_status(str(error))
-                return
-            act()
+            if event.client is not None:
+                act()
 
     def show_status(self, text: str) -> None:
         self._status.content = paragraph(text)

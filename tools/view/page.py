@@ -35,7 +35,7 @@ from tools.view.pictures import (
     what_can_be_shown,
 )
 from tools.view.text import STYLE, paragraph, printable
-from tools.view.widgets import options_of, value_of
+from tools.view.widgets import options_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -419,7 +419,7 @@ class Page:
             if event.client is None:  # not people, but `_show_values`
                 return
             try:
-                act(value_of(event.target))
+                act(event.target.value)
             except Exception as error:
                 self.viewer.report(self, error)
 

@@ -171,6 +171,7 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
         connection = server._websock_server._live_connections[client.client_id]
         try:
             connection.report = viewer.open_page(client)
+            connection.widget_of = client.gui._gui_input_handle_from_uuid.get
         except Exception as error:
             _LOG.error("%s", "".join(traceback.format_exception(error)))
             await connection.close(1011, "the page cannot be made; the server's log says why")

@@ -58,7 +58,7 @@ def table(
     for number, cells in enumerate(rows):
         lines.append(_row("td", cells, is_bold=number < len(bold) and bold[number]))
     body = "".join(lines)
-    own = 'border="1" cellpadding="4" style="border-collapse:collapse"'
+    own = 'border="1" bordercolor="#c8c8c8" cellpadding="4" style="border-collapse:collapse"'
     return f'<div style="{STYLE}"><table {own}>{body}</table></div>'
 
 

@@ -11,18 +11,21 @@ from recipes.errors import short
 from tools.view.text import printable
 
 
-def value_of(widget: Any) -> Any:
-    """Return a widget's value, which a page has sent.
+def value_of(widget: Any, sent: Any) -> Any:
+    """Return what a page has sent as a value that the widget can have.
+
+    Args:
+        widget: viser's handle of it.
+        sent: A truth value, number, text, or a tuple of numbers.
 
     Raises:
-        ClimateGSError: it is none of the widget's options, or beyond its ends.
+        ClimateGSError: it is of another kind, none of the widget's options, or beyond its ends.
     """
-    value = widget.value
+    value = _cast(sent, widget.value)
     options = getattr(widget, "options", None)
-    if options is not None and value not in options:
-        raise ClimateGSError(
-            f"{widget.label}: {short(repr(value))} is none of its options; choose one of them"
-        )
+    if value is None or (options is not None and value not in options):
+        wanted = "a value of its kind" if options is None else "one of its options"
+        raise ClimateGSError(f"{widget.label}: expected {wanted}; got {short(repr(sent))}")
     low, high = getattr(widget, "min", None), getattr(widget, "max", None)
     numbers = value if isinstance(value, tuple) else (value,)
     for number, least, most in zip(numbers, _ends(low, numbers), _ends(high, numbers), strict=True):
@@ -34,6 +37,19 @@ def value_of(widget: Any) -> Any:
             ends = " to ".join("any" if end is None else f"{end:g}" for end in (least, most))
             raise ClimateGSError(f"{widget.label}: {number:g} is not within its ends, {ends}")
     return value
+
+
+def _cast(sent: Any, now: Any) -> Any:
+    """The value as one of the kind that the widget has now; None where it is of another."""
+    if isinstance(now, bool | str):
+        return sent if type(sent) is type(now) else None
+    if isinstance(now, int | float):
+        is_number = isinstance(sent, int | float) and not isinstance(sent, bool)
+        return type(now)(sent) if is_number else None  # a browser has one kind of numbers
+    if isinstance(now, tuple) and isinstance(sent, tuple) and len(sent) == len(now):
+        values = tuple(map(_cast, sent, now))
+        return None if None in values else values
+    return None
 
 
 def _ends(end: Any, numbers: tuple[Any, ...]) -> tuple[Any, ...]:
