@@ -30,7 +30,7 @@ def value_of(widget: Any, sent: Any) -> Any:
     numbers = value if isinstance(value, tuple) else (value,)
     for number, least, most in zip(numbers, _ends(low, numbers), _ends(high, numbers), strict=True):
         # A browser rounds to a slider's steps.
-        slack = (getattr(widget, "step", None) or 0) if isinstance(number, float) else 0
+        slack = (getattr(widget, "step", None) or 0) / 2 if isinstance(number, float) else 0
         if (least is not None and number < least - slack) or (
             most is not None and number > most + slack
         ):
