@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import shlex
+import struct
 import subprocess
 import sys
 import threading
@@ -20,13 +22,16 @@ import numpy as np
 import pytest
 import torch
 from page_client import PageClient
+from report_outputs import make_row, write_output
 from streets import LABELLED_STREET, SMALL_STREET, open_street
 from websockets.exceptions import InvalidStatus
 
 from augment import effects
 from augment.cameras import Camera
-from augment.errors import ClimateGSError
+from augment.errors import ClimateGSError, OutputError
 from augment.geometry import invert_rigid
+from augment.jobs.manifest import rows_to_table, write_manifest
+from augment.jobs.store import open_store
 from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.fields import found
@@ -415,6 +420,63 @@ def test_an_output_is_looked_through_by_its_numbers(tmp_path):
         count = len(page.pictures)
         page.set("shows", "depth")
         assert page.rest(after=count).std() > 10
+
+
+HOSTILE = "{(globalThis.PWNED = 1)} <img src=x onerror=globalThis.PWNED=1> | ` &lt; \u202e \x00"
+
+
+def hostile_output(out: Path) -> Path:
+    """An output whose manifest has code in every text that it may have, and numbers without end."""
+    texts = ("source", "base", "surface", "lidar_note", "style", "quality", "settings", "recipe",
+             "trajectory", "version", "backend", "message")  # fmt: skip
+    own = dict.fromkeys(texts, HOSTILE)
+    rows = [make_row(frame=0), make_row(frame=1, smog_extinction_per_m=0.5)]
+    write_output(out, rows)
+    numbers = {"flood_level_m": 1e308, "snow_depth_m": 5e-324}
+    rows[1] |= {name: -value for name, value in numbers.items()}
+    rows = [row | own | {"scene": HOSTILE, "variant": name, "camera": ""} | numbers
+            for row, name in zip(rows, ("(none)", HOSTILE), strict=True)]  # fmt: skip
+    write_manifest(out, rows_to_table(rows))
+    return out
+
+
+def test_what_a_manifest_says_is_shown_letter_for_letter(tmp_path):
+    output = find_output(str(hostile_output(tmp_path / "out")))
+    assert output is not None
+    viewer = OutputViewer(output)
+    assert viewer.numbers == ["smog_extinction_per_m"]
+    with serve(import_viser(), viewer, "127.0.0.1", 0) as url, PageClient(url) as page:
+        page.wait_for(lambda: page.pictures, "a picture")
+        page.set("left of the line", page.widgets["left of the line"][0]["options"][1])
+        page.set("variant", page.widgets["variant"][0]["options"][1])
+        page.set("frame", 1)
+        page.wait_for(lambda: "2 images" in page.status(), "the picture")
+        widgets = [widget for same in page.widgets.values() for widget in same]
+        assert not any("_markdown" in widget for widget in widgets)
+        shown = page.status() + "".join(widget.get("content") or "" for widget in widgets)
+    assert "<img" not in shown and "&lt;img src=x onerror" in shown
+    assert "\u202e" not in shown and "\\u202e" in shown
+
+
+def test_files_of_an_output_that_are_none_are_said_and_not_waited_for(tmp_path):
+    rows = [make_row(frame=number) for number in range(4)]
+    write_output(tmp_path, rows)
+    pipe, loop, large, wrong = (tmp_path / row["image_path"] for row in rows)
+    for path in (pipe, loop):
+        path.unlink()
+    os.mkfifo(pipe)
+    loop.symlink_to(loop.name)
+    data = bytearray(large.read_bytes())
+    data[16:24] = struct.pack(">II", 2**20, 2**20)
+    large.write_bytes(data)
+    wrong.write_bytes(b"no image")
+    viewer = OutputViewer(open_store(str(tmp_path)))
+    said = []
+    for row in viewer.rows:
+        with pytest.raises(OutputError, match="cannot read") as raised:
+            viewer.picture(row, "image")
+        said.append(str(raised.value))
+    assert "a pipe" in said[0] and "1048576 x 1048576 pixels" in said[2]
 
 
 # ---- The command ---------------------------------------------------------------------------------

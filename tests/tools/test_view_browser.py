@@ -13,15 +13,19 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 import pytest
 from streets import SMALL_STREET
-from test_view import SCALE, rendered, served
+from test_view import SCALE, hostile_output, rendered, served
 
+from augment.jobs.store import open_store
 from augment.views import render_view
 from tools.view.edits import Edits
+from tools.view.outputs import OutputViewer
+from tools.view.server import import_viser, serve
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
@@ -125,6 +129,68 @@ def test_two_tabs_fly_apart_and_a_killed_one_leaves_the_other(browser, tmp_path)
         at_rest(two)
         assert not np.array_equal(image_of(two), before)
         two.close()
+
+
+# How a page's attempt to connect ends.
+CONNECT = """address => new Promise(done => {
+  const socket = new WebSocket(address, ["viser-v1.1.0"]);
+  socket.onopen = () => done("open");
+  socket.onerror = () => done("refused");
+})"""
+
+
+def test_pages_of_other_sites_connect_to_nothing_while_the_page_is_open(browser, tmp_path):
+    output = OutputViewer(open_store(str(hostile_output(tmp_path / "out"))))
+    with serve(import_viser(), output, "127.0.0.1", 0) as url:
+        host = urlsplit(url).netloc
+        port = host.rpartition(":")[2]
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(url)
+        page.get_by_text("2 images").wait_for(timeout=WAIT_MS)
+        assert page.evaluate(CONNECT, f"ws://{host}") == "open"  # by its cookie
+        context.route("http://*/elsewhere", lambda route: route.fulfill(body="<p>elsewhere</p>"))
+        local = tmp_path / "page.html"
+        local.write_text("<p>a file</p>")
+        sites = ["http://evil.example/elsewhere", "http://localhost:45999/elsewhere",
+                 "http://127.0.0.1:45999/elsewhere", local.as_uri(), "about:blank"]  # fmt: skip
+        for site in sites:
+            other = context.new_page()
+            other.goto(site)
+            for address in (host, f"127.0.0.1:{port}", f"[::1]:{port}"):
+                assert other.evaluate(CONNECT, f"ws://{address}") == "refused", site
+            other.close()
+        # A page whose address names another server, or that is in a frame, is not sent.
+        other = context.new_page()
+        answer = other.goto(f"http://{host}/?websocket=ws://evil.example")
+        assert answer is not None and answer.status == 403
+        other.goto(sites[1])
+        other.set_content(f'<iframe src="{url}"></iframe>')
+        other.wait_for_timeout(1500)
+        assert not any(frame.url.startswith("http") and "2 images" in frame.content()
+                       for frame in other.frames)  # fmt: skip
+        context.close()
+
+
+def test_texts_of_a_manifest_run_nothing_in_a_browser(browser, tmp_path):
+    output = OutputViewer(open_store(str(hostile_output(tmp_path / "out"))))
+    with serve(import_viser(), output, "127.0.0.1", 0) as url:
+        page = browser.new_page()
+        requests = []
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(url)
+        page.get_by_text("onerror=globalThis.PWNED=1").first.wait_for(timeout=WAIT_MS)
+        page.get_by_label("variant").first.click()
+        page.get_by_role("option").last.click()
+        page.get_by_role("slider").first.press("ArrowRight")
+        page.wait_for_timeout(1000)
+        text = page.inner_text("body")
+        assert page.evaluate("globalThis.PWNED") is None and "Error Parsing" not in text
+        # Nor does anything go to another server; and nothing offers to share the page.
+        own = ("data:", "blob:", url.partition("?")[0])
+        assert not [address for address in requests if not address.startswith(own)]
+        assert page.locator(".tabler-icon-share").count() == 0
+        page.close()
 
 
 def test_the_command_serves_until_it_is_interrupted(browser, tmp_path):
