@@ -20,7 +20,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from augment.cameras import Camera
 from augment.cast_shadows import CastShadows, shadows_of
@@ -55,6 +54,7 @@ from augment.effects.snow.surface_kernels import LINK, RISES
 from augment.errors import SceneError
 from augment.ground import check_metric_and_level
 from augment.labels import EGO_VEHICLE
+from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
@@ -793,7 +793,7 @@ def place_snow_support(
         return SnowSupport(_no_cells(), {})
     parked = tuple(_parked(scene))
     steps = len(views) + len(squares) + len(vehicles)
-    with tqdm(total=steps, desc="placing snow", disable=not progress, unit="step") as bar:
+    with ProgressBar(total=steps, desc="placing snow", disable=not progress, unit="step") as bar:
         parts = [PosedGaussians(background), *parked]
         seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
         paths = wheel_paths(scene)
