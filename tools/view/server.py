@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -35,17 +35,19 @@ from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
 from augment.scene import Scene
-from augment.timing import stopwatch
+from augment.timing import PassProgress, stopwatch, watched
 from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
+from tools.view.browser import keep_arrow_keys_with_widgets
 from tools.view.edits import Edits, free_path, save_recipe, without_weather
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
+    away_sentence,
     coarse,
     draw,
     in_window,
@@ -54,6 +56,7 @@ from tools.view.pictures import (
     recipe_to_show,
     split,
 )
+from tools.view.status import Activity, ShownPicture
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -63,6 +66,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 JOIN_S = 10.0  # that the picture being drawn gets when the server ends
+TICK_S = 0.25  # from one look at what is being done to the next, for the lines that tell it
 
 
 def view_scene(options: ViewOptions) -> int:
@@ -150,6 +154,7 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
     async def _(client: ClientHandle) -> None:
         connection = server._websock_server._live_connections[client.client_id]
         if _is_ours(connection.request.headers, host):
+            keep_arrow_keys_with_widgets(client)
             viewer.open_page(client)
         else:
             await connection.close(1008, "pages of other sites have no business here")
@@ -193,16 +198,35 @@ class Viewer:
         self.pages: list[Page] = []
         self._is_ending = False
         self._known: set[tuple[str, ...]] = set()  # kernels that have run
+        self._activity: tuple[Page, Activity] | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+        self._end = threading.Event()
+        self._ticker = threading.Thread(target=self._tell, name="status", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
+        self._ticker.start()
 
     def stop(self) -> None:
+        self._end.set()
         with self.changed:
             self._is_ending = True
             self.changed.notify()
         self._thread.join(JOIN_S)
+        self._ticker.join(JOIN_S)
+
+    def activity_for(self, page: Page) -> Activity | None:
+        """What the thread does for a page, or is about to; None while it draws for another."""
+        current = self._activity
+        if current is None:
+            return Activity()
+        return current[1] if current[0] is page else None
+
+    def _tell(self) -> None:
+        """Has pages that wait for a picture say what is being done."""
+        while not self._end.wait(TICK_S):
+            for page in tuple(self.pages):
+                page.update_status()
 
     def open_page(self, client: ClientHandle) -> None:
         page = Page(self, client)
@@ -227,6 +251,17 @@ class Viewer:
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        with _compiling_told(self._count_compiling):
+            self._serve_pages()
+
+    def _count_compiling(self, change: int) -> None:
+        """A kernel begins to be compiled (1), or is compiled (-1)."""
+        if self._activity is not None:
+            activity = self._activity[1]
+            activity.compiling = max(0, activity.compiling + change)
+            activity.compiled += change < 0
+
+    def _serve_pages(self) -> None:
         while True:
             with self.changed:
                 page, work = self._next()
@@ -238,10 +273,13 @@ class Viewer:
                 # The others come first next time.
                 self.pages.sort(key=lambda other: other is page)
             assert page is not None
+            self._activity = (page, Activity())
             try:
                 self._work(page, work)
             except Exception as error:
                 self.report(page, error)
+            finally:
+                self._activity = None
 
     def _next(self) -> tuple[Page | None, Any]:
         """The page that waits for longest and what to do for it; or None, and how long there is
@@ -285,7 +323,7 @@ class Viewer:
         except _Outdated:
             own.last = time.monotonic()  # a small picture comes first, however long the pass took
         except Exception:
-            page.show_status("not drawn")
+            page.show_failure(wish)
             raise
         finally:  # what failed is not tried again before something changes
             own.drawn = wished
@@ -306,8 +344,6 @@ class Viewer:
         factor = self._factor(page, wish, recipe, camera)
         if moving:
             factor *= page.progress.factor
-        elif page.progress.rested == 0 or self._is_new(recipe):
-            page.show_status("preparing")
         started = time.perf_counter()
         with self._kernels(recipe):
             shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
@@ -320,8 +356,17 @@ class Viewer:
         page.show_picture(shown.rgb, shown.depth_m, moving=moving)
         if moving:
             page.progress.factor = _paced(page.progress.factor, took)
-        what = "while moving" if moving else "at rest"
-        page.show_status(f"{width} x {height} {what}, {1000 * took:.0f} ms")
+        own = ShownPicture(
+            wish=wish,
+            width=width,
+            height=height,
+            seconds=took,
+            at=time.monotonic(),
+            is_rest=not moving,
+            is_valid=refusal is None,
+        )
+        page.show_progress(own)
+        page.show_warning(away_sentence(self.scene, camera))
         page.show_error(refusal)
         if not moving:
             self._finish(page, wish, recipe, camera, seconds)
@@ -333,10 +378,20 @@ class Viewer:
 
         Raises:
             _Outdated: at rest, before a pass: the page is closed or wishes for something else.
+                Within a preparation: the page is closed, or an effect has been taken out.
         """
 
-        def check() -> None:
-            if page.is_closed or page.wish is not wish:
+        def tell(progress: PassProgress) -> None:
+            if self._activity is not None:
+                self._activity[1].progress = progress
+            if page.is_closed:
+                raise _Outdated
+            if page.wish is wish:
+                return
+            if progress.total:  # most of what follows needs it, too: a depth that is dragged
+                if _lacks_effect_of(page, recipe):
+                    raise _Outdated
+            elif not moving:
                 raise _Outdated
 
         def drawn(recipe: Recipe) -> Shown:
@@ -344,17 +399,14 @@ class Viewer:
             asked = coarse(asked) if moving else asked
             return draw(self.scene, camera, asked, wish.shows, backend=self.backend)
 
-        if moving:
-            shown, seconds = drawn(recipe), {}
-        else:
-            with stopwatch(check) as seconds:
-                shown = drawn(recipe)
+        with watched(tell), contextlib.nullcontext({}) if moving else stopwatch() as seconds:
+            shown = drawn(recipe)
         if wish.is_split:
             clear = without_weather(recipe)
             size = shown.rgb.shape
             key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
             if page.before is None or page.before[0] != key:
-                with contextlib.nullcontext() if moving else stopwatch(check):
+                with watched(tell):
                     page.before = (key, drawn(clear).rgb)
             shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
         return shown, seconds
@@ -489,8 +541,35 @@ class Viewer:
         return wish.edits.command(f"{self._where(wish, None)} --out out/view")
 
 
+@contextlib.contextmanager
+def _compiling_told(tell: Callable[[int], None]) -> Iterator[None]:
+    """Has a function told when numba begins (1) and ends (-1) to compile a kernel; not of those
+    that lie in its cache.
+    """
+    from numba.core.event import Event, Listener, install_listener
+
+    class Counter(Listener):
+        def on_start(self, event: Event) -> None:
+            tell(1)
+
+        def on_end(self, event: Event) -> None:
+            tell(-1)
+
+    with install_listener("numba:compile", Counter()):
+        yield
+
+
 class _Outdated(Exception):
     """Nobody waits for the picture any more."""
+
+
+def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
+    """Whether the page asks for a recipe without an effect that another one has."""
+    try:
+        asked = page.recipe(page.wish.edits)
+    except RecipeError:
+        return False
+    return not recipe.sections().keys() <= asked.sections().keys()
 
 
 def _paced(factor: float, seconds: float) -> float:
