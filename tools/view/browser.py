@@ -34,16 +34,21 @@ def keep_arrow_keys_with_widgets(client: ClientHandle) -> None:
     client.gui._websock_interface.queue_message(RunJavascriptMessage(_ARROWS_STAY_WITH_WIDGETS))
 
 
-def style_of_place_sliders(sliders: Iterable[Any]) -> str:
-    """HTML that hides the number boxes which viser puts beside sliders, and leaves room for marks.
+def page_style(place_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
+    """The page's style as HTML.
 
     Args:
-        sliders: Handles of sliders whose numbers are places along their way, which tell nobody
-            anything: the value stands in a box of its own.
+        place_sliders: Handles of sliders whose numbers are places along their way, which tell
+            nobody anything: viser's box beside them is hidden, as the value has a box of its own,
+            and their marks get room.
+        headings: Handles of ticks that begin a part of the page; their labels are bold.
     """
-    names = [f"[id='{slider._impl.uuid}']" for slider in sliders]
-    if not names:
-        return ""
-    boxes = ", ".join(f"{name} + *" for name in names)
-    rules = f"{boxes} {{ display: none }} {', '.join(names)} {{ margin-bottom: 1em }}"
-    return f"<style>{rules}</style>"
+    sliders = [f"[id='{handle._impl.uuid}']" for handle in place_sliders]
+    labels = [f"label[for='{handle._impl.uuid}']" for handle in headings]
+    rules = {
+        ", ".join(f"{slider} + *" for slider in sliders): "display: none",
+        ", ".join(sliders): "margin-bottom: 1em",
+        ", ".join(labels): "font-weight: bold; color: black",
+    }
+    text = " ".join(f"{where} {{ {what} }}" for where, what in rules.items() if where)
+    return f"<style>{text}</style>"

@@ -23,7 +23,7 @@ from recipes.errors import RecipeError
 from recipes.fields import found
 from recipes.load import describe_preset, preset_names
 from recipes.schema import TIERS, Recipe
-from tools.view.browser import style_of_place_sliders
+from tools.view.browser import page_style
 from tools.view.controls import MAIN_FIELDS, Control, Group, effect_groups, group_of, split_by_rank
 from tools.view.edits import Edits, as_yaml, free_path
 from tools.view.fields import NONE, Field
@@ -343,8 +343,8 @@ class Page:
             self._plan = gui.add_markdown("")
         with tabs.add_tab("Save"):
             self._build_save()
-        sliders = (own.place_slider for own in self._fields.values())
-        gui.add_html(style_of_place_sliders(slider for slider in sliders if slider is not None))
+        sliders = [own.place_slider for own in self._fields.values() if own.place_slider]
+        gui.add_html(page_style(sliders, [self._effects[group.path][0] for group in main]))
 
     def _build_recipe(self) -> None:
         gui, names = self.gui, preset_names()
