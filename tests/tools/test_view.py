@@ -179,6 +179,10 @@ def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
     assert said(rough, wish, Activity(PassProgress("sky")), now=2.0) == (
         "Rough picture, the whole one follows: drawing (sky)"
     )
+    bare = dataclasses.replace(at_rest, is_complete=False)
+    assert said(bare, wish, Activity(PassProgress("LiDAR returns"))) == (
+        "Picture, what lies over it follows: drawing (LiDAR returns)"
+    )
     refused = dataclasses.replace(at_rest, is_valid=False)
     assert "of the last recipe that was valid" in said(refused, wish, Activity())
     assert said(at_rest, wish, Activity(), has_failed=True) == "Not drawn"

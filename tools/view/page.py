@@ -124,7 +124,7 @@ class Page:
         self.progress, self.is_closed = Progress(), False
         self.wish = Wish(viewer.edits, 0, first_camera(viewer.scene, viewer.frames[0]))
         self.before: tuple[Any, np.ndarray] | None = None  # the picture without weather, by view
-        self._shown: ShownPicture | None = None
+        self._picture: ShownPicture | None = None
         self._failed: Wish | None = None  # could not be drawn
         self._telling = threading.Lock()  # three threads say what is being done
         self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
@@ -502,6 +502,7 @@ class Page:
         self._when(picture, lambda _: self._save(with_picture=True), "on_click")
 
     def _save(self, *, with_picture: bool) -> None:
+        self._saved.content = f'<p style="{_TEXT}">saving</p>'
         self.do(lambda: self.viewer.save(self, self._name.value, with_picture=with_picture))
 
     def go_to_frame(self, number: int) -> None:
@@ -532,9 +533,9 @@ class Page:
 
     # ---- Shown by the viewer's thread ------------------------------------------------------------
 
-    def show_progress(self, shown: ShownPicture) -> None:
+    def show_progress(self, picture: ShownPicture) -> None:
         """A picture has been sent."""
-        self._shown, self._failed = shown, None
+        self._picture, self._failed = picture, None
         self.update_status()
 
     def show_failure(self, wish: Wish) -> None:
@@ -551,7 +552,7 @@ class Page:
         with self._telling:
             now, wish = time.monotonic(), self.wish
             status = page_status(
-                self._shown,
+                self._picture,
                 wish,
                 self.viewer.activity_for(self),
                 waited_s=now - self.progress.asked,

@@ -19,6 +19,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -222,6 +223,11 @@ class Viewer:
             return Activity()
         return current[1] if current[0] is page else None
 
+    def _note(self, progress: PassProgress) -> None:
+        """The thread has got to a pass, or to a step of one."""
+        if self._activity is not None:
+            self._activity[1].progress = progress
+
     def _tell(self) -> None:
         """Has pages that wait for a picture say what is being done."""
         while not self._end.wait(TICK_S):
@@ -347,29 +353,32 @@ class Viewer:
         started = time.perf_counter()
         with self._kernels(recipe):
             shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
-        height, width = shown.rgb.shape[:2]
-        if wish.pose is None:
-            shown = in_window(shown, place_in_window(camera.resized(width, height), page.aspect))
-        took = time.perf_counter() - started
-        if page.is_closed:
-            return
-        page.show_picture(shown.rgb, shown.depth_m, moving=moving)
-        if moving:
-            page.progress.factor = _paced(page.progress.factor, took)
-        own = ShownPicture(
-            wish=wish,
-            width=width,
-            height=height,
-            seconds=took,
-            at=time.monotonic(),
-            is_rest=not moving,
-            is_valid=refusal is None,
-        )
-        page.show_progress(own)
-        page.show_warning(away_sentence(self.scene, camera))
-        page.show_error(refusal)
-        if not moving:
-            self._finish(page, wish, recipe, camera, seconds)
+            height, width = shown.rgb.shape[:2]
+            if wish.pose is None:
+                place = place_in_window(camera.resized(width, height), page.aspect)
+                shown = in_window(shown, place)
+            took = time.perf_counter() - started
+            if page.is_closed:
+                return
+            page.show_picture(shown.rgb, shown.depth_m, moving=moving)
+            if moving:
+                page.progress.factor = _paced(page.progress.factor, took)
+            picture = ShownPicture(
+                wish=wish,
+                width=width,
+                height=height,
+                seconds=took,
+                at=time.monotonic(),
+                is_rest=not moving,
+                is_complete=not wish.lidar,
+                is_valid=refusal is None,
+            )
+            page.show_progress(picture)
+            page.show_warning(away_sentence(self.scene, camera))
+            page.show_error(refusal)
+            if not moving:
+                self._finish(page, wish, recipe, camera, seconds)
+                page.show_progress(replace(picture, is_complete=True))
 
     def _picture(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
@@ -382,8 +391,7 @@ class Viewer:
         """
 
         def tell(progress: PassProgress) -> None:
-            if self._activity is not None:
-                self._activity[1].progress = progress
+            self._note(progress)
             if page.is_closed:
                 raise _Outdated
             if page.wish is wish:
@@ -426,6 +434,7 @@ class Viewer:
         """What follows the picture at rest."""
         points = None
         if wish.lidar:
+            self._note(PassProgress("LiDAR returns"))
             points = lidar_points(self.scene, page.frame_of(wish), recipe)
         own = wish.frustums and (wish.camera if wish.pose is None else "flight")
         key = (wish.frame, wish.boxes, own, wish.lidar and recipe)
@@ -443,12 +452,14 @@ class Viewer:
 
     @contextlib.contextmanager
     def _kernels(self, recipe: Recipe) -> Iterator[None]:
-        """Has the kernels of effects that are new compiled on all cores."""
+        """Has the kernels of effects that are new compiled on all cores, to the end of the list."""
         if not self._is_new(recipe):
             yield
             return
         with compiling_noted(kernel_modules([recipe], self.backend)):
             yield
+            self._count_compiling(1)  # processes beside this one may compile on
+        self._count_compiling(-1)
         self._known.add(tuple(recipe.sections()))
 
     def _is_new(self, recipe: Recipe) -> bool:

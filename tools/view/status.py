@@ -35,6 +35,8 @@ class ShownPicture:
     """When it was sent, on the monotonic clock."""
     is_rest: bool
     """Whether it is the whole picture, and not a rough one while something moves."""
+    is_complete: bool = True
+    """Whether what lies over the picture is there, too."""
     is_valid: bool = True
     """Whether the wish's recipe is valid; else the picture is of the last one that was."""
 
@@ -69,19 +71,19 @@ def describe_activity(activity: Activity | None) -> str:
     """What the thread is doing, in words. activity: None while it draws for another page."""
     if activity is None:
         return "waiting for the picture of another page"
-    if activity.compiling:
+    progress = activity.progress
+    if progress is not None and progress.total and not activity.compiling:
+        return f"{progress.name}, step {progress.done} of {progress.total}"
+    if activity.compiling or activity.compiled:  # or another process compiles what is wanted next
         so_far = f", {activity.compiled} done" if activity.compiled else ""
         return f"compiling kernels (only the first time{so_far})"
-    progress = activity.progress
     if progress is None:
         return "drawing"
-    if progress.total:
-        return f"{progress.name}, step {progress.done} of {progress.total}"
     return "preparing the scene" if progress.name in _PREPARATIONS else f"drawing ({progress.name})"
 
 
 def page_status(
-    shown: ShownPicture | None,
+    picture: ShownPicture | None,
     wish: Wish,
     activity: Activity | None,
     *,
@@ -92,7 +94,7 @@ def page_status(
     """What a page says of its picture.
 
     Args:
-        shown: The last picture; None before the first.
+        picture: The last picture; None before the first.
         wish: What the page asks for.
         activity: What the thread does for this page; None while it draws for another.
         waited_s: Seconds since the wish.
@@ -101,14 +103,14 @@ def page_status(
     """
     if has_failed:
         return Status("Not drawn", False)
-    is_current = shown is not None and shown.wish is wish
-    if shown is not None:
-        size = f"{shown.width} x {shown.height}"
-        if is_current and shown.is_rest:
-            recipe = "" if shown.is_valid else "; of the last recipe that was valid"
-            return Status(f"{size} at rest, {1000 * shown.seconds:.0f} ms{recipe}", True)
-        if not shown.is_rest and now - shown.at < MOVING_S:
-            return Status(f"{size} while moving, {1000 * shown.seconds:.0f} ms", is_current)
+    is_current = picture is not None and picture.wish is wish
+    if picture is not None:
+        size = f"{picture.width} x {picture.height}"
+        if is_current and picture.is_rest and picture.is_complete:
+            recipe = "" if picture.is_valid else "; of the last recipe that was valid"
+            return Status(f"{size} at rest, {1000 * picture.seconds:.0f} ms{recipe}", True)
+        if not picture.is_rest and now - picture.at < MOVING_S:
+            return Status(f"{size} while moving, {1000 * picture.seconds:.0f} ms", is_current)
     doing = describe_activity(activity)
     if waited_s >= 1:
         doing += f", {waited_s:.0f} s"
@@ -116,19 +118,20 @@ def page_status(
     if activity is not None and activity.progress is not None and not activity.compiling:
         total = activity.progress.total
         share = activity.progress.done / total if total else None
-    text = f"{_what_is_shown(shown, wish)}: {doing}"
+    text = f"{_what_is_shown(picture, wish)}: {doing}"
     return Status(text, is_current, share, waited_s >= BUSY_S)
 
 
-def _what_is_shown(shown: ShownPicture | None, wish: Wish) -> str:
+def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
     """How the picture differs from the wish, in words."""
-    if shown is None:
+    if picture is None:
         return "First picture"
-    if shown.wish is wish:
-        return "Rough picture, the whole one follows"
-    if shown.wish.edits != wish.edits:
+    if picture.wish is wish:
+        follows = "what lies over it" if picture.is_rest else "the whole one"
+        return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
+    if picture.wish.edits != wish.edits:
         return "Picture not of this recipe yet"
-    views = ((own.frame, own.camera, own.pose) for own in (shown.wish, wish))
+    views = ((own.frame, own.camera, own.pose) for own in (picture.wish, wish))
     if len(set(views)) > 1:
         return "Picture not of this view yet"
     return "Picture not up to date yet"
