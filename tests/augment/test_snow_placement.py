@@ -28,6 +28,7 @@ from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, Scene, Track
 from augment.semantics import SemanticClass
+from augment.timing import PassProgress, watched
 from recipes.snow import Snow
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
@@ -115,11 +116,16 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
 
 
-def test_bits_do_not_depend_on_threads(flat_ground) -> None:
+def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     scene, bed = flat_ground
     limit_threads(2)
-    together = place_snow_support(scene, cameras_of(scene), COARSE)
+    told = list[PassProgress]()
+    with watched(told.append):
+        together = place_snow_support(scene, cameras_of(scene), COARSE)
     assert_equal_cells(together.ground, bed.ground)
+    total = told[0].total
+    assert [progress.done for progress in told] == [*range(total + 1)] and total > 1
+    assert {progress.name for progress in told} == {"placing snow"}
 
 
 def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:

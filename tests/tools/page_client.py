@@ -22,8 +22,8 @@ Found = TypeVar("Found")
 
 class PageClient:
     """widgets: as the server made and changed them, by FOLDER/LABEL, in order. pictures: the time
-    of each, and its message. nodes: what lies over the picture. theme: of the page. pose: of the
-    window, which goes where the server puts it.
+    of each, and its message. said: all that the page's lines have said, in order. nodes: what lies
+    over the picture. theme: of the page. pose: of the window, which goes where the server puts it.
     """
 
     def __init__(
@@ -36,6 +36,7 @@ class PageClient:
         self.size, self.widgets, self.pictures = size, dict[str, list[dict[str, Any]]](), []
         self.nodes: set[str] = set()
         self.theme: dict[str, Any] = {}
+        self.said: list[str] = []
         self.pose: dict[str, Any] = {
             "position": [0.0, -5.0, 2.0], "look_at": [0.0, 0.0, 0.0],
             "up_direction": [0.0, 0.0, 1.0], "fov": 1.0,
@@ -171,6 +172,7 @@ class PageClient:
             own |= message["updates"]
             if "content" in message["updates"]:
                 self._html[message["uuid"]] = message["updates"]["content"]
+                self.said.append(message["updates"]["content"])
         elif kind.startswith("Gui") and "props" in message:
             own = {**message["props"], "uuid": message["uuid"], "value": message.get("value")}
             self._by_uuid[message["uuid"]] = own

@@ -87,11 +87,11 @@ def test_a_browser_shows_render_views_bytes_and_saves_what_render_repeats(browse
         page = opened(browser, url)
         camera = viewer.scene.frames[0].cameras["front"]
         assert within(image_of(page), render_view(viewer.scene, camera, edits.recipe()).rgb)
-        page.get_by_text("smog", exact=True).click()
-        number = page.get_by_label("visibility_m").nth(1)
+        number = page.get_by_role("textbox", name="visibility_m", exact=True)
         number.fill("30")
         number.press("Enter")
-        page.get_by_role("slider").nth(2).press("ArrowRight")  # scatter, at the folder's end
+        page.get_by_text("more of smog").click()
+        page.get_by_role("slider").nth(1).press("ArrowRight")  # overcast
         at_rest(page)
         page.get_by_role("tab", name="Save").click()
         page.get_by_role("button", name="Save picture").click()
@@ -103,6 +103,48 @@ def test_a_browser_shows_render_views_bytes_and_saves_what_render_repeats(browse
     text = (tmp_path / "views" / "my-weather.yaml").read_text()
     assert "visibility_m: 30" in text
     assert np.array_equal(rendered(tmp_path / "out", command), saved)
+
+
+def test_arrow_keys_move_the_slider_that_has_the_focus_and_else_the_camera(browser, tmp_path):
+    with served(Edits("dense-fog", SCALE, folder=tmp_path)) as (viewer, url):
+        page = opened(browser, url)
+        (own,) = viewer.pages
+        number = page.get_by_role("textbox", name="visibility_m", exact=True)
+        before = float(number.input_value())
+        # The slider is logarithmic; no box tells its place beside the value's.
+        boxes = [box.input_value() for box in page.locator("input:visible").all()]
+        assert boxes.count("on") == len(boxes) - 2  # ticks, the preset and the visibility
+        slider = page.get_by_role("slider").first
+        for _ in range(5):
+            slider.press("ArrowRight", delay=200)
+        at_rest(page)
+        assert before * 1.05 < float(number.input_value()) < before * 1.2
+        smog = own.recipe(own.wish.edits).weather.smog
+        assert smog is not None and smog.visibility_m == float(number.input_value())
+        page.get_by_role("tab", name="Weather").press("ArrowRight", delay=500)
+        page.wait_for_timeout(2000)
+        assert own.wish.pose is None  # neither has flown
+        page.mouse.click(300, 250)
+        page.keyboard.down("ArrowRight")
+        page.wait_for_function("() => document.body.innerText.includes('not of this view yet')")
+        page.keyboard.up("ArrowRight")
+        at_rest(page)
+        assert own.wish.pose is not None
+        page.close()
+
+
+def test_a_new_preset_is_not_at_rest_before_its_own_picture_is_there(browser, tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url):
+        page = opened(browser, url)
+        page.get_by_label("preset").first.click()
+        page.get_by_role("option", name="fresh-snow", exact=True).click()
+        page.wait_for_function("() => document.body.innerText.includes('placing snow, step')")
+        assert "at rest" not in page.locator("body").inner_text()
+        at_rest(page)
+        camera = viewer.scene.frames[0].cameras["front"]
+        recipe = Edits("fresh-snow", SCALE).recipe()
+        assert within(image_of(page), render_view(viewer.scene, camera, recipe).rgb)
+        page.close()
 
 
 def test_two_tabs_fly_apart_and_a_killed_one_leaves_the_other(browser, tmp_path):

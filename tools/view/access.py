@@ -120,13 +120,16 @@ def is_loopback(name: str) -> bool:
         return False
 
 
-def start_server(viser: Any, access: Access, host: str, port: int, **options: Any) -> Any:
+def start_server(
+    viser: Any, access: Access, host: str, port: int, *, script: str, **options: Any
+) -> Any:
     """Return a viser server that is open to those only whom `access` lets in, and shares nothing.
 
     Args:
         viser: The module.
         host: The address that pages are served at.
         port: Or the next that is free.
+        script: JavaScript of ours that the page runs first.
         options: More of `websockets.serve`, in place of viser's.
 
     Raises:
@@ -142,7 +145,7 @@ def start_server(viser: Any, access: Access, host: str, port: int, **options: An
         def disconnect_share_url(self) -> None:
             """Do nothing: nothing is shared."""
 
-    with _guarded_handshakes(access, options) as guards:
+    with _guarded_handshakes(access, script, options) as guards:
         server = PrivateServer(host=host, port=port, verbose=False)
     if not guards:
         server.stop()
@@ -154,7 +157,9 @@ def start_server(viser: Any, access: Access, host: str, port: int, **options: An
 
 
 @contextlib.contextmanager
-def _guarded_handshakes(access: Access, options: dict[str, Any]) -> Iterator[list[Any]]:
+def _guarded_handshakes(
+    access: Access, script: str, options: dict[str, Any]
+) -> Iterator[list[Any]]:
     """Have websockets servers that start within the block ask `access` first; viser has no option
     for it. The list that comes with the block has an item for each of them.
     """
@@ -172,9 +177,16 @@ def _guarded_handshakes(access: Access, options: dict[str, Any]) -> Iterator[lis
             if len(connection.server.connections) >= MAX_PAGES:
                 text = f"climategs view: {MAX_PAGES} pages are open, which is all there may be.\n"
                 return _text(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
+            if "Accept-Encoding" in request.headers:
+                del request.headers["Accept-Encoding"]  # a script is put into the page's text
             response = process_request(connection, request)
             if response is not None:
-                for name, value in access.page_headers(request.headers["Host"], port).items():
+                own = f"<script>{script}</script></body>".encode()
+                response.body = response.body.replace(b"</body>", own)
+                headers = access.page_headers(request.headers["Host"], port)
+                for name, value in {**headers, "Content-Length": str(len(response.body))}.items():
+                    if name in response.headers:
+                        del response.headers[name]
                     response.headers[name] = value
             return response
 

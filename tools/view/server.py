@@ -20,6 +20,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -35,18 +36,20 @@ from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
 from augment.scene import Scene
-from augment.timing import stopwatch
+from augment.timing import PassProgress, stopwatch, watched
 from augment.views import render_view
 from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
+from tools.view.browser import ARROWS_STAY_WITH_WIDGETS
 from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather, write_new
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
+    away_sentence,
     coarse,
     draw,
     in_window,
@@ -55,6 +58,7 @@ from tools.view.pictures import (
     recipe_to_show,
     split,
 )
+from tools.view.status import Activity, ShownPicture
 from tools.view.text import table
 
 if TYPE_CHECKING:
@@ -66,6 +70,7 @@ _LOG = logging.getLogger(__name__)
 EVERY_ADDRESS = ("0.0.0.0", "::", "")  # that a server may be told to listen at
 MAX_PIXELS = 2**25  # of a picture that is drawn for a page: as many as 8K video has
 JOIN_S = 10.0  # that the picture being drawn gets when the server ends
+TICK_S = 0.25  # from one look at what is being done to the next, for the lines that tell it
 
 
 def view_scene(options: ViewOptions) -> int:
@@ -159,8 +164,9 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     access = Access(is_local=is_loopback(str(address[0])))
     options = {"create_connection": PageConnection, "max_size": MAX_MESSAGE_BYTES}
+    script = ARROWS_STAY_WITH_WIDGETS
     with contextlib.redirect_stdout(io.StringIO()):  # it says what we say
-        server = start_server(viser, access, host, port, **options)
+        server = start_server(viser, access, host, port, script=script, **options)
     server.gui.configure_theme(show_logo=False, show_share_button=False)  # before a page is there
     loop = server.get_event_loop()
     loop.call_soon_threadsafe(loop.set_exception_handler, _note_exception)
@@ -219,16 +225,40 @@ class Viewer:
         self.pages: list[Page] = []
         self._is_ending = False
         self._known: set[tuple[str, ...]] = set()  # kernels that have run
+        self._activity: tuple[Page, Activity] | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+        self._end = threading.Event()
+        self._ticker = threading.Thread(target=self._tell, name="status", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
+        self._ticker.start()
 
     def stop(self) -> None:
+        self._end.set()
         with self.changed:
             self._is_ending = True
             self.changed.notify()
         self._thread.join(JOIN_S)
+        self._ticker.join(JOIN_S)
+
+    def activity_for(self, page: Page) -> Activity | None:
+        """What the thread does for a page, or is about to; None while it draws for another."""
+        current = self._activity
+        if current is None:
+            return Activity()
+        return current[1] if current[0] is page else None
+
+    def _note(self, progress: PassProgress) -> None:
+        """The thread has got to a pass, or to a step of one."""
+        if self._activity is not None:
+            self._activity[1].progress = progress
+
+    def _tell(self) -> None:
+        """Has pages that wait for a picture say what is being done."""
+        while not self._end.wait(TICK_S):
+            for page in tuple(self.pages):
+                page.update_status()
 
     def open_page(self, client: ClientHandle) -> Callable[[str], None]:
         page = Page(self, client)
@@ -254,6 +284,17 @@ class Viewer:
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        with _compiling_told(self._count_compiling):
+            self._serve_pages()
+
+    def _count_compiling(self, change: int) -> None:
+        """A kernel begins to be compiled (1), or is compiled (-1)."""
+        if self._activity is not None:
+            activity = self._activity[1]
+            activity.compiling = max(0, activity.compiling + change)
+            activity.compiled += change < 0
+
+    def _serve_pages(self) -> None:
         while True:
             with self.changed:
                 page, work = self._next()
@@ -265,10 +306,13 @@ class Viewer:
                 # The others come first next time.
                 self.pages.sort(key=lambda other: other is page)
             assert page is not None
+            self._activity = (page, Activity())
             try:
                 self._work(page, work)
             except Exception as error:
                 self.report(page, error)
+            finally:
+                self._activity = None
 
     def _next(self) -> tuple[Page | None, Any]:
         """The page that waits for longest and what to do for it; or None, and how long there is
@@ -312,7 +356,7 @@ class Viewer:
         except _Outdated:
             own.last = time.monotonic()  # a small picture comes first, however long the pass took
         except Exception:
-            page.show_status("not drawn")
+            page.show_failure(wish)
             raise
         finally:  # what failed is not tried again before something changes
             own.drawn = wished
@@ -333,25 +377,35 @@ class Viewer:
         factor = self._factor(page, wish, recipe, camera)
         if moving:
             factor *= page.progress.factor
-        elif page.progress.rested == 0 or self._is_new(recipe):
-            page.show_status("preparing")
         started = time.perf_counter()
         with self._kernels(recipe):
             shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
-        height, width = shown.rgb.shape[:2]
-        if wish.pose is None:
-            shown = in_window(shown, place_in_window(camera.resized(width, height), page.aspect))
-        took = time.perf_counter() - started
-        if page.is_closed:
-            return
-        page.show_picture(shown.rgb, shown.depth_m, moving=moving)
-        if moving:
-            page.progress.factor = _paced(page.progress.factor, took)
-        what = "while moving" if moving else "at rest"
-        page.show_status(f"{width} x {height} {what}, {1000 * took:.0f} ms")
-        page.show_error(refusal)
-        if not moving:
-            self._finish(page, wish, recipe, camera, seconds)
+            height, width = shown.rgb.shape[:2]
+            if wish.pose is None:
+                place = place_in_window(camera.resized(width, height), page.aspect)
+                shown = in_window(shown, place)
+            took = time.perf_counter() - started
+            if page.is_closed:
+                return
+            page.show_picture(shown.rgb, shown.depth_m, moving=moving)
+            if moving:
+                page.progress.factor = _paced(page.progress.factor, took)
+            picture = ShownPicture(
+                wish=wish,
+                width=width,
+                height=height,
+                seconds=took,
+                at=time.monotonic(),
+                is_rest=not moving,
+                is_complete=not wish.lidar,
+                is_valid=refusal is None,
+            )
+            page.show_progress(picture)
+            page.show_warning(away_sentence(self.scene, camera))
+            page.show_error(refusal)
+            if not moving:
+                self._finish(page, wish, recipe, camera, seconds)
+                page.show_progress(replace(picture, is_complete=True))
 
     def _picture(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
@@ -360,10 +414,19 @@ class Viewer:
 
         Raises:
             _Outdated: at rest, before a pass: the page is closed or wishes for something else.
+                Within a preparation: the page is closed, or an effect has been taken out.
         """
 
-        def check() -> None:
-            if page.is_closed or page.wish is not wish:
+        def tell(progress: PassProgress) -> None:
+            self._note(progress)
+            if page.is_closed:
+                raise _Outdated
+            if page.wish is wish:
+                return
+            if progress.total:  # most of what follows needs it, too: a depth that is dragged
+                if _lacks_effect_of(page, recipe):
+                    raise _Outdated
+            elif not moving:
                 raise _Outdated
 
         def drawn(recipe: Recipe) -> Shown:
@@ -371,17 +434,14 @@ class Viewer:
             asked = coarse(asked) if moving else asked
             return draw(self.scene, camera, asked, wish.shows, backend=self.backend)
 
-        if moving:
-            shown, seconds = drawn(recipe), {}
-        else:
-            with stopwatch(check) as seconds:
-                shown = drawn(recipe)
+        with watched(tell), contextlib.nullcontext({}) if moving else stopwatch() as seconds:
+            shown = drawn(recipe)
         if wish.is_split:
             clear = without_weather(recipe)
             size = shown.rgb.shape
             key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
             if page.before is None or page.before[0] != key:
-                with contextlib.nullcontext() if moving else stopwatch(check):
+                with watched(tell):
                     page.before = (key, drawn(clear).rgb)
             shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
         return shown, seconds
@@ -408,6 +468,7 @@ class Viewer:
         """What follows the picture at rest."""
         points = None
         if wish.lidar:
+            self._note(PassProgress("LiDAR returns"))
             points = lidar_points(self.scene, page.frame_of(wish), recipe)
         own = wish.frustums and (wish.camera if wish.pose is None else "flight")
         key = (wish.frame, wish.boxes, own, wish.lidar and recipe)
@@ -421,12 +482,14 @@ class Viewer:
 
     @contextlib.contextmanager
     def _kernels(self, recipe: Recipe) -> Iterator[None]:
-        """Has the kernels of effects that are new compiled on all cores."""
+        """Has the kernels of effects that are new compiled on all cores, to the end of the list."""
         if not self._is_new(recipe):
             yield
             return
         with compiling_noted(kernel_modules([recipe], self.backend)):
             yield
+            self._count_compiling(1)  # processes beside this one may compile on
+        self._count_compiling(-1)
         self._known.add(tuple(recipe.sections()))
 
     def _is_new(self, recipe: Recipe) -> bool:
@@ -543,8 +606,35 @@ def check_size(width: float, height: float) -> None:
         )
 
 
+@contextlib.contextmanager
+def _compiling_told(tell: Callable[[int], None]) -> Iterator[None]:
+    """Has a function told when numba begins (1) and ends (-1) to compile a kernel; not of those
+    that lie in its cache.
+    """
+    from numba.core.event import Event, Listener, install_listener
+
+    class Counter(Listener):
+        def on_start(self, event: Event) -> None:
+            tell(1)
+
+        def on_end(self, event: Event) -> None:
+            tell(-1)
+
+    with install_listener("numba:compile", Counter()):
+        yield
+
+
 class _Outdated(Exception):
     """Nobody waits for the picture any more."""
+
+
+def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
+    """Whether the page asks for a recipe without an effect that another one has."""
+    try:
+        asked = page.recipe(page.wish.edits)
+    except RecipeError:
+        return False
+    return not recipe.sections().keys() <= asked.sections().keys()
 
 
 def _paced(factor: float, seconds: float) -> float:

@@ -58,6 +58,7 @@ from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
+from augment.timing import counted
 
 # ---- Which squares of the world a support covers, how fine each is, and where its cells are kept -
 
@@ -67,6 +68,7 @@ RINGS_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 COARSEST_M = 1.0  # cells double up to about this size; a coarser cell_m does not double at all
 BYTES_PER_CELL = 70  # of a support
 MAX_BYTES = 4 << 30
+PLACING = "placing snow"  # what bars and watchers are told
 _SIDE_M = 3.2  # of a tile, about
 _PATH_STEP_M = 1.0  # camera centres closer than this are one place of the path
 _PATH_GAP_M = 25.0  # those farther apart are not joined
@@ -806,15 +808,23 @@ def place_snow_support(
         return SnowSupport(_no_cells(), {})
     parked = tuple(_parked(scene))
     steps = len(views) + len(squares) + len(vehicles)
-    with ProgressBar(total=steps, desc="placing snow", disable=not progress, unit="step") as bar:
+    with (
+        ProgressBar(total=steps, desc=PLACING, disable=not progress, unit="step") as bar,
+        counted(PLACING, steps) as advance,
+    ):
+
+        def after_each() -> None:
+            bar.update()
+            advance()
+
         parts = [PosedGaussians(background), *parked]
-        seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
+        seen_from = draw_views(views, parts, backend=backend, after_each=after_each)
         paths = wheel_paths(scene, with_invented=settings.invented_tracks)
         work = _Ground(
             *(background, parked, plan, views, seen_from, paths, settings),
             *(shadows_of(scene), backend),
         )
-        in_turn = functools.partial(in_order, after_each=bar.update, backend=backend)
+        in_turn = functools.partial(in_order, after_each=after_each, backend=backend)
         found = in_turn(work.find, squares)
         find = functools.partial(
             find_actor_cells,
