@@ -601,8 +601,8 @@ def check_size(width: float, height: float) -> None:
     if width * height > MAX_PIXELS:
         raise ClimateGSError(
             f"the picture has {width:.0f} x {height:.0f} pixels; a page has at most "
-            f"{MAX_PIXELS / 1e6:.0f} million drawn: lower render.scale, or look through a smaller "
-            f"angle"
+            f"{MAX_PIXELS / 1e6:.0f} million drawn: lower render.scale, look through a smaller "
+            f"angle, or save the recipe and use `climategs render`"
         )
 
 
