@@ -45,8 +45,8 @@ MAIN_FIELDS = {
 # Words beside a section's name, where the name alone does not tell a driver what it is.
 PLAIN_WORDS = {
     "weather.smog": "fog, haze",
-    "weather.snow": "on the ground",
-    "weather.snowfall": "in the air",
+    "weather.snow": "lying",
+    "weather.snowfall": "flakes",
     "style": "light",
 }
 
