@@ -18,12 +18,20 @@ import json
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    ValidationError,
+)
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parsed_json
@@ -40,6 +48,7 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MAX_JSON = 256 << 20  # bytes of text, with buffers in it
 _MAX_VALUES = 2_000_000  # in the JSON, buffers left out
 _MAX_NODES = 100_000
+_MAX_ATTRIBUTES = 1000  # of a primitive
 _MAX_PLACED = 10_000  # primitives in the scene, copies among them
 _KNOWN = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _COLOURS = (None, "srgb_rec709_display", "BT.709-sRGB", "BT.709")  # the drafts' names are the rest
@@ -89,22 +98,30 @@ class _PrimitiveExtensions(_Entry):
     KHR_gaussian_splatting: _Splatting | None = None
 
 
+def _of_few_keys(value: object) -> object:
+    if isinstance(value, dict) and len(value) > _MAX_ATTRIBUTES:
+        raise ValueError(f"it has {len(value)} attributes; at most {_MAX_ATTRIBUTES} are read")
+    return value
+
+
 class _Primitive(_Entry):
-    attributes: dict[str, NonNegativeInt] = {}
+    attributes: Annotated[dict[str, NonNegativeInt], BeforeValidator(_of_few_keys)] = {}
     mode: int = 4
     extensions: _PrimitiveExtensions = _PrimitiveExtensions()
 
 
 class _Mesh(_Entry):
-    primitives: tuple[_Primitive, ...]
+    primitives: Annotated[tuple[_Primitive, ...], Field(fail_fast=True)]
 
 
-_Numbers = tuple[FiniteFloat, ...]
+# A list with a wrong item is not looked at to its end: of millions of errors each costs a kilobyte.
+_Numbers = Annotated[tuple[FiniteFloat, ...], Field(fail_fast=True)]
+_Indices = Annotated[tuple[NonNegativeInt, ...], Field(fail_fast=True)]
 
 
 class _Node(_Entry):
     mesh: NonNegativeInt | None = None
-    children: tuple[NonNegativeInt, ...] = ()
+    children: _Indices = ()
     matrix: _Numbers | None = Field(None, min_length=16, max_length=16)
     translation: _Numbers = Field((0, 0, 0), min_length=3, max_length=3)
     rotation: _Numbers = Field((0, 0, 0, 1), min_length=4, max_length=4)
@@ -126,18 +143,18 @@ class _Node(_Entry):
 
 
 class _Scene(_Entry):
-    nodes: tuple[NonNegativeInt, ...] = ()
+    nodes: _Indices = ()
 
 
 class _Document(_Entry):
     asset: dict[str, Any]
-    extensionsRequired: tuple[str, ...] = ()
-    buffers: tuple[_Buffer, ...] = ()
-    bufferViews: tuple[_View, ...] = ()
-    accessors: tuple[_Accessor, ...] = ()
-    meshes: tuple[_Mesh, ...] = ()
-    nodes: tuple[_Node, ...] = ()
-    scenes: tuple[_Scene, ...] = ()
+    extensionsRequired: Annotated[tuple[str, ...], Field(fail_fast=True)] = ()
+    buffers: Annotated[tuple[_Buffer, ...], Field(fail_fast=True)] = ()
+    bufferViews: Annotated[tuple[_View, ...], Field(fail_fast=True)] = ()
+    accessors: Annotated[tuple[_Accessor, ...], Field(fail_fast=True)] = ()
+    meshes: Annotated[tuple[_Mesh, ...], Field(fail_fast=True)] = ()
+    nodes: Annotated[tuple[_Node, ...], Field(fail_fast=True)] = ()
+    scenes: Annotated[tuple[_Scene, ...], Field(fail_fast=True)] = ()
     scene: NonNegativeInt = 0
 
 

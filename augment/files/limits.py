@@ -68,6 +68,13 @@ def read_json(path: Path, most: int) -> dict[str, Any]:
     return parsed_json(text, str(path))
 
 
+def check_values(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> None:
+    """Refuse a JSON text with more commas and opening brackets than so many."""
+    values = sum(text.count(mark) for mark in (b",", b"[", b"{"))
+    if values > max_values:
+        raise SceneError(f"{where}: its JSON holds {values} values; at most {max_values} are read")
+
+
 def parsed_json(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dict[str, Any]:
     """The object of a JSON text.
 

@@ -360,13 +360,16 @@ class SplatFile:
     problems: tuple[str, ...] = ()
 
 
-def read_splats(path: str | Path, *, activated: bool | None = None) -> SplatFile:
-    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, or the
-    meta.json of a SOG folder.
+def read_splats(
+    path: str | Path, *, activated: bool | None = None, level: int | None = None
+) -> SplatFile:
+    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, the
+    meta.json of a SOG folder, or the lod-meta.json of a streamed one.
 
     Args:
         path: the file.
         activated: of a .ply alone, as of `read_ply`.
+        level: of a lod-meta.json alone, the level of detail; 0, the finest, by default.
 
     Raises:
         SceneError: no such file, an unknown format, damaged content, or Gaussians that need more
@@ -374,21 +377,26 @@ def read_splats(path: str | Path, *, activated: bool | None = None) -> SplatFile
     """
     path = Path(path)
     try:
-        return _reader_of(path, activated)(path)
+        return _reader_of(path, activated, level)(path)
     except MemoryError as error:
         raise SceneError(f"{path}: its Gaussians need more memory than there is: {error}") from None
 
 
-def _reader_of(path: Path, activated: bool | None) -> Callable[[Path], SplatFile]:
+def _reader_of(
+    path: Path, activated: bool | None, level: int | None
+) -> Callable[[Path], SplatFile]:
     from augment.files.gltf import GLB, read_gltf  # which take this module's records
     from augment.files.sog import META, ZIP, read_sog
     from augment.files.spz import GZIP, read_spz, refuse_bare_spz
+    from augment.files.streamed_sog import LOD_META, read_streamed_sog
     from augment.files.usd import read_usd
 
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz, .sog, .glb or .usd")
     with path.open("rb") as file:
         start = file.read(8)
+    if level is not None and path.name != LOD_META:
+        raise SceneError(f"{path} has no levels of detail, as a {LOD_META} has; leave lod out")
     if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r"):
         return partial(read_ply, activated=activated)
     if activated is not None:
@@ -396,6 +404,8 @@ def _reader_of(path: Path, activated: bool | None) -> Callable[[Path], SplatFile
             f"{path}: only a .ply may store values before or after their activation; leave "
             f"activated out"
         )
+    if path.name == LOD_META:
+        return partial(read_streamed_sog, level=level or 0)
     if start[:2] == GZIP:
         return read_spz
     if path.suffix.lower() in _USD_SUFFIXES:  # before ZIP, which a .usdz is too

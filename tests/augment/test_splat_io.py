@@ -193,7 +193,7 @@ def test_values_that_look_activated_are_asked_about(tmp_path: Path) -> None:
     write_ply(path, taken)  # logits and logarithms, as trainers store them
     torch.testing.assert_close(read_splats(path).gaussians.scales, taken.scales)
     write_splat(tmp_path / "a.splat", taken)
-    with pytest.raises(SceneError, match="only a .ply"):
+    with pytest.raises(SceneError, match=r"only a .ply"):
         read_splats(tmp_path / "a.splat", activated=True)
 
 
