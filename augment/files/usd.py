@@ -27,7 +27,7 @@ import torch
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parsed_json
 from augment.files.ply import SplatFile, join_placed
-from augment.files.usd_stage import ATTRIBUTES
+from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
 from augment.jobs.atomic import make_folder, refusals_of, replaced_file
 from augment.scene import SH_COUNTS, Gaussians
 
@@ -148,18 +148,22 @@ def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
 def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
     """The Gaussians of a prim in its axes, at 0; columns that it lacks have the default."""
     count, each = len(columns["positions"]), (degree + 1) ** 2
+    kept = min(each, SH_COUNTS[-1])
 
     def values(name: str, rows: int) -> np.ndarray:
         if name in columns:
             return columns[name]
         return np.tile(np.array(ATTRIBUTES[name], np.float32), (rows, 1))
 
-    sh = values("radiance:sphericalHarmonicsCoefficients", count * each)
+    if COEFFICIENTS in columns:
+        sh = columns[COEFFICIENTS].reshape(count, each, 3)[:, :kept]
+    else:
+        sh = values(COEFFICIENTS, count * kept).reshape(count, kept, 3)
     ready = {
         "quats": values("orientations", count)[:, [3, 0, 1, 2]],
         "scales": values("scales", count),
         "opacities": values("opacities", count).reshape(count),
-        "sh": sh.reshape(count, each, 3)[:, : SH_COUNTS[-1]],
+        "sh": sh,
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in ready.items()}
     return Gaussians(means=torch.zeros(count, 3), **tensors)

@@ -26,12 +26,14 @@ import numpy as np
 LEAST_ROW = 6  # bytes of a place, in halves
 MAX_COPIES = 16  # of all Gaussians that the file has room for
 MAX_DEGREE = 16  # of spherical harmonics; those beyond the third are cut off
+MAX_PRIMS = 10_000  # with Gaussians, copies among them
+COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 # The attributes of a prim beside its positions: numbers a value, and the schema's default.
 ATTRIBUTES: dict[str, list[float]] = {
     "orientations": [0.0, 0.0, 0.0, 1.0],
     "scales": [1.0, 1.0, 1.0],
     "opacities": [1.0],
-    "radiance:sphericalHarmonicsCoefficients": [0.0, 0.0, 0.0],
+    COEFFICIENTS: [0.0, 0.0, 0.0],
 }
 
 
@@ -116,6 +118,8 @@ def read_stage(path: Path, arrays: list[np.ndarray]) -> dict[str, Any]:
                 f"it places more than {MAX_COPIES} times the Gaussians that it has room for; place "
                 "fewer copies"
             )
+        if len(prims) == MAX_PRIMS:
+            raise Refusal(f"it places more than {MAX_PRIMS} prims of Gaussians; join them")
         prims.append(facts_of(prim, matrix, positions, arrays, time))
     return {"notes": notes, "problems": problems, "prims": prims}
 
@@ -133,7 +137,7 @@ def facts_of(
         )
     columns = {"positions": positions}
     for name, default in ATTRIBUTES.items():
-        rows = count * (degree + 1) ** 2 if name.endswith("Coefficients") else count
+        rows = count * (degree + 1) ** 2 if name == COEFFICIENTS else count
         values = column(prim, name, len(default), time)
         if values is None or len(values) < rows:
             held = 0 if values is None else len(values)
