@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int32
-from tqdm import tqdm
 
 from augment.base_photo import RECORDED
 from augment.cameras import Camera
 from augment.lod import keeps_levels
 from augment.memo import memo_of
+from augment.progress import ProgressBar
 from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
 from augment.render.threads import divided_threads, views_at_once
@@ -166,7 +166,7 @@ def _find_errors(scene: Scene, found: _Found, rounds: int, progress: bool) -> No
     steps, told = (rounds - found.rounds) * len(cameras), "finding splats to leave out"
     count = min(views_at_once(len(opaque)), len(cameras))
     pool = divided_threads(count) if count > 1 else None
-    with tqdm(desc=told, total=steps, unit="view", disable=not progress) as bar:
+    with ProgressBar(desc=told, total=steps, unit="view", disable=not progress) as bar:
 
         def look(camera: Camera) -> Changes:
             if not hasattr(spaces, "scratch"):
