@@ -228,7 +228,7 @@ REFUSED = {
     "no table": (write(str(LENSES), b"ARROW1 no"), r"intrinsics\.feather is not a whole Feather"),
     "zeros without an end": (
         write(str(SENSORS), feather_of_zeros(9_000_000)),
-        r"sensor\.feather is not a whole Feather table \(it has more than 8388608 rows",
+        r"sensor\.feather is not a whole Feather table \(it states more than 8388608 rows",
     ),
     "lists in place of texts": (
         table(SENSORS, sensor_name=lambda v: [[name] for name in v]),
