@@ -235,7 +235,11 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
 
 def _is_nuscenes(folder: Path) -> bool:
     versions = (name for name in _names(folder) if name.startswith("v1.0-"))
-    return any((folder / name / "scene.json").is_file() for name in versions)
+    if any((folder / name / "scene.json").is_file() for name in versions):
+        return True
+    from adapters.nuscenes.tables import table_folders  # under any other name
+
+    return (folder / "samples").is_dir() and bool(table_folders(folder))
 
 
 def _is_kitti(folder: Path) -> bool:

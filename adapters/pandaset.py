@@ -238,7 +238,7 @@ def _read_times(path: Path, expected: int) -> np.ndarray:
         frame = int(np.argmin(np.diff(times) > 0)) + 1
         raise AdapterError(
             f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
-            f"{times[frame - 1]} s. Copy it again"
+            f"{times[frame - 1]} s. Correct the times in the file"
         )
     return np.round(times * 1e9).astype(np.int64)
 
@@ -255,7 +255,7 @@ def _read_poses(path: Path) -> np.ndarray:
         frame = int(np.argmax(off))
         raise AdapterError(
             f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
-            f"{headings[frame].tolist()}. Copy the file again"
+            f"{headings[frame].tolist()}. Divide it by its length"
         )
     positions = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
     return rigid(rotmat_from_quat(torch.from_numpy(headings)), torch.from_numpy(positions)).numpy()

@@ -51,7 +51,7 @@ _CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0
 _LATEST_S = 9e9  # nanoseconds in int64 reach 9.2e18
 _NEAR_S = 0.25  # an image is taken this close to its frame's time
 _SPIN_NS = 100_000_000  # one turn of the TOP laser, from the frame's time on
-_ADVICE = "copy it again from the dataset"
+_ADVICE = "write it as the dataset does, or copy the dataset's own file"
 
 
 # ---- Which files ---------------------------------------------------------------------------------

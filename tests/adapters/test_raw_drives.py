@@ -27,6 +27,7 @@ from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
+from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
 from adapters.procedural import StreetLabels
 from adapters.raw_drive import Picture, usable_images
 from adapters.recording.adapter import RecordingLabels
@@ -45,6 +46,7 @@ from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError
 from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
+from recipes.load import load_recipe
 
 QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
 RAW: dict[str, tuple[Callable[[Path], Path], dict[str, str]]] = {
@@ -86,6 +88,26 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: 
     np.testing.assert_array_equal(labels.boxes(number).centers_m, scene.boxes(number).centers_m)
     assert len(scene.boxes(number)) >= 2
     np.testing.assert_array_equal(labels.lidar(0).points_m, scene.lidar(0).points_m)
+
+
+MARK = b"\xef\xbb\xbf"  # with which some editors begin UTF-8
+
+
+def test_texts_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    text, table, tree = tmp_path / "a.txt", tmp_path / "a.json", tmp_path / "a.yaml"
+    text.write_bytes(MARK + b"1 2")
+    table.write_bytes(MARK + b'{"a": 1}')
+    tree.write_bytes(MARK + b"a: 1")
+    assert read_numbers(text).tolist() == [1, 2]
+    assert read_json(table) == read_yaml(tree) == {"a": 1}
+    tree.write_bytes(MARK + b"name: fog\nweather: {smog: {visibility_m: 100}}\n")
+    assert load_recipe(str(tree)).name == "fog"
+
+
+def test_values_of_another_type_are_said_to_be_corrected_not_copied(tmp_path: Path) -> None:
+    with pytest.raises(AdapterError, match=r"x: must be a valid number.* Correct the value") as e:
+        validated(Number, "a", "x")
+    assert "opy" not in str(e.value)
 
 
 CODES = np.array(
