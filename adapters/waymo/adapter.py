@@ -666,7 +666,8 @@ def read_sweeps(
     _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
     missing, faults, step = [], {}, 0
-    rows = _index(segment, "lidar", "key.laser_name", LASERS)
+    has_returns = segment.files.has("lidar")
+    rows = _index(segment, "lidar", "key.laser_name", LASERS) if has_returns else {}
     in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
     waiting: deque[tuple[int, Future[Sweep | None]]] = deque()
 

@@ -347,12 +347,7 @@ class Segment:
 
 
 def read_segment(files: SegmentFiles) -> Segment:
-    """All but images, range images and labels."""
-    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
-        raise AdapterError(
-            f"segment {files.name} lacks {', '.join(str(files.path(name)) for name in missing)}; a "
-            f"scene needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
-        )
+    """All but images, range images and labels; what its components say that are there."""
     rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
     stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
     order = np.argsort(stamps, kind="stable")
@@ -364,9 +359,16 @@ def read_segment(files: SegmentFiles) -> Segment:
     if (np.diff(stamps) <= 0).any():
         twice = stamps[1:][np.diff(stamps) <= 0][0]
         raise rows.fault(STAMP, f"must name each frame once; {twice} stands twice")
-    cameras, lasers = _read_cameras(files), _read_lasers(files)
+    cameras = _read_cameras(files) if files.has("camera_calibration") else {}
+    lasers = _read_lasers(files) if files.has("lidar_calibration") else {}
     segment = Segment(files, stamps, poses, stamps * 1000 + _SPIN_NS // 2, cameras, lasers, {}, ())
-    shots, problems = _read_shots(segment)
+    shots, problems = _read_shots(segment) if cameras and files.has("camera_image") else ({}, ())
+    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
+        lacks = (
+            f"the segment lacks {', '.join(str(files.path(name)) for name in missing)}; a scene "
+            f"needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
+        )
+        problems = (lacks, *problems)
     times = [
         own["FRONT"].pose_ns if "FRONT" in (own := shots.get(n, {})) else int(usual)
         for n, usual in enumerate(segment.pose_times_ns)
@@ -472,6 +474,8 @@ def extract_images(
     """Paths of the frames' images without lens distortion, by frame and camera, and a sentence for
     what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`): those
     of the frames in `now` at once, the others from when they are read on."""
+    if not segment.shots:
+        return {n: {} for n in numbers}, ()
     files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
     folder = image_folder(segment.files.name, files)
     shots = {

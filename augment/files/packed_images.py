@@ -35,7 +35,7 @@ from recipes.files import open_file
 PACKED = "packed.json"
 _MAX_PACKED = 1 << 26  # bytes of it
 _DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError)
-_ADVICE = "copy it again from the dataset"
+_ADVICE = "write it as the dataset does, or copy the dataset's own file"
 _AT_ONCE = 16  # images: some 6 MB of JPEGs, decoded 0.1 GB
 _JPEG_QUALITY = 95
 _THREADS = 4  # decoders and encoders release the interpreter

@@ -172,7 +172,7 @@ def test_colmap_models_that_are_cut_short_are_named_by_table_and_entry(
     cameras = "1 PINHOLE 640 480 500 510 321 242\n2 OPENCV 640 480 400 401 320 240 0.1 0 0 0\n"
     names = [f"{number}.jpg" for number in range(6)]
     model = pycolmap.Reconstruction(str(write_colmap(tmp_path / "source", cameras, names)))
-    for number in range(9):
+    for _ in range(9):
         model.add_point3D(np.ones(3), pycolmap.Track([]), np.zeros(3, np.uint8))
     whole = tmp_path / "whole"
     whole.mkdir()
