@@ -476,6 +476,27 @@ class RawDrive:
     colour_every: int = 1
     has_metric_scale: bool = True
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            AdapterError: the car's path is wider than maps of it can be."""
+        path = self.path
+        width_m = np.ptp(path, axis=0)[:2]
+        if np.prod(width_m + 2 * _MAX_RANGE_M) > _MAX_AREA_M2:
+            steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            number = int(steps.argmax())
+            raise AdapterError(
+                f"{self.source}: the car's path is {width_m[0]:.3g} x {width_m[1]:.3g} m wide, "
+                f"more than a scene can be; it goes furthest, {steps[number]:.3g} m, between "
+                f"frames {self.frames[number].index} and {self.frames[number + 1].index}. Poses "
+                f"must be metres; of a longer drive choose some frames (frames=)"
+            )
+
+    @property
+    def path(self) -> np.ndarray:
+        """The car's places in the frames, float64 [F, 3]."""
+        return np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames])
+
     @property
     def used(self) -> tuple[Frame, ...]:
         """The frames that the scene is built from."""
@@ -504,7 +525,7 @@ def scene_of_drive(
 
     Raises:
         IncompleteDrive: there is no return or no image to build from.
-        AdapterError: no image shows a return, or the drive is too wide."""
+        AdapterError: no image shows a return."""
     # Labels are read without the kernels that scenes are built by.
     from adapters.lidar_scene.scene import build_lidar_scene
 
@@ -531,21 +552,8 @@ def scene_of_drive(
 
 def _checked(drive: RawDrive) -> RawDrive:
     """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
-    seems to be in another frame.
-
-    Raises:
-        AdapterError: its path is wider than maps of it can be."""
-    path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])
-    low, high = path.min(axis=0), path.max(axis=0)
-    if np.prod((high - low)[:2] + 2 * _MAX_RANGE_M) > _MAX_AREA_M2:
-        steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        number = int(steps.argmax())
-        raise AdapterError(
-            f"{drive.source}: the car's path is {' x '.join(f'{v:.3g}' for v in (high - low)[:2])} "
-            f"m wide, more than a scene can be; it goes furthest, {steps[number]:.3g} m, between "
-            f"frames {drive.frames[number].index} and {drive.frames[number + 1].index}. Poses must "
-            f"be metres; of a longer drive choose some frames (frames=)"
-        )
+    seems to be in another frame."""
+    low, high = drive.path.min(axis=0), drive.path.max(axis=0)
     near = [
         ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
         for sweep in drive.sweeps

@@ -18,7 +18,7 @@ from shown import psnr_of
 from waymo_files import DRIVER, ORIGIN, PARKED, Form, Rig, Street, car_pose, changed
 
 from adapters.base import open_scene, recognise
-from adapters.raw_drive import RawDrive
+from adapters.raw_drive import IncompleteDrive, RawDrive
 from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import reflectances
@@ -444,8 +444,8 @@ def test_contradictions_are_refused_by_file_and_column(copy: Path) -> None:
         path = files.table_path(copy, tag)
         content = path.read_bytes()
         path.unlink()
-        with pytest.raises(AdapterError, match=rf"lacks .*{tag}.*download them too"):
-            read(copy)
+        with pytest.raises(IncompleteDrive, match=rf"lacks .*{tag}.*download them too"):
+            open_scene(f"waymo:{copy}")
         path.write_bytes(content[:-100])
         with pytest.raises(AdapterError, match=rf"{tag}.*cannot be read as Parquet"):
             read(copy)
