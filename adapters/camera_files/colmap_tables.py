@@ -7,6 +7,7 @@ number of its entries; a text that COLMAP wrote says it in a comment.
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from collections.abc import Callable
@@ -43,11 +44,12 @@ def check_colmap_tables(model: Path) -> None:
             continue
         try:
             with open_file(path) as file:
-                data = file.read(_MAX_BYTES + 1)
+                size = os.fstat(file.fileno()).st_size
+                if size > _MAX_BYTES:
+                    raise AdapterError(f"{path} is larger than {_MAX_BYTES} bytes; no model is")
+                data = file.read()
         except OSError as error:
             raise AdapterError(f"{path} cannot be read ({error.strerror or error})") from None
-        if len(data) > _MAX_BYTES:
-            raise AdapterError(f"{path} is larger than {_MAX_BYTES} bytes; no model is")
         if suffix == ".bin":
             _check_binary(data, path, entry_end, word)
         else:
