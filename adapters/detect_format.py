@@ -236,7 +236,11 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
 
 def _is_nuscenes(folder: Path) -> bool:
     versions = (name for name in _names(folder) if name.startswith("v1.0-"))
-    return any((folder / name / "scene.json").is_file() for name in versions)
+    if any((folder / name / "scene.json").is_file() for name in versions):
+        return True
+    from adapters.nuscenes.tables import table_folders  # under any other name
+
+    return (folder / "samples").is_dir() and bool(table_folders(folder))
 
 
 def _is_kitti(folder: Path) -> bool:
@@ -250,10 +254,10 @@ def _is_kitti(folder: Path) -> bool:
 
 
 def _is_waymo(folder: Path) -> bool:
-    tables = ("vehicle_pose", "lidar_calibration")
     splits = (folder, *(folder / name for name in WAYMO_SPLITS))
-    return any(all((split / name).is_dir() for name in tables) for split in splits) or all(
-        (folder / f"{name}.parquet").is_file() for name in tables
+    poses = "vehicle_pose"
+    return (folder / f"{poses}.parquet").is_file() or any(
+        (split / poses).is_dir() and any((split / poses).glob("*.parquet")) for split in splits
     )
 
 
@@ -309,11 +313,7 @@ FOLDERS = (
         "a PandaSet sequence (camera/ and lidar/)",
     ),
     Signature("nuscenes", _is_nuscenes, "a nuScenes dataset (v1.0-*/scene.json)"),
-    Signature(
-        "waymo",
-        _is_waymo,
-        "Waymo Open Dataset v2 tables (vehicle_pose/ and lidar_calibration/, of Parquet files)",
-    ),
+    Signature("waymo", _is_waymo, "Waymo Open Dataset v2 tables (vehicle_pose/, of Parquet files)"),
     Signature(
         "street_gaussians",
         _is_street_gaussians,
