@@ -39,12 +39,13 @@ from llvmlite.binding import get_host_cpu_name
 
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri
-from augment.errors import AdapterError, ClimateGSError, SceneError
+from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
 from augment.files.recorded_images import has_image
 from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
-from augment.jobs.atomic import remove_temporaries
+from augment.jobs.atomic import open_lock, remove_temporaries, wait_for_lock
 from augment.labels import LabelSource
 from augment.scene import Scene, is_drawable
+from recipes.files import open_file
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ DEFAULT_LIMIT_GB = 10.0  # some 150 scenes
 _MAX_FILES = 1_000_000  # of a dataset's folder: some seconds to look at; or links lead in circles
 _IMAGES = "images"
 _IN_USE_S = 86_400.0
+MAX_BUILDING_S = 1800.0  # how long to wait for another process that builds the same scene
 _CODE = ("adapters", "augment", "recipes")
 _LIBRARIES = (
     "climategs", "numpy", "scipy", "numba", "torch", "opencv-contrib-python-headless",
@@ -294,25 +296,29 @@ def _alone(folder: Path, key: str) -> Iterator[bool]:
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            lock = stack.enter_context(path.open("wb"))
-        except OSError as error:
+            lock = open_lock(path)
+        except (OSError, OutputError) as error:
             _complain(folder, error)
             yield False
             return
-        stack.callback(path.unlink, missing_ok=True)
-        with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                logger.info("another process is building this scene; waiting for it")
-                fcntl.flock(lock, fcntl.LOCK_EX)
+        stack.callback(os.close, lock)
+        try:
+            wait_for_lock(path, lock, patience_s=MAX_BUILDING_S, doing="builds this scene")
+        except OutputError as error:
+            logger.warning("%s. The scene is built without the cache", error)
+            yield False
+            return
+        except OSError:  # a system without locks
+            pass
+        else:
             # Not left to closing the file, which a process started meanwhile may have open too.
             stack.callback(fcntl.flock, lock, fcntl.LOCK_UN)
+        stack.callback(path.unlink, missing_ok=True)
         yield True
 
 
 def _digest_of(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:32]
 
 

@@ -448,7 +448,8 @@ class BlockWorker:
         recipe, backend = block.recipe, self._setup.backend
         if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
-            with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
+            lock = folder / f"beds-{folder_name(block.scene)}.lock"
+            with file_lock(lock, "finds where snow can lie"):
                 job = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
                 effects.share_effects(job, only_files=True)
 

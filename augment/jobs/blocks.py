@@ -21,6 +21,7 @@ from pydantic import Field, TypeAdapter
 import augment
 from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
+from augment.jobs.atomic import read_file
 from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, reading_back, variant_name
@@ -452,7 +453,7 @@ def _staged(store: Store) -> dict[str, int]:
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
         with contextlib.suppress(OSError, OutputError):  # published meanwhile
             progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
-            finished = sum(j.read_bytes().count(b'"status":"ok"') for j in progress_logs)
+            finished = sum(read_file(j).count(b'"status":"ok"') for j in progress_logs)
             if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished

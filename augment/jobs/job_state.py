@@ -26,6 +26,7 @@ from augment.jobs.atomic import (
     flush_folder,
     make_folder,
     output_error,
+    read_file,
     refusals_of,
     remove_temporaries,
     write_atomic,
@@ -82,9 +83,14 @@ class ProgressLog:
     def load(self) -> tuple[Identity | None, list[dict[str, Any]]]:
         """The identity and rows in it; (None, []) where there is none."""
         try:
-            lines = self.path.read_bytes().split(b"\n")[:-1]  # the last part has no line break
+            lines = read_file(self.path).split(b"\n")[:-1]  # the last part has no line break
         except FileNotFoundError:
             return None, []
+        except OSError as error:
+            raise OutputError(
+                f"{self.path} cannot be read: {error.strerror}. Delete it; what it lists is "
+                f"rendered again"
+            ) from error
         with reading_back(str(self.path), "Delete it; what it lists is rendered again"):
             identity, *rows = [json.loads(line) for line in lines]
             return Identity(**identity), rows
@@ -92,10 +98,10 @@ class ProgressLog:
     def begin(self, identity: Identity) -> None:
         """Open for appending; starts with the identity, or goes on after the last whole line."""
         with refusals_of(self.path):
-            whole = self.path.read_bytes() if self.path.exists() else b""
+            whole = read_file(self.path) if self.path.exists() else b""
             whole = whole[: whole.rfind(b"\n") + 1]
             write_atomic(self.path, whole or _line(asdict(identity)))
-            self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+            self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
 
     def append(self, row: dict[str, Any]) -> None:
         """Add a finished image. Returns when the line is on the disk."""

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from augment import effects
 from augment.errors import OutputError
+from augment.jobs.atomic import path_below
 from augment.jobs.box_tables import BOXES_2D, MASKS
 from recipes.schema import Recipe
 
@@ -158,15 +159,3 @@ def resolve_inside(root: Path, relative: str) -> Path:
             f"trust the folder"
         )
     return path_below(root, parts)
-
-
-def path_below(root: Path, parts: tuple[str, ...]) -> Path:
-    """The path of these components, which no link leads out of the root."""
-    path = root.joinpath(*parts)
-    real_root = root.resolve()
-    if not path.resolve().is_relative_to(real_root):
-        raise OutputError(
-            f"{path} leads through a link to {path.resolve()}, outside {real_root}; "
-            f"put the files themselves under the output folder"
-        )
-    return path

@@ -21,7 +21,7 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from augment.errors import OutputError
-from augment.jobs.atomic import write_atomic
+from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, share_columns, variant_name
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
@@ -134,7 +134,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
             f"manifest when it ends; run it again to let it finish"
         )
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except OSError as error:
         raise OutputError(f"{path} cannot be read: {error.strerror}") from error
     return parse_manifest(data, str(path))
@@ -261,7 +261,7 @@ def write_manifest(out_dir: Path, table: pa.Table) -> Path:
     """Replace the manifest in one step; untouched where it already says the same."""
     path = Path(out_dir) / MANIFEST
     data = manifest_bytes(table)
-    if not (path.is_file() and path.read_bytes() == data):
+    if not (path.is_file() and read_file(path) == data):
         write_atomic(path, data)
     return path
 

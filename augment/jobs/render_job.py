@@ -25,7 +25,7 @@ from augment.base_photo import check_photos
 from augment.cameras import Frame
 from augment.effects import Sharing, share_effects
 from augment.errors import ClimateGSError, OutputError
-from augment.jobs.atomic import write_atomic
+from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
@@ -113,7 +113,7 @@ def copy_files(recipe: Recipe, folder: Path) -> None:
     for section_path, section in recipe.sections().items():
         for key, data in read_files(section).items() if section.files else ():
             path = folder / names[f"{section_path}.{key}"]
-            if not (path.is_file() and path.read_bytes() == data):
+            if not (path.is_file() and read_file(path) == data):
                 write_atomic(path, data)
 
 

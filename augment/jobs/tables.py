@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.labels import Boxes, LidarSweep
+from recipes.files import open_file
 
 METADATA_KEY = b"climategs"
 
@@ -191,6 +192,8 @@ def as_described(path: Path) -> Iterator[None]:
 def opened_parquet(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
     """The file, for as long as it is read; what Arrow then raises becomes an OutputError."""
     try:
+        if not isinstance(source, bytes):
+            open_file(source).close()  # refuses pipes, at which Arrow would wait without end
         with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:
             if _has_extension_types(at):
                 raise OutputError(

@@ -189,3 +189,24 @@ def _kept(folder: Path):
     """A scene of everything that scenes hold, of a folder of its own."""
     folder.mkdir(exist_ok=True)
     return cached_scene("recording", str(folder), {}, fitted_scene)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe"])
+def test_what_others_put_in_the_caches_folder_is_neither_emptied_nor_waited_for(
+    kind: str, cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = _kept(tmp_path / "a")
+    (entry,) = cache.iterdir()
+    lock = cache / f"{entry.name.partition('-')[0]}.lock"
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    entry.unlink()
+    if kind == "pipe":
+        os.mkfifo(lock)
+        os.mkfifo(entry)
+    else:
+        lock.symlink_to(victim if kind == "link" else tmp_path / "nothing")
+        entry.symlink_to("/dev/zero")
+    assert_same(_kept(tmp_path / "a"), first)
+    assert victim.read_text() == "precious" and not (tmp_path / "nothing").exists()
+    assert "where a lock of climategs was expected" in caplog.text
