@@ -15,7 +15,7 @@ import os
 import tempfile
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,31 +39,43 @@ from augment.jobs.block_worker import (
 from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, variant_name
+from augment.jobs.layout import (
+    MANIFEST,
+    STATE_FOLDER,
+    FileListing,
+    path_kinds,
+    variant_folder,
+    variant_name,
+)
 from augment.jobs.manifest import (
     FAILED,
+    KEY,
     OK,
+    TRAILING,
     Identity,
     compact,
     image_row,
+    leading_columns,
     lidar_notes,
     list_parts,
     parts_to_merge,
     publish_part,
     read_finished,
     rows_to_table,
+    rows_without_files,
 )
 from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.quality import Question, recorded
-from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from augment.trust import left_out_sentence, magnified_sentence
+from recipes.files import with_digest
 from recipes.job import JobRecipes, JobScene
-from recipes.schema import Recipe
+from recipes.schema import Recipe, columns_of_effects
 
 # ---- Which block a worker gets next: one of the scene it has open, as long as there are any ------
 
@@ -165,7 +177,8 @@ class SceneWork(Work):
 class BlockWork(Work):
     """Renders and publishes blocks. names: by scene, what the job calls it. opened: the scene that
     each slot has open. fail: records all images of a block as failed. on_image: told how many
-    images are done, and how many of them failed. A block whose worker dies is tried once more, each
+    images are done, and how many of them failed. damaged: keys of published blocks that have lost
+    files. A block whose worker dies is tried once more, each
     of its images in a process of its own.
     """
 
@@ -176,8 +189,10 @@ class BlockWork(Work):
         opened: dict[int, str],
         fail: FailBlock,
         on_image: Callable[[int, int], None] = lambda done, failed: None,
+        damaged: Collection[str] = (),
     ) -> None:
         self.tally = Tally()
+        self._damaged = frozenset(damaged)
         self._queue, self._names = BlockQueue(blocks), names
         self._fail, self._on_image = fail, on_image
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
@@ -203,7 +218,8 @@ class BlockWork(Work):
             return None
         self._opened[slot] = block.scene
         self._busy.add(slot)
-        return BlockTask(block, self._names.get(block.scene))
+        is_damaged = block.key in self._damaged
+        return BlockTask(block, self._names.get(block.scene), is_damaged=is_damaged)
 
     def later_s(self) -> float | None:
         return max(0.0, self._later[0][0] - time.monotonic()) if self._later else None
@@ -550,7 +566,9 @@ class _Generation:
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
             self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
-            work = BlockWork(pending, plan.names, workers.opened, self._fail, self._show)
+            work = BlockWork(
+                pending, plan.names, workers.opened, self._fail, self._show, self._damaged_keys
+            )
             total = sum(block.images for block in blocks)
             work.tally.skipped = total - sum(block.images for block in pending)
             begun = time.perf_counter()
@@ -571,7 +589,11 @@ class _Generation:
     def _pending(self, blocks: Sequence[Block]) -> list[Block]:
         """What is not published, or with failures that are tried again; refuses a mixed output."""
         parts = list_parts(self._store)
+        damaged = self._damaged([block for block in blocks if block.key in parts])
+        self._restore_recipes([block for block in blocks if block.key in parts])
         pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        pending += [block for block in damaged if not parts[block.key].has_failures]
+        self._damaged_keys = {block.key for block in damaged}
         new = [block for block in pending if block.key not in parts]
         if new:
             _check_not_mixed(self._store, self._plan, new)
@@ -580,6 +602,37 @@ class _Generation:
         published = [block for block in blocks if block.key not in left]
         clear_leftovers(self._store, self._job.setup.scratch, published)
         return pending
+
+    def _damaged(self, published: Sequence[Block]) -> list[Block]:
+        """The blocks of which a file is gone, in an output on this machine."""
+        out = self._store.local_dir
+        if out is None or not published:
+            return []
+        known = (*leading_columns(), *columns_of_effects(), *TRAILING)
+        columns = {*KEY, "status", *(f"{kind}_path" for kind in path_kinds())}
+        table = read_finished(self._store, [name for name in known if name not in columns])
+        images = rows_without_files(table, FileListing(out))
+        if not images:
+            return []
+        return [
+            block
+            for block in published
+            if any(
+                (block.scene, block.variant, frame, camera) in images
+                for frame in block.frames
+                for camera in block.cameras
+            )
+        ]
+
+    def _restore_recipes(self, published: Sequence[Block]) -> None:
+        """Write what is missing of the recipes in the folders of variants."""
+        out = self._store.local_dir
+        if out is None:
+            return
+        for block in {(block.scene, block.variant): block for block in published}.values():
+            folder = out / variant_folder(block.scene, block.variant)
+            if lacks_recipe(block.recipe, folder):
+                write_recipe(with_digest(block.recipe), folder)
 
     def _render(
         self, workers: Workers, work: BlockWork, pending: Sequence[Block], total: int

@@ -26,6 +26,7 @@ from augment.jobs.atomic import (
     flush_folder,
     make_folder,
     output_error,
+    path_below,
     read_file,
     refusals_of,
     remove_temporaries,
@@ -38,6 +39,7 @@ from augment.jobs.layout import (
     MANIFEST,
     STATE_FOLDER,
     SWEEPS,
+    FileListing,
     box_weather_files,
     folder_name,
     item_paths,
@@ -66,6 +68,7 @@ from augment.jobs.worker import Chunk, Outcome, describe
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
+JOURNAL = "journal"  # the folder of progress logs in that of the state
 
 
 class ProgressLog:
@@ -75,7 +78,7 @@ class ProgressLog:
     """
 
     def __init__(self, out_dir: Path, scene: str, variant: str) -> None:
-        folder = out_dir / STATE_FOLDER / "journal" / folder_name(scene)
+        folder = out_dir / STATE_FOLDER / JOURNAL / folder_name(scene)
         self.path = folder / f"{folder_name(variant)}.jsonl"
         self._file: int | None = None
         self._lock = threading.Lock()
@@ -135,7 +138,7 @@ class ProgressLog:
 
 def logged_variants(out_dir: Path) -> list[str]:
     """Folders (`<scene>/<variant>`) of the variants that some job has begun and not ended."""
-    root = out_dir / STATE_FOLDER / "journal"
+    root = out_dir / STATE_FOLDER / JOURNAL
     return sorted(str(p.relative_to(root).with_suffix("")) for p in root.glob("*/*.jsonl"))
 
 
@@ -159,13 +162,17 @@ class VariantState:
         self.rows: dict[Item, dict[str, Any]] = {}
         self.box_weather: dict[str, dict[Item, BoxNumbers]] = {kind: {} for kind in box_tables()}
         self._out_dir, self._is_logged = out_dir, False
+        self._listing = FileListing(out_dir)
 
     @property
     def key(self) -> tuple[str, str]:
         return self.index.name, self.name
 
-    def load(self, table: pa.Table | None, overwrite: bool) -> bool:
-        """Read what is known; true where there is anything that has to be given up."""
+    def load(self, table: pa.Table | None, listing: FileListing, overwrite: bool) -> bool:
+        """Read what is known; true where there is anything that has to be given up. listing: of the
+        output folder.
+        """
+        self._listing = listing
         begun, logged = self.progress_log.load()
         rows = [] if table is None else rows_of(table, {self.key})
         found = begun or (Identity.of_row(rows[0]) if rows else None)
@@ -203,7 +210,19 @@ class VariantState:
                 return False
         of_variant = {"labels", "calibration", *box_tables()}
         paths = [row[f"{kind}_path"] for kind in path_kinds() if kind not in of_variant]
-        return all((self._out_dir / path).is_file() for path in paths if path is not None)
+        return all(self._listing.has(path) for path in paths if path is not None)
+
+    def check_folders(self, cameras: Iterable[str]) -> None:
+        """Raise OutputError where a folder that will be written to is a link out of the output."""
+        recipe, index = self.recipe, self.index
+        paths = {
+            path
+            for name in {"", *cameras}
+            for path in item_paths(index.name, recipe, name, 0).values()
+            if path is not None
+        }
+        for folder in sorted({path.rpartition("/")[0] for path in paths}):
+            path_below(self._out_dir, tuple(folder.split("/")))
 
     def record(self, outcome: Outcome, frame: Frame) -> None:
         """Enter what became of an image, durably. May be called from several threads."""
@@ -332,7 +351,9 @@ class JobState:
         """Clear away what a killed run left, and read what it finished."""
         if (self.out_dir / MANIFEST).is_file():
             self._table = read_manifest(self.out_dir)
-        replaced = [variant for variant in self.variants if variant.load(self._table, overwrite)]
+        path_below(self.out_dir, (STATE_FOLDER, JOURNAL, folder_name(self.index.name)))
+        listing = FileListing(self.out_dir)
+        replaced = [v for v in self.variants if v.load(self._table, listing, overwrite)]
         self._clear_leftovers()
         if replaced:
             self._give_up(replaced)
@@ -412,7 +433,7 @@ class JobState:
         state = self.out_dir / STATE_FOLDER
         remove_temporaries(self.out_dir, recursive=False)
         remove_temporaries(state, recursive=False)  # blocks of other jobs may be at work below it
-        remove_temporaries(state / "journal")
+        remove_temporaries(state / JOURNAL)
         _remove_tree(state / "trash")
         mine = {variant.folder for variant in self.variants}
         sweeps = f"{folder_name(self.index.name)}/{SWEEPS}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -117,6 +118,33 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
     if output.labels:
         used["labels"] = f"{base}/labels/boxes.parquet"
     return {kind: used.get(kind) for kind in path_kinds()}
+
+
+class FileListing:
+    """Which files an output folder on this machine has. A folder is looked at once, when it is
+    first asked for: tens of thousands of single looks would take longer than all else of a resume.
+    """
+
+    def __init__(self, out_dir: Path) -> None:
+        self._out_dir = out_dir
+        self._names: dict[str, frozenset[str]] = {}
+
+    def has(self, path: str) -> bool:
+        """Whether there is a file of this path, which is relative to the output folder. Raises
+        OutputError: a link leads out of the output folder.
+        """
+        folder, _, name = path.rpartition("/")
+        if folder not in self._names:
+            self._names[folder] = self._names_in(folder)
+        return name in self._names[folder]
+
+    def _names_in(self, folder: str) -> frozenset[str]:
+        place = path_below(self._out_dir, tuple(folder.split("/")) if folder else ())
+        try:
+            with os.scandir(place) as entries:
+                return frozenset(entry.name for entry in entries if entry.is_file())
+        except OSError:  # missing, or what is no folder
+            return frozenset()
 
 
 @contextlib.contextmanager

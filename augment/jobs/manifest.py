@@ -22,7 +22,14 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.jobs.atomic import read_file, write_atomic
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, share_columns, variant_name
+from augment.jobs.layout import (
+    MANIFEST,
+    STATE_FOLDER,
+    FileListing,
+    path_kinds,
+    share_columns,
+    variant_name,
+)
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
@@ -220,6 +227,20 @@ def _refuse(table: pa.Table, name: str, wrong: pa.ChunkedArray, expected: str, w
             f"{table[name][row].as_py()!r:.200}. No job writes that: take the file from a copy, or "
             f"write to another output folder"
         )
+
+
+def rows_without_files(table: pa.Table, listing: FileListing) -> set[tuple[str, str, int, str]]:
+    """The finished images, by `KEY`, of which a file that the manifest names is missing. listing:
+    of the output folder.
+    """
+    mask = np.zeros(table.num_rows, bool)
+    for name in (f"{kind}_path" for kind in path_kinds()):
+        missing = [p for p in pc.unique(table[name]).to_pylist() if p and not listing.has(p)]
+        if missing:
+            named = pc.is_in(table[name], pa.array(missing, pa.string()))
+            mask |= named.to_numpy(zero_copy_only=False)
+    rows = table.filter(pc.and_(pa.array(mask), pc.equal(table["status"], OK)))
+    return set(zip(*(rows[name].to_pylist() for name in KEY), strict=True))
 
 
 def merge_rows(

@@ -25,7 +25,7 @@ from augment.base_photo import check_photos
 from augment.cameras import Frame
 from augment.effects import Sharing, share_effects
 from augment.errors import ClimateGSError, OutputError
-from augment.jobs.atomic import read_file, write_atomic
+from augment.jobs.atomic import path_below, read_file, write_atomic
 from augment.jobs.files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
@@ -60,6 +60,7 @@ from recipes.schema import SECTIONS, Recipe
 # ---- The files that a recipe names, beside the images: those of a style in `<variant>/style/` ----
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
+RECIPE_FILE = "recipe.yaml"
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
 
 
@@ -115,6 +116,23 @@ def copy_files(recipe: Recipe, folder: Path) -> None:
             path = folder / names[f"{section_path}.{key}"]
             if not (path.is_file() and read_file(path) == data):
                 write_atomic(path, data)
+
+
+def write_recipe(recipe: Recipe, folder: Path) -> None:
+    """Write `recipe.yaml`, and the files that it names. folder: the variant's. Raises RecipeError:
+    as copy_files. OutputError: the system refused, or a link leads out of the output.
+    """
+    place = folder.parent.name, folder.name
+    for name in stored_names(recipe).values():
+        path_below(folder.parents[1], (*place, *PurePath(name).parts[:-1]))
+    copy_files(recipe, folder)
+    write_atomic(folder / RECIPE_FILE, dump_recipe(portable_recipe(recipe)).encode())
+
+
+def lacks_recipe(recipe: Recipe, folder: Path) -> bool:
+    """Whether `recipe.yaml` or a file that it names is missing. folder: the variant's."""
+    names = (RECIPE_FILE, *stored_names(recipe).values())
+    return not all((folder / name).is_file() for name in names)
 
 
 def _safe_name(path: str) -> str:
@@ -324,6 +342,7 @@ class _Run:
                     check_kept(recipe, folders)
                 self._prepare(self.recipes)
             self.job_state.open(overwrite=self.job.overwrite)
+            self._restore_recipes()
             chunks = list(self.job_state.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
@@ -345,6 +364,12 @@ class _Run:
                 ) from None
             finally:
                 self.job_state.close()
+
+    def _restore_recipes(self) -> None:
+        """Write the recipes of begun variants, and files that they name, where they are missing."""
+        for variant in self.job_state.variants:
+            if variant.rows and lacks_recipe(variant.recipe, variant.place):
+                write_recipe(variant.recipe, variant.place)
 
     def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
         if chunks:
@@ -424,10 +449,9 @@ class _Run:
         """Announce the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
             variant = self.job_state.variants[number]
+            variant.check_folders(n for c in chunks if c.variant == number for n in c.cameras)
             variant.progress_log.begin(variant.identity)
-            copy_files(variant.recipe, variant.place)
-            text = dump_recipe(portable_recipe(variant.recipe)).encode()
-            write_atomic(variant.place / "recipe.yaml", text)
+            write_recipe(variant.recipe, variant.place)
 
     def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -101,6 +102,25 @@ def test_a_finished_job_renders_nothing_and_touches_nothing(finished: Path) -> N
     result = run(small_job(finished, renderer=must_not_render))
     assert (result.written, result.skipped, result.failed) == (0, 12, 0)
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()} == before
+
+
+def test_any_file_that_was_deleted_is_made_again(finished, whole, tmp_path: Path) -> None:
+    """One of every folder; nothing but what is missing is rendered."""
+    out = Path(shutil.copytree(finished, tmp_path / "out"))
+    firsts = {path.rpartition("/")[0]: path for path in whole}
+    names = {*firsts.values(), *(path for path in whole if path.endswith("recipe.yaml"))}
+    for path in sorted(path for path in names if "/" in path):
+        (out / path).unlink()
+        images = rendered(small_job(out))
+        assert outputs(out) == whole, path
+        assert leftovers(out) == []
+        if "/images/" in path or "/depth/" in path:
+            assert len(images) == 1
+        if path.endswith("recipe.yaml"):
+            assert images == []
+    shutil.rmtree(out / "a")
+    assert len(rendered(small_job(out))) == 8
+    assert outputs(out) == whole and leftovers(out) == []
 
 
 def test_shards_in_any_order_give_the_files_of_one_run(tmp_path: Path, whole: dict) -> None:

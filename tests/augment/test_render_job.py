@@ -371,6 +371,35 @@ def test_a_missing_file_is_rendered_again_and_leftovers_of_a_killed_run_go(
     assert tree_digest(copied) == tree_digest(whole)
 
 
+def test_any_file_that_was_deleted_is_made_again(tmp_path: Path) -> None:
+    """One of every folder: images, masks, labels, sweeps, calibration, recipe."""
+    job = fog_job(tmp_path, uri="fake:street?frames=2")
+    run(job)
+    whole = tree_digest(tmp_path)
+    firsts = {path.rpartition("/")[0]: path for path in whole}
+    singles = ("recipe.yaml", "calibration.json", "boxes.parquet", "boxes_2d.parquet")
+    names = {*firsts.values(), *(path for path in whole if path.endswith(singles))}
+    deleted = {path for path in names if "/" in path and not path.startswith(".climategs")}
+    assert {"images", "depth", "labels"} <= {path.split("/")[2] for path in deleted}
+    for path in sorted(deleted):
+        (tmp_path / path).unlink()
+        run(job)
+        assert tree_digest(tmp_path) == whole, path
+
+
+def test_folders_that_lead_out_of_the_output_are_not_written_to(tmp_path: Path) -> None:
+    for number, inner in enumerate(
+        ("street", "street/fog-000", "street/fog-000/images", "street/fog-000/depth/front")
+    ):
+        out, elsewhere = tmp_path / f"out{number}", tmp_path / f"elsewhere{number}"
+        elsewhere.mkdir()
+        (out / inner).parent.mkdir(parents=True)
+        (out / inner).symlink_to(elsewhere)
+        with pytest.raises(OutputError, match="leads through a link"):
+            run(fog_job(out))
+        assert list(elsewhere.iterdir()) == []
+
+
 def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path) -> None:
     recipes = [make_recipe(), make_recipe(variant=1)]
     run(RenderJob("fake:street", recipes, tmp_path / "whole"))
