@@ -19,6 +19,7 @@ import torch
 
 from adapters.base import open_scene, scenes_of
 from adapters.camera_files.paths import frames_from_path_file
+from adapters.scene_cache import scene_digest
 from augment import effects
 from augment.boxes import PlacedBoxes, find_occlusion
 from augment.cameras import Camera, Frame
@@ -210,6 +211,7 @@ def generate_dataset(options: GenerateOptions) -> int:
         scratch=options.scratch or default_scratch(out),
         backend=backend,
         open_scene=open_scene,
+        digest_of=scene_digest,
     )
     task = GenerateJob(
         recipes,
@@ -380,6 +382,7 @@ def render_recipes(options: RenderOptions) -> int:
         workers=options.workers,
         backend=backend,
         overwrite=options.overwrite,
+        source_digest=scene_digest(options.scene),
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
     print_images(result, f"{result.seconds:.1f} s")
@@ -482,7 +485,7 @@ def run_demo(out: Path, frames: int) -> int:
         scene = open_scene(uri)
         warm_up(recipes)
     ready = time.perf_counter()
-    job = RenderJob(scene_uri=uri, recipes=recipes, out_dir=out)
+    job = RenderJob(uri, recipes, out, source_digest=scene_digest(uri))
     result = run_job(job, scene_loader=lambda _uri: scene)
     for failure in result.failures:
         print_note(f"failed: {failure}")

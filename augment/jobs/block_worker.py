@@ -231,10 +231,25 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
             claim.release()
 
 
+def clear_staged(store: Store, scratch: Path | None, scene_folder: str) -> None:
+    """Delete the folders that blocks of a scene are rendered in, but for those that live processes
+    are at.
+    """
+    root = store.local_dir / STATE_FOLDER if store.local_dir is not None else scratch
+    for folder in sorted(root.glob(f"blocks/{scene_folder}.*")) if root is not None else ():
+        claim = try_claim(store, folder_name(folder.name))
+        if claim is not None:
+            with claim:
+                _remove_tree(folder)
+
+
 def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
     """Delete the folder that a block was rendered in; who calls holds its claim."""
-    folder = staging_folder(store, scratch, block)
     clear_files_of(store, block)
+    _remove_tree(staging_folder(store, scratch, block))
+
+
+def _remove_tree(folder: Path) -> None:
     try:
         shutil.rmtree(folder)
     except FileNotFoundError:
@@ -258,8 +273,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class WorkSetup:
     """What all workers of a job share; picklable. store_uri: the output. scratch: where blocks are
-    rendered on their way to an output that is not on this machine. open_scene, renderer: importable
-    functions; None renders with the library's.
+    rendered on their way to an output that is not on this machine. open_scene, renderer, digest_of:
+    importable functions; None renders with the library's, and notes no digest of a scene's content.
     """
 
     store_uri: str
@@ -267,6 +282,7 @@ class WorkSetup:
     backend: str
     open_scene: SceneLoader
     renderer: Renderer | None = None
+    digest_of: Callable[[str], str | None] | None = None
 
     @property
     def output(self) -> str:
@@ -373,7 +389,8 @@ class BlockWorker:
     def _index(self, task: IndexTask) -> SceneRecord:
         started = time.perf_counter()
         scene = self._scene_of(task.uri, task.name)
-        return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
+        digest = self._setup.digest_of(task.uri) if self._setup.digest_of is not None else None
+        return SceneRecord.of(scene, task.uri, time.perf_counter() - started, digest)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
         scene, setup = self._scene_of(task.uri, task.name), self._setup
@@ -448,6 +465,7 @@ class BlockWorker:
             backend=self._setup.backend,
             workers=2 if task.is_trial else 1,
             shared_dir=self._shared_dir(),
+            source_digest=block.digest,
         )
         with Publisher(self._store, folder, block) as publisher:
 

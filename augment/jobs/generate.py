@@ -68,6 +68,7 @@ from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPoo
 from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.quality import Question, recorded
 from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
+from augment.jobs.scene_changes import SceneChange, changes_in
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.render.buffers import AUTO, CUDA
@@ -492,7 +493,10 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
     with contextlib.closing(Workers(job)) as workers:
-        return _plan(job, store, workers, progress, keep=False)
+        plan, changes = _plan(job, store, workers, progress, keep=False)
+    for change in changes:
+        change.check(store)
+    return plan
 
 
 class Workers:
@@ -560,8 +564,9 @@ class _Generation:
     def go(self) -> GenerateResult:
         started = time.perf_counter()
         with contextlib.closing(Workers(self._job)) as workers:
-            plan = _plan(self._job, self._store, workers, self._progress, keep=True)
+            plan, changes = _plan(self._job, self._store, workers, self._progress, keep=True)
             self._plan = plan
+            self._accept(changes)
             self._timings["plan"] = time.perf_counter() - started
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
@@ -588,9 +593,18 @@ class _Generation:
 
     def _pending(self, blocks: Sequence[Block]) -> list[Block]:
         """What is not published, or with failures that are tried again; refuses a mixed output."""
+        table = self._finished_rows()
+        if table is not None and (changes := changes_in(table, blocks)):
+            # A record that says otherwise would hide the change from the next run.
+            names = self._plan.names
+            paths = [_record_path(change.uri, names.get(change.scene)) for change in changes]
+            self._store.delete(paths)
+            self._accept(changes)
+            table = self._finished_rows()
         parts = list_parts(self._store)
-        damaged = self._damaged([block for block in blocks if block.key in parts])
-        self._restore_recipes([block for block in blocks if block.key in parts])
+        published = [block for block in blocks if block.key in parts]
+        damaged = [] if table is None else self._damaged(table, published)
+        self._restore_recipes(published)
         pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
         pending += [block for block in damaged if not parts[block.key].has_failures]
         self._damaged_keys = {block.key for block in damaged}
@@ -603,15 +617,34 @@ class _Generation:
         clear_leftovers(self._store, self._job.setup.scratch, published)
         return pending
 
-    def _damaged(self, published: Sequence[Block]) -> list[Block]:
-        """The blocks of which a file is gone, in an output on this machine."""
-        out = self._store.local_dir
-        if out is None or not published:
-            return []
+    def _accept(self, changes: Iterable[SceneChange]) -> None:
+        """Refuse to mix images of changed scenes with those of before; what is left of deleted ones
+        is forgotten.
+        """
+        for change in changes:
+            change.check(self._store)
+        for change in changes:
+            change.accept(self._store, self._job.setup.scratch)
+
+    def _finished_rows(self) -> pa.Table | None:
+        """What an output on this machine has of finished images: their files, and what they were
+        made from; None where nothing is finished, or the output is elsewhere.
+        """
+        if self._store.local_dir is None:
+            return None
         known = (*leading_columns(), *columns_of_effects(), *TRAILING)
-        columns = {*KEY, "status", *(f"{kind}_path" for kind in path_kinds())}
-        table = read_finished(self._store, [name for name in known if name not in columns])
-        images = rows_without_files(table, FileListing(out))
+        columns = {*KEY, "status", "source_digest", *(f"{kind}_path" for kind in path_kinds())}
+        try:
+            return read_finished(self._store, [name for name in known if name not in columns])
+        except OutputError:
+            if self._store.exists(MANIFEST):
+                raise
+            return None
+
+    def _damaged(self, table: pa.Table, published: Sequence[Block]) -> list[Block]:
+        """The blocks of which a file is gone."""
+        assert self._store.local_dir is not None, "the files of others are not looked at"
+        images = rows_without_files(table, FileListing(self._store.local_dir))
         if not images:
             return []
         return [
@@ -725,12 +758,15 @@ def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) ->
     return notes
 
 
-def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool) -> Plan:
-    found: dict[tuple[str, str | None], SceneRecord | str] = {}
-    for entry in job.scenes:
-        record = None if job.rescan else _known(store, entry)
-        if record is not None:
-            found[entry.uri, entry.name] = record
+def _plan(
+    job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool
+) -> tuple[Plan, list[SceneChange]]:
+    """The plan, and the scenes that have changed since the output's record of them was made. keep:
+    whether records of other scenes are written.
+    """
+    known, changes = _known_scenes(job, store, keep=keep)
+    changed = {change.record_path for change in changes}
+    found: dict[tuple[str, str | None], SceneRecord | str] = {} if job.rescan else {**known}
     tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
     with tqdm(
         total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
@@ -738,14 +774,50 @@ def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, k
 
         def each(task: IndexTask, record: SceneRecord | str) -> None:
             found[task.uri, task.name] = record
-            if keep and isinstance(record, SceneRecord):
-                store.write(_record_path(task.uri, task.name), record.to_json())
+            path = _record_path(task.uri, task.name)
+            if keep and isinstance(record, SceneRecord) and path not in changed:
+                store.write(path, record.to_json())
             bar.update()
 
         opening = SceneWork(dict.fromkeys(tasks), each, "opening the scene", workers.opened)
         workers.do(opening)
     resolved = resolve_recipes(job, store, workers, found, progress=progress, keep=keep)
-    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved), changes
+
+
+def _known_scenes(
+    job: GenerateJob, store: Store, *, keep: bool
+) -> tuple[dict[tuple[str, str | None], SceneRecord], list[SceneChange]]:
+    """The records of the job's scenes by URI and name, and those of scenes that have changed."""
+
+    def look_up(entry: JobScene) -> tuple[SceneRecord | None, str | None]:
+        record, digest_of = _known(store, entry), job.setup.digest_of
+        return record, None if record is None or digest_of is None else digest_of(entry.uri)
+
+    known: dict[tuple[str, str | None], SceneRecord] = {}
+    changes: list[SceneChange] = []
+    with ThreadPoolExecutor(_READS, thread_name_prefix="scenes") as pool:
+        pairs = list(pool.map(look_up, job.scenes))
+    for entry, (record, digest) in zip(job.scenes, pairs, strict=True):
+        path = _record_path(entry.uri, entry.name)
+        if record is None:
+            continue
+        if digest is not None and record.digest is None:
+            _log.warning(
+                "note: %s holds the scene %s of an older version, which did not note its content; "
+                "it is taken to be the scene as it is now",
+                store.uri,
+                record.name,
+            )
+            record = replace(record, digest=digest)
+            if keep:
+                store.write(path, record.to_json())
+        if digest in (None, record.digest):
+            known[entry.uri, entry.name] = record
+        else:
+            digests = str(record.digest), str(digest)
+            changes.append(SceneChange(record.name, entry.uri, *digests, record_path=path))
+    return known, changes
 
 
 def _known(store: Store, entry: JobScene) -> SceneRecord | None:

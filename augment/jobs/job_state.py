@@ -99,11 +99,11 @@ class ProgressLog:
             return Identity(**identity), rows
 
     def begin(self, identity: Identity) -> None:
-        """Open for appending; starts with the identity, or goes on after the last whole line."""
+        """Open for appending; starts with the identity, and goes on after the last whole line."""
         with refusals_of(self.path):
             whole = read_file(self.path) if self.path.exists() else b""
-            whole = whole[: whole.rfind(b"\n") + 1]
-            write_atomic(self.path, whole or _line(asdict(identity)))
+            rows = whole[whole.find(b"\n") + 1 : whole.rfind(b"\n") + 1]
+            write_atomic(self.path, _line(asdict(identity)) + rows)
             self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
 
     def append(self, row: dict[str, Any]) -> None:
@@ -163,6 +163,7 @@ class VariantState:
         self.box_weather: dict[str, dict[Item, BoxNumbers]] = {kind: {} for kind in box_tables()}
         self._out_dir, self._is_logged = out_dir, False
         self._listing = FileListing(out_dir)
+        self._adopts = False  # images whose rows lack the digest of the scene's content
 
     @property
     def key(self) -> tuple[str, str]:
@@ -175,11 +176,19 @@ class VariantState:
         self._listing = listing
         begun, logged = self.progress_log.load()
         rows = [] if table is None else rows_of(table, {self.key})
-        found = begun or (Identity.of_row(rows[0]) if rows else None)
-        if overwrite and found is not None:
+        identities = {Identity.of_row(row) for row in rows} | ({begun} if begun else set())
+        if overwrite and identities:
             return True
-        if found is not None:
+        for found in sorted(identities, key=repr):
             self.identity.check(found, str(self.place))
+        if self.identity.source_digest is not None:
+            self._adopts = any(found.source_digest is None for found in identities)
+            if self._adopts:
+                _log.warning(
+                    "note: %s is of an older version, which did not note the content of its "
+                    "scene; it is taken to be the scene as it is now",
+                    self.place,
+                )
         self._is_logged = begun is not None
         for kind, file in box_weather_files(self.recipe).items():
             if any(row.get(f"{kind}_path") for row in rows):
@@ -190,6 +199,8 @@ class VariantState:
                     self.box_weather[kind][row["frame"], row["camera"]] = own.from_json(numbers)
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
         shown = shown_words(self.recipe)
+        if self._adopts:
+            shown["source_digest"] = self.identity.source_digest
         known = [{**later_columns(), **row, **shown} for row in [*rows, *logged]]
         self.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
@@ -261,8 +272,12 @@ class VariantState:
                 write_atomic(path, data)
 
     def is_complete(self) -> bool:
-        """Whether `write_files` has nothing to do, and no progress log is open."""
-        return not self._is_logged and all(path.is_file() for path in self.files().values())
+        """Whether `finish` has nothing to do for it, and no progress log is open."""
+        return (
+            not self._is_logged
+            and not self._adopts
+            and all(path.is_file() for path in self.files().values())
+        )
 
     def _boxes(self, path: Path, cache: BoxCache) -> bytes:
         frames = {frame for frame, _ in self.rows}

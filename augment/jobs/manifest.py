@@ -68,7 +68,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
         **{"width": whole, "height": whole},
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *words, "quality"), text),
-        **{"render_scale": pa.float64(), "settings": text},
+        **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
         **dict.fromkeys(share_columns().values(), pa.float64()),
     }
 
@@ -503,17 +503,26 @@ def _worth(part: Part) -> tuple[bool, float, str]:
 
 @dataclass(frozen=True)
 class Identity:
-    """What must agree for two runs to write into the same variant folder."""
+    """What must agree for two runs to write into the same variant folder. source_digest: of the
+    scene's content; None where nobody knows it, which agrees with any.
+    """
 
     source: str
     recipe_hash: str
     trajectory: str
     version: str
     backend: str
+    source_digest: str | None = None
 
     @staticmethod
     def of_row(row: dict[str, Any]) -> Identity:
         return Identity(**{name: row[name] for name in Identity.__dataclass_fields__})
+
+    def is_of_other_content(self, other: Identity) -> bool:
+        """Whether the scene's files are known to differ."""
+        return None not in (digests := {self.source_digest, other.source_digest}) and (
+            len(digests) > 1
+        )
 
     def check(self, found: Identity, where: str) -> None:
         """Raise OutputError where the folder was written by something else."""
@@ -530,6 +539,11 @@ class Identity:
             for name, label in names.items()
             if mine[name] != theirs[name]
         ]
+        if not different and self.is_of_other_content(found):
+            different = [
+                f"the files of the scene {self.source} have changed since: the digest of their "
+                f"content is {theirs['source_digest']!r} there, {mine['source_digest']!r} here"
+            ]
         if different:
             raise OutputError(
                 f"{where} already holds images of another kind: {'; '.join(different)}. Give the "

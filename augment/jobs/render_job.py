@@ -160,7 +160,8 @@ class RenderJob:
     the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
     variants' folders, finished or not, and choose their settings anew. shared_dir: keeps
     what lies in files of what images share (where snow can lie) for later jobs; the output folder's
-    state if None.
+    state if None. source_digest: of the scene's content (adapters.scene_cache.scene_digest); images
+    of other content in the output are then refused.
     """
 
     scene_uri: str
@@ -173,6 +174,7 @@ class RenderJob:
     backend: str = "auto"
     overwrite: bool = False
     shared_dir: Path | None = None
+    source_digest: str | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -429,8 +431,14 @@ class _Run:
             )
 
     def _identity(self, recipe: Recipe) -> Identity:
-        version = augment.__version__
-        return Identity(self.index.source, recipe.hash, self.trajectory, version, self.backend)
+        return Identity(
+            self.index.source,
+            recipe.hash,
+            self.trajectory,
+            augment.__version__,
+            self.backend,
+            self.job.source_digest,
+        )
 
     def _prepare(self, recipes: Sequence[Recipe]) -> None:
         """Find what images of these recipes share, for all cameras of the scene or the path."""

@@ -482,3 +482,50 @@ def test_overwriting_replaces_the_variant_and_no_other(tmp_path: Path) -> None:
     assert (
         read_manifest(tmp_path).column("variant").to_pylist() == ["fog-000"] * 2 + ["fog-001"] * 8
     )
+
+
+# ---- What the scene's files held when its images were made ---------------------------------------
+
+
+def test_a_scene_whose_content_has_changed_is_refused(tmp_path: Path) -> None:
+    job = fog_job(tmp_path, frames=[1], source_digest="content1")
+    run(job)
+    before = tree_digest(tmp_path)
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content1"}
+    assert run(job, must_not_render).skipped == 2
+    changed = dataclasses.replace(job, frames=[1, 2], source_digest="content2")
+    with pytest.raises(OutputError, match=r"have changed since.*content1.*content2.*overwr"):
+        run(changed, must_not_render)
+    assert {k: v for k, v in tree_digest(tmp_path).items() if "/" in k} == {
+        k: v for k, v in before.items() if "/" in k
+    }
+    assert run(dataclasses.replace(changed, overwrite=True)).written == 4
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content2"}
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_an_output_without_a_digest_is_taken_for_the_scene_as_it_is_once(
+    tmp_path: Path, caplog, ended: bool
+) -> None:
+    old = fog_job(tmp_path)
+    if ended:
+        run(old)
+    else:
+        calls = []
+
+        def killed(*given, backend):
+            calls.append(given)
+            if len(calls) == 3:
+                raise SystemExit("killed")
+            return fake_render(*given, backend=backend)
+
+        with pytest.raises(SystemExit, match="killed"):
+            run(old, killed)
+    known = dataclasses.replace(old, source_digest="content1")
+    run(known)
+    assert caplog.text.count("of an older version") == 1
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content1"}
+    run(known, must_not_render)
+    assert caplog.text.count("of an older version") == 1
+    with pytest.raises(OutputError, match="have changed since"):
+        run(dataclasses.replace(old, source_digest="content2"))
