@@ -53,7 +53,14 @@ from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video, write_rgb
 from tools.export import label_files, mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
-from tools.output import LABELS_OF_STORES, compiling_noted, fill, print_images, print_note
+from tools.output import (
+    LABELS_OF_STORES,
+    compiling_noted,
+    duration_text,
+    fill,
+    print_images,
+    print_note,
+)
 
 if TYPE_CHECKING:
     from tools.cli import GenerateOptions, RenderOptions
@@ -230,7 +237,7 @@ def generate_dataset(options: GenerateOptions) -> int:
     store.delete([probe])
     with ended_by_sigterm():
         result = run_generate(task, prepare=lambda recipes: warm_up_for_workers(recipes, backend))
-    print_images(result, _duration(result.seconds))
+    print_images(result, duration_text(result.seconds))
     if shares := shares_of(result.timings):
         print(shares.sentence)
     for uri, why in result.unusable.items():
@@ -281,7 +288,7 @@ def _dry_run(job: GenerateJob) -> int:
     if guess.unsampled:
         print(f"  taken as their mean: {', '.join(guess.unsampled)}")
     print(
-        f"about {_duration(guess.seconds)} of one worker, {_size(guess.bytes)} "
+        f"about {duration_text(guess.seconds)} of one worker, {_size(guess.bytes)} "
         f"(from one picture a recipe; right to a factor of two or so)"
     )
     return 1 if plan.unusable else 0
@@ -292,7 +299,7 @@ def _status_text(status: JobStatus) -> str:
         kind: [(name, g) for name, g in groups.items() if g.published < g.planned]
         for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe))
     }
-    left = _duration(status.left_s) if status.left_s and not _is_done(status) else ""
+    left = duration_text(status.left_s) if status.left_s and not _is_done(status) else ""
     return fill("status.txt", status=status, left=left, unfinished=unfinished, max_lines=_MAX_LINES)
 
 
@@ -313,14 +320,6 @@ def ended_by_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.1f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
 
 
 def _size(count: float) -> str:

@@ -119,10 +119,11 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
 def rows_to_table(rows: Iterable[Row]) -> pa.Table:
     """Rows as a sorted table."""
     rows, others = list(rows), leading_columns().keys() | TRAILING.keys()
-    absent = {name: _absent(name) for name in sorted({n for row in rows for n in row} - others)}
+    numbers = sorted({name for row in rows for name in row} - others)
+    absent = {**later_columns(), **{name: _absent(name) for name in numbers}}
     columns = {
         name: pa.array([row[name] if name in row else absent[name] for row in rows], kind)
-        for name, kind in _kinds(absent).items()
+        for name, kind in _kinds(numbers).items()
     }
     return _sorted(pa.table(columns))
 
