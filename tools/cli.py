@@ -130,7 +130,7 @@ class GenerateOptions(SceneCommand):
             large it gets. Nothing is written.
         status: Say how far the jobs of the output have come; needs no job file. The exit code is 0
             if all is done.
-        rescan: Open all scenes again, in case they have got frames since.
+        rescan: Open all scenes again, in place of what the output knows of them.
         scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
             on Ray the CPU.
