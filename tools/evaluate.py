@@ -92,11 +92,11 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
     ]
     notes = _notes(drives, {pair.kind for _, pair in found}, short, long)
     if not found:
-        hint = f" {' '.join(notes)}" if notes else ""
+        hint = "".join(f" ({note})" for note in notes)
         raise OutputError(
             f"{out} has no two images to compare: neither frames {short} or {long} apart of one "
             f"camera, nor cameras of one frame whose axes are less than 90 degrees apart. Render "
-            f"consecutive frames.{hint}"
+            f"consecutive frames{hint}"
         )
     if progress:
         for note in notes:
@@ -130,21 +130,24 @@ def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: in
     """Why tables are empty. kinds: of the pairs that there are."""
     asked = {SHORT: short, LONG: long}
     missing = [kind for kind in asked if kind not in kinds]
-    steps = Counter(
-        b - a
+    by_camera = [
+        sorted(frame for frame, own in drive.rows if own == camera)
         for drive in drives
         for camera in {camera for _, camera in drive.rows}
-        for a, b in itertools.pairwise(sorted(f for f, own in drive.rows if own == camera))
-    )
+    ]
+    steps = Counter(b - a for frames in by_camera for a, b in itertools.pairwise(frames))
     if not missing or not steps:
         return []
-    step = steps.most_common(1)[0][0]
-    far = max(2, math.ceil(long / step)) * step
-    none = " or ".join(str(asked[kind]) for kind in missing)
+    step, span = steps.most_common(1)[0][0], max(frames[-1] - frames[0] for frames in by_camera)
+    far = min(math.ceil(long / step), span // step) * step
+    hint = "render more frames"
+    if far > step:
+        hint = f"add --short {step} --long {far}, or render consecutive frames"
+    apart = " or ".join(str(asked[kind]) for kind in missing)
     return [
-        f"no two frames of a camera are {none} apart: the numbers of most are {step} apart, so the "
-        f"tables of {' and '.join(missing)} range are empty. Add --short {step} --long {far}, or "
-        f"render consecutive frames."
+        f"no two frames of a camera are {apart} apart, so the tables of {' and '.join(missing)} "
+        f"range are empty: the numbers of most are {step} apart, of the first and last {span}; "
+        f"{hint}"
     ]
 
 

@@ -15,7 +15,6 @@ import contextlib
 import ctypes
 import errno
 import fcntl
-import itertools
 import logging
 import os
 import re
@@ -87,42 +86,6 @@ def replaced_file(
                 file.close()
         if flush:
             flush_folder(path.parent)
-
-
-def write_new(root: Path, folder: str, name: str, suffix: str, data: bytes) -> Path:
-    """Write a file under a name that nothing has yet: NAME.suffix, else NAME-2.suffix and so on. A
-    link has its name too, wherever it leads, and is not followed.
-
-    Args:
-        root: the folder that no link may lead out of; made if missing.
-        folder: below the root; made if missing.
-        name: one component of a path.
-        suffix: with its dot, or empty.
-
-    Returns:
-        The file's path.
-
-    Raises:
-        OutputError: the system refused, or the folder is a link out of the root.
-    """
-    place = path_below(root, (folder,))
-    with refusals_of(place):
-        make_folder(place)
-    for number in itertools.count(1):
-        path = place / (f"{name}{suffix}" if number == 1 else f"{name}-{number}{suffix}")
-        with refusals_of(path):
-            try:
-                file = path.open("xb")
-            except FileExistsError:
-                continue
-            try:
-                with file:
-                    file.write(data)
-            except BaseException:
-                path.unlink(missing_ok=True)
-                raise
-        return path
-    raise AssertionError
 
 
 def read_file(path: Path) -> bytes:

@@ -54,6 +54,7 @@ from augment.jobs.manifest import (
     PARTS,
     Identity,
     Pictured,
+    check_rows,
     image_row,
     later_columns,
     merge_rows,
@@ -94,9 +95,15 @@ class ProgressLog:
                 f"{self.path} cannot be read: {error.strerror}. Delete it; what it lists is "
                 f"rendered again"
             ) from error
-        with reading_back(str(self.path), "Delete it; what it lists is rendered again"):
+        with self.reading():
             identity, *rows = [json.loads(line) for line in lines]
+            if not all(isinstance(value, str | None) for value in identity.values()):
+                raise ValueError(f"its first line must hold texts; got {identity!r:.200}")
             return Identity(**identity), rows
+
+    def reading(self) -> contextlib.AbstractContextManager[None]:
+        """While its lines are taken apart, what goes wrong is an OutputError."""
+        return reading_back(str(self.path), "Delete it; what it lists is rendered again")
 
     def begin(self, identity: Identity) -> None:
         """Open for appending; starts with the identity, and goes on after the last whole line."""
@@ -193,10 +200,12 @@ class VariantState:
         for kind, file in box_weather_files(self.recipe).items():
             if any(row.get(f"{kind}_path") for row in rows):
                 self.box_weather[kind] = _read_table(kind, self.place / file)
-        for row in logged:  # which have the boxes' numbers beyond the manifest's columns
-            for kind, own in box_tables().items():
-                if (numbers := row.pop(kind, None)) is not None:
-                    self.box_weather[kind][row["frame"], row["camera"]] = own.from_json(numbers)
+        with self.progress_log.reading():
+            for row in logged:  # which have the boxes' numbers beyond the manifest's columns
+                for kind, own in box_tables().items():
+                    if (numbers := row.pop(kind, None)) is not None:
+                        self.box_weather[kind][row["frame"], row["camera"]] = own.from_json(numbers)
+            check_rows(logged, self.key, str(self.progress_log.path))
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
         shown = shown_words(self.recipe)
         if self._adopts:

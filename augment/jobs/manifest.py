@@ -162,6 +162,15 @@ def parse_manifest(data: bytes, where: str, without: Collection[str] = ()) -> pa
     return table
 
 
+def check_rows(rows: Sequence[Row], key: tuple[str, str], where: str) -> None:
+    """Raise OutputError, or what Python and Arrow raise of wrong types, where rows are none of a
+    job's. key: scene and variant of all of them. where: the file that they are from.
+    """
+    if wrong := [row for row in rows if (row["scene"], row["variant"]) != key]:
+        raise ValueError(f"a line is of {wrong[0]['variant']!r:.80}, not of {key[1]!r}")
+    _check_values(rows_to_table(rows), where)
+
+
 def _check_types(table: pa.Table, where: str, without: Collection[str]) -> None:
     requested = {n: kind for n, kind in _kinds(weather_columns(table)).items() if n not in without}
     advice = "It was written by another program or version: write to another output folder"

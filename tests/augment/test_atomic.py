@@ -24,7 +24,6 @@ from augment.jobs.atomic import (
     replaced_folder,
     wait_for_lock,
     write_atomic,
-    write_new,
 )
 from augment.jobs.claims import try_lock
 from augment.jobs.processes import OutputLock, file_lock
@@ -260,19 +259,6 @@ def test_a_lock_held_for_ever_is_waited_for_no_longer_than_said(tmp_path):
     wait_for_lock(path, waiter, patience_s=0.1, doing="builds")
     os.close(holder)
     os.close(waiter)
-
-
-def test_a_new_file_takes_no_name_that_anything_has(tmp_path):
-    uploads = tmp_path / "uploads"
-    uploads.mkdir()
-    (uploads / "fog.v2.yaml").symlink_to(tmp_path / "nothing")
-    (uploads / "fog.v2-2.yaml").write_text("somebody's")
-    path = write_new(tmp_path, "uploads", "fog.v2", ".yaml", DATA)
-    assert (path, path.read_bytes()) == (uploads / "fog.v2-3.yaml", DATA)
-    assert not (tmp_path / "nothing").exists()
-    (tmp_path / "opened").symlink_to("/")
-    with pytest.raises(OutputError, match="leads through a link"):
-        write_new(tmp_path, "opened", "fog", ".yaml", DATA)
 
 
 def test_a_link_that_leads_to_itself_is_no_file(tmp_path):

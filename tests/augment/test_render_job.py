@@ -436,6 +436,36 @@ def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
     assert tree_digest(out) == tree_digest(tmp_path / "whole")
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("image_path", 1e308),
+        ("image_path", "../victim.png"),
+        ("frame", "x"),
+        ("camera", None),
+        ("status", []),
+        ("variant", "fog-001"),
+        ("new", {}),
+        ("width", 2**70),
+        ("box_2d", {"pixels": 3}),
+    ],
+)
+def test_a_damaged_journal_is_told(tmp_path: Path, field: str, value: object) -> None:
+    """Whose lines are rows of the manifest, and come from anybody as that does."""
+    job = fog_job(tmp_path, frames=[0])
+    run(job)
+    identity, *rows = read_manifest(tmp_path).to_pylist()[:1] * 2
+    (tmp_path / "manifest.parquet").unlink()
+    progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+    progress_log.parent.mkdir(parents=True)
+    lines = [{name: identity[name] for name in IDENTITY}, {**rows[0], field: value}]
+    progress_log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(OutputError, match=f"{progress_log}"):
+        run(job)
+    progress_log.unlink()
+    assert run(job).written == 2
+
+
 @pytest.mark.parametrize("ended", [True, False], ids=["finished", "only begun"])
 def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bool) -> None:
     run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))

@@ -226,8 +226,8 @@ def test_frames_that_are_not_consecutive_have_no_pairs(tmp_path):
     facts = measure(tmp_path / "out")
     clear = facts["recipes"][0]
     (note,) = facts["notes"]
-    assert "1 or 7 apart: the numbers of most are 2 apart" in note
-    assert "--short 2 --long 8" in note and note in evaluation_text(facts)
+    assert "1 or 7 apart, so the tables of short and long range are empty" in note
+    assert "--short 2 --long 4" in note and note in evaluation_text(facts)
     assert clear["short"] is None and clear["long"] is None and clear["cameras"]["pairs"] == 3
     thinned = measure(tmp_path / "out", short=2, long=4)
     assert thinned["notes"] == []
