@@ -35,7 +35,7 @@ from augment.boxes import (
 )
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs.atomic import write_atomic
+from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.box_tables import (
     BOXES_2D,
     MASKS,
@@ -342,7 +342,7 @@ def calibration_bytes(
 def read_entries(path: Path) -> dict[int, dict[str, Any]]:
     """The frame entries of a calibration file by frame number."""
     try:
-        frames = json.loads(Path(path).read_bytes())["frames"]
+        frames = json.loads(read_file(path))["frames"]
         return {entry["frame"]: entry for entry in frames}
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise OutputError(f"{path} is missing or not a calibration file: {error!r}") from error
