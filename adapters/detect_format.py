@@ -17,6 +17,7 @@ from augment.errors import AdapterError
 from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
+from augment.files.streamed_sog import LOD_META
 from augment.jobs.mirror import SourceTree
 from augment.scene import Scene
 from recipes.files import open_file
@@ -277,12 +278,13 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    found = sum(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
-    return found == 1 or (found == 0 and is_sog_folder(folder))
+    if (folder / LOD_META).is_file() or is_sog_folder(folder):
+        return True
+    return any(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
 
 
 def _is_splat_file(path: Path) -> bool:
-    if path.name == META and is_sog_folder(path.parent):
+    if path.name == LOD_META or (path.name == META and is_sog_folder(path.parent)):
         return True
     return path.suffix.lower() in SPLAT_SUFFIXES[1:] or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
@@ -338,8 +340,8 @@ FOLDERS = (
     Signature(
         "gaussians",
         _holds_splats,
-        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
-        ".splat, .spz, .sog, .glb, .gltf or .usd file, or meta.json and images of SOG, in it",
+        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), .ply, .splat, .spz, .sog, "
+        ".glb, .gltf or .usd files, a lod-meta.json, or meta.json and images of SOG, in it",
     ),
 )
 FILES = (
@@ -354,5 +356,9 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply, .splat, .spz, .sog, .glb, .gltf or .usd file"),
+    Signature(
+        "gaussians",
+        _is_splat_file,
+        "a .ply, .splat, .spz, .sog, .glb, .gltf or .usd file or a lod-meta.json",
+    ),
 )

@@ -27,7 +27,7 @@ from tools.options import (
     SceneCommand,
     StyleTrainOptions,
 )
-from tools.output import LABELS_OF_STORES, JsonFile, check_local, write_json
+from tools.output import LABELS_OF_STORES, JsonFile, NoteHandler, check_local, write_json
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -637,7 +637,7 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     table, prog = COMMANDS, "climategs"
     description = "Weather for driving scenes made of 3D Gaussians."
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[NoteHandler()])
     try:
         if arguments and arguments[0] in ("bench", *GROUPS):
             group, *arguments = arguments
