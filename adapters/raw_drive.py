@@ -554,23 +554,20 @@ def _checked(drive: RawDrive) -> RawDrive:
     """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
     seems to be in another frame."""
     low, high = drive.path.min(axis=0), drive.path.max(axis=0)
-    near = [
+    is_near = [
         ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
         for sweep in drive.sweeps
     ]
     sweeps = tuple(
         sweep if keep.all() else sweep.select(keep)
-        for sweep, keep in zip(drive.sweeps, near, strict=True)
-    )
-    far = sum(int((~keep).sum()) for keep in near)
-    said = (
-        (
-            f"{far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path and "
-            f"are left out; coordinates must be metres",
-        )
-        if far
-        else ()
+        for sweep, keep in zip(drive.sweeps, is_near, strict=True)
     )
     timed = [(int(np.median(s.timestamps_ns)), s.points) for s in sweeps if len(s)]
-    frames = camera_problems(drive.frames) + lidar_problems(drive.frames, timed)
-    return replace(drive, sweeps=sweeps, problems=frames + said + drive.problems)
+    problems = [*camera_problems(drive.frames), *lidar_problems(drive.frames, timed)]
+    num_far = sum(int((~keep).sum()) for keep in is_near)
+    if num_far:
+        problems.append(
+            f"{num_far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path "
+            f"and are left out; coordinates must be metres"
+        )
+    return replace(drive, sweeps=sweeps, problems=(*problems, *drive.problems))

@@ -256,13 +256,20 @@ def _class_meanings(tables: SceneTables) -> dict[int, int]:
     return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in tables.class_names.items()}
 
 
+# NotImplementedError, RuntimeError: a compression or a password that zipfile does not know.
+_NPZ_FAULTS = (
+    *(OSError, ValueError, LookupError, EOFError, zlib.error, zipfile.BadZipFile),
+    *(NotImplementedError, RuntimeError),
+)
+
+
 def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
     """The numbers of those returns in a file of nuScenes' panoptic labels."""
     try:
         with zipfile.ZipFile(file) as archive, archive.open("data.npy") as member:
             opened: Any = member
             numbers = read_npy(opened)[rows]
-    except (OSError, ValueError, KeyError, IndexError, zlib.error, zipfile.BadZipFile) as error:
+    except _NPZ_FAULTS as error:
         raise AdapterError(
             f"{file} must hold an array `data`, one number a return ({error}); copy it again"
         ) from error

@@ -482,8 +482,11 @@ def test_images_that_cannot_be_used_are_problems(copy):
     assert "images/roof belongs to no camera of calibration.json" in more[1]
     for path in copy.glob("images/front_camera/00000[02].png"):
         path.unlink()
-    for query in ({"held_out": "1:2"}, {"frames": "0:1"}):
-        with pytest.raises(AdapterError, match=r"no usable image of .* not held out.*: camera"):
+    for query, some in (
+        ({"held_out": "1:2"}, r"2 frames \(0, 2\) that are not held out"),
+        ({"frames": "0:1"}, r"1 frame \(0\);"),
+    ):
+        with pytest.raises(AdapterError, match=rf"no usable image in {some}.*camera"):
             open_recording(str(copy), QUERY | query)
 
 
