@@ -207,7 +207,7 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
 
 def _read_image(path: Path, camera: Camera) -> np.ndarray | None:
     """RGB at the camera's size; None for what is no image of its proportions."""
-    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2)
     if image is None:
         return None
     height, width = image.shape[:2]

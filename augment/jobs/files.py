@@ -35,6 +35,7 @@ from augment.boxes import (
 )
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
+from augment.files.recorded_images import decode_pixels
 from augment.jobs.atomic import write_atomic
 from augment.jobs.box_tables import (
     BOXES_2D,
@@ -432,7 +433,7 @@ def encode_image(rgb: np.ndarray, output: Output) -> bytes:
 
 def decode_image(data: bytes) -> np.ndarray:
     """uint8 [H, W, 3] RGB. Raises ValueError where the bytes are no complete image."""
-    bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = _decode(data, cv2.IMREAD_COLOR)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
@@ -491,10 +492,7 @@ def _encode(extension: str, array: np.ndarray, settings: list[int]) -> bytes:
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise ValueError(f"not a readable image file ({len(data)} bytes): {error}") from error
+    image = decode_pixels(data, flags)
     if image is None:
         raise ValueError(f"not a readable image file ({len(data)} bytes)")
     return image
