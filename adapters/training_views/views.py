@@ -27,7 +27,6 @@ NONE = "none"
 _EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
 CACHE_BYTES = 1 << 30
 _MAX_POSITION_M = 1e6  # float32 has a resolution of 6 cm there
-_MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
 _SIZE_SHARE = 0.05  # by which the sides of one camera's images may differ
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
@@ -257,11 +256,6 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
         raise AdapterError(
             f"{where}: its position in the scene must be finite and within {_MAX_POSITION_M:.0f} m "
             f"of the origin; got {position}. Check the pose in the dataset"
-        )
-    if not _MIN_FOCAL < camera.fx / camera.width < _MAX_FOCAL:
-        raise AdapterError(
-            f"{where}: a focal length of {camera.fx:g} px is impossible for an image of "
-            f"{camera.width} columns; check the intrinsics and their unit (pixels)"
         )
 
 

@@ -179,17 +179,13 @@ def test_jumps_of_exposure_are_named(tmp_path):
     assert len(said) == 4 and "jumps 3 more times, last after frame 15" in said[-1]
 
 
-@pytest.mark.parametrize("change", ["position", "focal"])
-def test_impossible_cameras_are_errors_that_say_where(scene, change):
+def test_a_camera_at_no_place_is_an_error_that_says_where(scene):
     def broken(camera):
         if camera.timestamp_ns != 3 * drives.FRAME_NS:
             return camera
-        if change == "focal":
-            return dataclasses.replace(camera, fx=0.15)
         pose = camera.camera_from_world.clone()
         pose[0, 3] = float("nan")
         return dataclasses.replace(camera, camera_from_world=pose)
 
-    match = {"position": "position in the scene", "focal": "focal length of 0.15 px"}[change]
-    with pytest.raises(AdapterError, match=rf"camera left, frame 3: .*{match}"):
+    with pytest.raises(AdapterError, match=r"camera left, frame 3: .*position in the scene"):
         RecordedViews(with_cameras(scene, broken), scale=1.0)

@@ -478,6 +478,10 @@ WRONG_CALIBRATIONS = [
     (put_camera("fx", None), "frame 1, camera 'left_camera': fx is missing"),
     (put_camera("fx", -5), "camera 'left_camera': .*fx must be finite and > 0"),
     (put_camera("fx", "long"), "left_camera': fx must be a valid number; got 'long'"),
+    (put_camera("fy", 1e-320), "frame 1, camera 'left_camera': fy must be from 6.999 to 9167 px "
+     r"in an image of 160x96 \(a field of view from 170 to 1 degrees.*got 9.99989e-321"),
+    (put_camera("fx", 1e9), r"camera 'left_camera': fx must be from 6.999 to 9167 px.*got 1e\+09"),
+    (put_camera("cx", -1e6), "camera 'left_camera': cx must lie within 1600 px of the centre"),
     (put_camera("width", 10**9), "left_camera': width must be less than or equal to"),
     (put_camera("timestamp_ns", "now"), "left_camera': timestamp_ns must be a valid integer"),
     (lambda c: c.update(frames=[]), r"frames must have at least 1 item .* got \[\]"),
