@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, read_image_size, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -217,8 +217,8 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
-    size = next((found for found in seen if not isinstance(found, str)), None)
+    headers = (check_image(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((header.size for header in headers if not isinstance(header, str)), None)
     if size is None:
         raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
     return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))

@@ -21,11 +21,13 @@ import torch
 from pydantic import BeforeValidator, Field
 
 from adapters.drive_checks import camera_problems, lidar_problems
-from adapters.plain_files import MISSING, read_image_size
+from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
 from augment.errors import AdapterError
+from augment.files.image_size import ImageHeader
+from augment.files.recorded_images import exif_hint
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
@@ -186,7 +188,7 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
         AdapterError: a camera's size is known from no calibration and no image; or, for
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
-        look = partial(_size_or_fault, decode=len(pictures) <= _MAX_DECODED)
+        look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
         seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
@@ -194,7 +196,8 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
     paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
     sizes, problems = {}, []
     for camera, own in by_camera.items():
-        usual = Counter(seen[p] for p in own if not isinstance(seen[p], str)).most_common(1)
+        headers = [header for p in own if not isinstance(header := seen[p], str)]
+        usual = Counter(header.size for header in headers).most_common(1)
         size = own[0].size or (usual[0][0] if usual else None)
         faults = []
         for picture in own:
@@ -214,22 +217,48 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
             faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
         sizes[camera] = size
         problems += faults
-    return DriveImages(paths, sizes, tuple(problems))
+    used = [
+        (p, h) for p, h in seen.items() if p.camera in paths[p.frame] and not isinstance(h, str)
+    ]
+    return DriveImages(paths, sizes, (*problems, *image_notes(used)))
 
 
-def _size_or_fault(picture: Picture, *, decode: bool) -> tuple[int, int] | str:
-    return _NO_FILE if picture.path is None else read_image_size(picture.path, decode=decode)
+def _header_or_fault(picture: Picture, *, decode: bool) -> ImageHeader | str:
+    return _NO_FILE if picture.path is None else check_image(picture.path, decode=decode)
 
 
-def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:
-    if seen == expected:
-        return ""
+def _fault(picture: Picture, seen: ImageHeader | str, expected: tuple[int, int] | None) -> str:
     if picture.path is None:
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
+    if expected is None or seen.size == expected:
+        return ""
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
+    return (
+        f"image {picture.path} is {size(seen.size)} pixels, its camera {size(expected)}; left out"
+        f"{exif_hint(seen, expected)}"
+    )
+
+
+def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
+    """A sentence where usable images have an EXIF orientation, and where they have 16 bits."""
+    notes = []
+    turned = [(picture, header) for picture, header in images if header.orientation != 1]
+    if turned:
+        picture, header = turned[0]
+        notes.append(
+            f"{len(turned)} of {len(images)} images have an EXIF orientation, such as "
+            f"{header.orientation} in camera {picture.camera}, frame {picture.frame}; it is "
+            f"ignored: poses and intrinsics are of the pixels as they are stored"
+        )
+    deep = [picture for picture, header in images if header.bits == 16]
+    if deep:
+        notes.append(
+            f"{len(deep)} of {len(images)} images have 16 bits a channel, such as of camera "
+            f"{deep[0].camera}, frame {deep[0].frame}; they are read as their values / 256"
+        )
+    return notes
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------
