@@ -269,6 +269,7 @@ class LabelledObject:
     visibility: float
     visible_fraction: float
     truncated_fraction: float
+    is_estimated: bool
     centre_m: np.ndarray
     size_m: np.ndarray
     camera_from_box: np.ndarray
@@ -317,6 +318,7 @@ def objects_of(
                 visibility=float(left[k]),
                 visible_fraction=float(flat["visible_fraction"][k]),
                 truncated_fraction=float(flat["truncated_fraction"][k]),
+                is_estimated=bool(flat["is_estimated"][k]),
                 centre_m=centres[k],
                 size_m=boxes.sizes_m[k],
                 camera_from_box=world_from_camera[:3, :3].T @ rotations[k],
@@ -330,7 +332,8 @@ def objects_of(
 
 def coco_annotation(it: LabelledObject, size: tuple[int, int]) -> dict[str, Any]:
     """An annotation without its numbers. size: of the image, width and height. Beside COCO's own
-    keys: bbox_amodal, occlusion, truncation, visibility, track_id, instance; null: not known.
+    keys: bbox_amodal, occlusion, truncation, visibility, is_estimated (the box by its 3D box, not
+    by pixels), track_id, instance; null: not known.
     """
     return {
         "bbox": _xywh(it.visible),
@@ -341,6 +344,7 @@ def coco_annotation(it: LabelledObject, size: tuple[int, int]) -> dict[str, Any]
         "occlusion": _rounded(1 - it.visible_fraction),
         "truncation": _rounded(it.truncated_fraction),
         "visibility": _rounded(it.visibility),
+        "is_estimated": it.is_estimated,
         "track_id": it.track_id,
         "instance": it.instance,
     }
