@@ -278,7 +278,7 @@ class _BoxesInView:
         is_behind = (enter <= leave) & (depths_m[near] > leave) & is_free
         before = near[is_before]
         held, placed = np.zeros(len(before), bool), self.placed
-        for other in np.flatnonzero(placed.is_finite).tolist() if len(before) else ():
+        for other in np.flatnonzero(placed.is_usable).tolist() if len(before) else ():
             corners = placed.low_m[other], placed.high_m[other]
             held |= _are_inside(self.returns.points_m[before], placed, other, *corners)
         return pixels[near[is_on & is_free]], pixels[before[~held]], int(is_behind.sum())

@@ -26,6 +26,7 @@ from jaxtyping import Float64, UInt8, UInt16
 from augment import base_photo, effects
 from augment.box_estimates import Estimate, Evidence, estimate_boxes
 from augment.boxes import (
+    NEAR_M,
     Instances,
     Occlusion,
     Outlines,
@@ -55,6 +56,9 @@ from augment.labels import Boxes, LabelSource
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from recipes.schema import Output, Recipe
+
+# Depth of the recording car in a picture that shows it: before every box.
+OWN_CAR_DEPTH_M = NEAR_M / 2
 
 
 @runtime_checkable
@@ -187,18 +191,32 @@ def show_boxes(
         evidence: reads what else is known of the frame's objects; None: depth alone decides.
         on_photo: the picture is a recorded one.
     """
-    surface, outlines = view.surface, outline_placed(placed, camera)
+    surface, outlines = _with_own_car(view.surface), outline_placed(placed, camera)
     numbers = instances.of(boxes.track_ids)
     actors = np.where(numbers <= len(instances.actors), numbers, 0)
     occlusion = find_occlusion(
-        _grown(placed, view), camera, surface.depth_m, surface.actors, actors, with_owners=masks
-    )
+        _grown(placed, view), camera, surface.depth_m, surface.actors, actors,
+        classes=surface.classes, with_owners=masks,
+    )  # fmt: skip
     estimates: Mapping[int, Estimate] = {}
     if evidence is not None:
         estimates = estimate_boxes(
-            placed, boxes.track_ids, camera, outlines, occlusion, evidence, on_photo=on_photo
-        )
+            placed, boxes.track_ids, camera, outlines, occlusion, evidence,
+            on_photo=on_photo, own_car=surface.own_car,
+        )  # fmt: skip
     return BoxesShown(outlines, occlusion, estimates)
+
+
+def _with_own_car(surface: Any) -> Any:
+    """A SurfaceView in which the recording car of its picture is what is nearest."""
+    if surface.own_car is None:
+        return surface
+    actors = surface.actors
+    return dataclasses.replace(
+        surface,
+        depth_m=np.where(surface.own_car, np.float32(OWN_CAR_DEPTH_M), surface.depth_m),
+        actors=None if actors is None else np.where(surface.own_car, np.uint16(0), actors),
+    )
 
 
 def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
@@ -773,6 +791,8 @@ def label_view(
         len(instances.actors),
     )
     painted = shown.paint_estimates(painted, numbers, surface.shown_classes)
+    if surface.own_car is not None:
+        painted = np.where(surface.own_car, np.uint16(0), painted)
     if wants_masks:
         measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(painted, numbers))
     changed: Any = view

@@ -1,4 +1,4 @@
-"""2D boxes of objects that rendered depth does not resolve."""
+"""2D boxes where rendered depth alone does not tell what shows an object."""
 
 from __future__ import annotations
 
@@ -39,13 +39,18 @@ def label(
     base: str = "recorded",
     splats: list | None = None,
     instance: bool = True,
+    classes: np.ndarray | None = None,
+    own_car: np.ndarray | None = None,
 ) -> tuple[np.ndarray | None, BoxNumbers, BoxNumbers]:
     """The instance image and both tables of boxes before a surface of that depth."""
     size = CAMERA.height, CAMERA.width
     depth = np.broadcast_to(np.float32(depth_m), size).copy()
-    classes = np.full(size, SemanticClass.UNKNOWN, np.uint8)
+    unknown = np.full(size, SemanticClass.UNKNOWN, np.uint8)
     none = np.zeros(size, np.uint16) if instance else None
-    surface = SurfaceView(depth, none, depth, classes, is_bare=False)
+    surface = SurfaceView(
+        depth, none, depth, unknown if classes is None else classes,
+        is_bare=False, classes=classes, own_car=own_car,
+    )  # fmt: skip
     view = WeatheredView(CAMERA, np.zeros((*size, 3), np.uint8), None, None, none, surface=surface)
     labelled = make_boxes(*(boxes or (CAR,)))
     evidence = Evidence(
@@ -148,3 +153,39 @@ def test_tables_without_the_column_are_read_as_of_depth_alone(tmp_path: Path) ->
     line = BOXES_2D.to_json(flat)
     assert BOXES_2D.from_json(line)["is_estimated"].tolist() == [True]
     assert BOXES_2D.from_json(line[:-1])["is_estimated"].tolist() == [False]
+
+
+# ---- Surfaces in a box that are not its object's -------------------------------------------------
+
+
+@pytest.mark.parametrize("scenery", [SemanticClass.VEGETATION, SemanticClass.ROAD])
+@pytest.mark.parametrize("instance", [True, False])
+def test_a_surface_of_scenery_in_a_box_is_not_its_object(
+    scenery: SemanticClass, instance: bool
+) -> None:
+    """A bush that reaches into the box of the car before it, 10 cm over the roof."""
+    _, y0, _, y1 = amodal_of(CAR)[0]
+    below = round(y0 + 0.3 * (y1 - y0))
+    classes = np.full((CAMERA.height, CAMERA.width), SemanticClass.VEHICLE, np.uint8)
+    classes[:below] = scenery
+    _, plain, _ = label(28.0, [], instance=instance)
+    _, flat, masks = label(28.0, [], instance=instance, classes=classes)
+    assert plain["modal_y0"][0] < y0 and flat["modal_y0"][0] == below
+    assert masks["top"][0] == below and masks["pixels"][0] == flat["pixels"][0]
+    assert flat["visible_fraction"][0] == 1  # the bush is beside it, not before it
+
+
+@pytest.mark.parametrize("depth_m", [28.0, 100.0])
+@pytest.mark.parametrize("instance", [True, False])
+def test_the_recording_car_in_a_photo_hides_what_is_behind_it(
+    depth_m: float, instance: bool
+) -> None:
+    _, y0, _, y1 = amodal_of(CAR)[0]
+    top = round((y0 + y1) / 2)
+    own_car = np.zeros((CAMERA.height, CAMERA.width), bool)
+    own_car[top:] = True
+    image, flat, masks = label(depth_m, ON_CAR, instance=instance, own_car=own_car)
+    assert flat["is_estimated"].tolist() == [depth_m == 100.0]
+    assert flat["modal_y1"][0] == masks["bottom"][0] == top
+    assert flat["visible_fraction"][0] == pytest.approx(0.5, abs=0.1)
+    assert image is None or not image[own_car].any()
