@@ -46,6 +46,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
+    names_in,
     recentred,
     scene_of_drive,
     usable_images,
@@ -678,7 +679,7 @@ def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
     positions = [table[f"position.{axis}"].to_numpy(dtype=np.float64) for axis in "xyz"]
     return Boxes(
         track_ids=tuple(str(v) for v in table["uuid"]),
-        labels=tuple(str(v) for v in table["label"]),
+        labels=names_in(table["label"]),
         centers_m=np.stack(positions, axis=1),
         sizes_m=np.stack(dimensions, axis=1),
         quats=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),

@@ -7,6 +7,7 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -398,6 +399,14 @@ class TimedBoxes:
             yield sample, bool(moves[i])
 
 
+def names_in(values: Iterable[object]) -> tuple[str, ...]:
+    """The texts of a dataset's column of names; "" of what is missing (None or NaN)."""
+    return tuple(
+        "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+        for value in values
+    )
+
+
 def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
     return next((boxes.attributes[name] for name in names if name in boxes.attributes), None)
 
@@ -426,8 +435,9 @@ def find_objects(
     several: an object may have several boxes in a frame; else the first one counts."""
     samples: list[BoxSample] = []
     labelled: set[str] = set()
-    bad, twice = [], []
+    bad, twice, nameless = [], [], []
     for timed in frames:
+        nameless += [timed.frame for label in timed.boxes.labels if not label]
         seen: set[str] = set()
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
@@ -444,7 +454,13 @@ def find_objects(
     if bad:
         problems.append(
             f"{len(bad)} boxes, the first in frame {bad[0]}, have a centre, size or rotation that "
-            f"is not finite or zero; objects are built without them"
+            f"is not finite or zero, or a negative size; objects are built without them, "
+            f"and labels for trainers have them as DontCare or not at all"
+        )
+    if nameless:
+        problems.append(
+            f"{len(nameless)} boxes, the first in frame {nameless[0]}, have no label; they are of "
+            f"no category, and left out of labels for trainers"
         )
     if twice:
         name, frame = twice[0]
