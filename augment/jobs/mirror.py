@@ -144,16 +144,17 @@ class SourceFolder(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """How many files a dataset has, and how many of them are camera images."""
+    """How many files a dataset has, and how many of them are camera images and LiDAR sweeps."""
 
     files: int
     images: int
+    sweeps: int = 0
 
 
 def survey(tree: SourceTree) -> Survey:
     """Look at all that belongs to a dataset, reading no file."""
-    are_images = [tree.is_image(file.relative) for folder in walk(tree) for file in folder.files]
-    return Survey(len(are_images), sum(are_images))
+    names = [file.relative for folder in walk(tree) for file in folder.files]
+    return Survey(len(names), sum(map(tree.is_image, names)), sum(map(tree.is_sweep, names)))
 
 
 def walk(tree: SourceTree, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
