@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -210,6 +211,37 @@ def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
         "0 of 3 LiDAR sweeps are weathered; 3 stay clear, as recorded"
     )
     assert not changed(root, copy) & LIDAR_FILES and contents(root) == before
+
+
+class Relabelled(Sweeps):
+    """Sweeps in files whose further contents are the source's."""
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return file.read_bytes() + super().lidar_content(frame_index, file, sweep)
+
+
+def test_new_labels_of_the_source_come_into_weathered_sweeps(root, tmp_path, bin_sweeps):
+    """Of the same size and time too; other changes of the file's facts are none of its labels."""
+    one, two = with_sweeps(root, "one", (0, 1)), with_sweeps(root, "two", (2,))
+    one, two = (dataclasses.replace(each, labels=Relabelled(root=root)) for each in (one, two))
+    out, copy = tmp_path / "out", tmp_path / "out/source/wet-000/002"
+    for scene in (one, two):
+        render(scene, out, make_recipe("wet", **WET))
+        mirror_outputs(scene, out, progress=False)
+    label = root / "lidar/00.bin"
+    time_ns = label.stat().st_mtime_ns
+    label.chmod(0o600)
+    assert "(up to date)" in mirror_outputs(two, out, progress=False)[0]
+    label.write_bytes(b"reviewed")
+    os.utime(label, ns=(time_ns, time_ns))
+    said = mirror_outputs(two, out, progress=False)  # knows nothing of the other's labels
+    assert "1 files of LiDAR of other scenes are out of date" in "\n".join(said)
+    assert "(1 files put in place)" in mirror_outputs(one, out, progress=False)[0]
+    assert (copy / "lidar/00.bin").read_bytes().startswith(b"reviewed")
+    assert (copy / "lidar/01.bin").read_bytes().startswith(b"recorded")
+    with pytest.raises(OutputError, match=r"1 file is not what was put .*lidar/01\.bin"):
+        (copy / "lidar/01.bin").write_bytes(b"edited")
+        mirror_outputs(one, out, progress=False)
 
 
 def test_scenes_of_one_dataset_keep_each_others_sweeps(root, tmp_path, bin_sweeps):
