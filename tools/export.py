@@ -131,6 +131,9 @@ def clear_notes(
         for name, path in frame.image_paths.items()
     }
     notes = _clear_note("camera images", extent.images, images, scene.name)
+    scheme, _, query = parse_uri(tree.uri)
+    if notes and scheme == "av2" and query.get("images") != "all":
+        notes[0] += "; images=all in its URI takes those between its sweeps"
     if not of_sweeps:
         return notes
     if not isinstance(scene.labels, StoresLidar):
@@ -151,7 +154,7 @@ def _clear_note(what: str, total: int, places: Mapping[str | None, bool], scene:
     reasons = [f"{left_out} of frames or cameras that are not rendered"] if left_out else []
     if others > 0:
         reasons.append(
-            f"{others} that no frame of scene {scene!r} has (taken between frames, or of other "
+            f"{others} that no frame of scene {scene!r} has (taken outside its frames, or of other "
             f"scenes)"
         )
     if not reasons:

@@ -96,7 +96,9 @@ def weather_sweeps_between(
     if missing:
         folder, backend = out_dir / STATE_FOLDER, rows[0]["backend"]
         share_effects(Sharing(scene, [recipe], folder=folder, backend=backend, progress=progress))
-    for number in tqdm(missing, desc="LiDAR between images", unit="sweep", disable=not progress):
+    for number in tqdm(
+        missing, desc="LiDAR between images", unit="sweep", disable=not (progress and missing)
+    ):
         try:
             sweep = scene.lidar(number)
             if sweep is None:

@@ -314,12 +314,12 @@ def test_what_will_stay_clear_is_said_before(root, bin_sweeps):
     scene = with_gap(with_sweeps(root, "one", (0, 1, 2)), 1)
     assert clear_notes(scene, of_sweeps=True) == [
         "4 of 8 camera images will stay clear in the dataset's copy: 4 that no frame of scene "
-        "'one' has (taken between frames, or of other scenes)"
+        "'one' has (taken outside its frames, or of other scenes)"
     ]
     assert clear_notes(scene, {0, 1}, ["front"], of_sweeps=True) == [
         "7 of 8 camera images will stay clear in the dataset's copy: 3 of frames or cameras that "
-        "are not rendered, 4 that no frame of scene 'one' has (taken between frames, or of other "
-        "scenes)",
+        "are not rendered, 4 that no frame of scene 'one' has (taken outside its frames, or of "
+        "other scenes)",
         "2 of 3 LiDAR sweeps will stay clear in the dataset's copy: 2 of frames or cameras that "
         "are not rendered",
     ]
