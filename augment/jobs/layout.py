@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -163,10 +164,10 @@ def resolve_inside(root: Path, relative: str) -> Path:
 def path_below(root: Path, parts: tuple[str, ...]) -> Path:
     """The path of these components, which no link leads out of the root."""
     path = root.joinpath(*parts)
-    real_root = root.resolve()
-    if not path.resolve().is_relative_to(real_root):
+    real_root, real_path = (Path(os.path.realpath(each)) for each in (root, path))
+    if not real_path.is_relative_to(real_root):  # a link to itself is left to who opens it
         raise OutputError(
-            f"{path} leads through a link to {path.resolve()}, outside {real_root}; "
+            f"{path} leads through a link to {real_path}, outside {real_root}; "
             f"put the files themselves under the output folder"
         )
     return path
