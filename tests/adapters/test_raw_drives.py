@@ -32,13 +32,7 @@ from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
 from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
 from adapters.procedural import StreetLabels
-from adapters.raw_drive import (
-    NO_SURFACE,
-    IncompleteDrive,
-    Picture,
-    class_of_air,
-    usable_images,
-)
+from adapters.raw_drive import NO_SURFACE, IncompleteDrive, Picture, class_of_air, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.uri import SCHEMES
