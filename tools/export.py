@@ -303,9 +303,9 @@ def _of_other_scenes(out: Path, variant: str, shown: Mapping[str, Shown]) -> dic
     by_path = {row["lidar_path"]: Weathered.sweep(out, row) for row in rows if is_weathered(row)}
     by_path |= {row["image_path"]: Weathered.image(out, row) for row in rows}
     for each in shown.values():
-        if each.sweep and is_sweep_between(out, variant, each.scene, each.sweep):
-            row = {"scene": each.scene, "lidar_path": each.sweep}
-            by_path.setdefault(each.sweep, Weathered.sweep(out, row))
+        path = each.sweep
+        if path and path not in by_path and is_sweep_between(out, variant, each.scene, path):
+            by_path[path] = Weathered.sweep(out, {"scene": each.scene, "lidar_path": path})
     found = {place: by_path.get(each.image or each.sweep) for place, each in shown.items()}
     return {
         place: ours for place, ours in found.items() if ours is not None and ours.path.is_file()
@@ -347,8 +347,8 @@ def _recipe_file(scene: Scene, out: Path, name: str) -> Path:
 def _check_there(scene: Scene, out: Path, deleted: Sequence[str]) -> None:
     if deleted:
         raise OutputError(
-            f"{_recipe_file(scene, out, deleted[0])} is not there, though {out / MANIFEST} lists "
-            f"images of {deleted[0]}: its folder was deleted. Render it again"
+            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST} lists "
+            f"images of {deleted[0]}; render it again"
         )
 
 

@@ -81,16 +81,16 @@ def weather_sweeps_between(
         rows: the variant's rows of the manifest.
         out_dir: the output folder, whose lock the caller holds.
     """
-    found = SweepsBetween([], {})
+    between = SweepsBetween([], {})
     if recipe.lidar != "weather" or not isinstance(scene.labels, StoresLidar):
-        return found
+        return between
     cameras = {row["camera"] for row in rows}
     span = frames_of_span(scene.frames, {row["frame"] for row in rows}, cameras)
-    told = {row["frame"] for row in rows if row["status"] == OK}
+    finished = {row["frame"] for row in rows if row["status"] == OK}
     places = {
         number: str(item_paths(scene.name, recipe, "", number)["lidar"])
         for number in span
-        if number not in told and scene.labels.lidar_files(number)
+        if number not in finished and scene.labels.lidar_files(number)
     }
     missing = [number for number, place in places.items() if not _is_weathered(out_dir / place)]
     if missing:
@@ -105,14 +105,14 @@ def weather_sweeps_between(
                 raise ValueError("its file cannot be read")
             data = lidar_bytes(weathered_sweep(scene, recipe, number, sweep))
         except Exception as error:  # of one sweep: the others have their weather
-            found.faults[number] = describe(error, "no weather on this sweep")
+            between.faults[number] = describe(error, "no weather on this sweep")
             continue
         write_atomic(out_dir / places[number], data, clear=False)
     for number, place in places.items():
-        if number not in found.faults:
+        if number not in between.faults:
             facts = {"scene": scene.name, "frame": number, "status": OK}
-            found.rows.append({**facts, "lidar": "weather", "lidar_path": place})
-    return found
+            between.rows.append({**facts, "lidar": "weather", "lidar_path": place})
+    return between
 
 
 def is_sweep_between(out_dir: Path, variant: str, scene: str, path: str) -> bool:
