@@ -343,7 +343,7 @@ def test_a_deleted_variant_does_not_stop_the_others(root, tmp_path):
             shutil.rmtree(out / "street/haze-000")
         with pytest.raises(OutputError, match=r"fog-000.* was deleted, .*; render it again"):
             mirror_outputs(scene, out, variants=variants or ["fog-000"], progress=False)
-    with pytest.raises(OutputError, match="recipe.yaml was deleted"):
+    with pytest.raises(OutputError, match=r"recipe\.yaml was deleted"):
         mirror_outputs(scene, out, progress=False)
 
 
