@@ -7,6 +7,7 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections import Counter, defaultdict
@@ -15,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ from adapters.drive_checks import camera_problems, lidar_problems
 from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
-from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
+from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
 from augment.files.image_size import ImageHeader
 from augment.files.recorded_images import exif_hint
@@ -317,14 +319,33 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
     return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
+def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
+    """The dataset's class number for returns that drops, flakes or fog made: that of the name, else
+    the lowest that stands for no surface, else the lowest of unknown meaning.
+
+    meaning, names: SemanticClass or NO_SURFACE, and the dataset's word, by class number."""
+    number = next((number for number, word in names.items() if word == name), None)
+    if number is not None:
+        return number
+    for wanted in (NO_SURFACE, SemanticClass.UNKNOWN):
+        if numbers := [number for number, what in meaning.items() if what == wanted]:
+            return min(numbers)
+    return next(number for number in itertools.count() if number not in meaning)
+
+
 def stored_records(
-    records: np.ndarray, columns: Sequence[str], sweep: LidarSweep, world_from_file: np.ndarray
+    records: np.ndarray,
+    columns: Sequence[str],
+    sweep: LidarSweep,
+    world_from_file: np.ndarray,
+    air: Mapping[str, float] = MappingProxyType({}),
 ) -> bytes:
     """Records float32 [N, C] of a file with a weathered sweep of them in their place.
 
-    columns: x, y, z, intensity and others, in the file's order. Returns that did not move keep
-    their coordinates to the bit; the others are carried back in float64, so that only float32's
-    rounding is left: less than 0.01 mm within 100 m of the sensor."""
+    columns: x, y, z, intensity and others, in the file's order. air: values of columns that say
+    what a return's surface is, for returns that drops, flakes or fog made. Returns that did not
+    move keep their coordinates to the bit; the others are carried back in float64, so that only
+    float32's rounding is left: less than 0.01 mm within 100 m of the sensor."""
     out = records[sweep.columns[INDEX_COLUMN]]
     changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
     offsets = sweep.points_m[changed] - world_from_file[:3, 3]
@@ -334,6 +355,8 @@ def stored_records(
     for axis, column in enumerate(axes):
         out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
+    for name, value in air.items():
+        out[is_in_air(sweep), columns.index(name)] = value
     return out.tobytes()
 
 
