@@ -7,6 +7,8 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 
 from __future__ import annotations
 
+import itertools
+import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -24,7 +27,7 @@ from adapters.drive_checks import camera_problems, lidar_problems
 from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
-from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
+from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
 from augment.files.image_size import ImageHeader
 from augment.files.recorded_images import exif_hint
@@ -316,14 +319,33 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
     return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
+def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
+    """The dataset's class number for returns that drops, flakes or fog made: that of the name, else
+    the lowest that stands for no surface, else the lowest of unknown meaning.
+
+    meaning, names: SemanticClass or NO_SURFACE, and the dataset's word, by class number."""
+    number = next((number for number, word in names.items() if word == name), None)
+    if number is not None:
+        return number
+    for wanted in (NO_SURFACE, SemanticClass.UNKNOWN):
+        if numbers := [number for number, what in meaning.items() if what == wanted]:
+            return min(numbers)
+    return next(number for number in itertools.count() if number not in meaning)
+
+
 def stored_records(
-    records: np.ndarray, columns: Sequence[str], sweep: LidarSweep, world_from_file: np.ndarray
+    records: np.ndarray,
+    columns: Sequence[str],
+    sweep: LidarSweep,
+    world_from_file: np.ndarray,
+    air: Mapping[str, float] = MappingProxyType({}),
 ) -> bytes:
     """Records float32 [N, C] of a file with a weathered sweep of them in their place.
 
-    columns: x, y, z, intensity and others, in the file's order. Returns that did not move keep
-    their coordinates to the bit; the others are carried back in float64, so that only float32's
-    rounding is left: less than 0.01 mm within 100 m of the sensor."""
+    columns: x, y, z, intensity and others, in the file's order. air: values of columns that say
+    what a return's surface is, for returns that drops, flakes or fog made. Returns that did not
+    move keep their coordinates to the bit; the others are carried back in float64, so that only
+    float32's rounding is left: less than 0.01 mm within 100 m of the sensor."""
     out = records[sweep.columns[INDEX_COLUMN]]
     changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
     offsets = sweep.points_m[changed] - world_from_file[:3, 3]
@@ -333,6 +355,8 @@ def stored_records(
     for axis, column in enumerate(axes):
         out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
+    for name, value in air.items():
+        out[is_in_air(sweep), columns.index(name)] = value
     return out.tobytes()
 
 
@@ -398,6 +422,14 @@ class TimedBoxes:
             yield sample, bool(moves[i])
 
 
+def names_in(values: Iterable[object]) -> tuple[str, ...]:
+    """The texts of a dataset's column of names; "" of what is missing (None or NaN)."""
+    return tuple(
+        "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+        for value in values
+    )
+
+
 def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
     return next((boxes.attributes[name] for name in names if name in boxes.attributes), None)
 
@@ -426,8 +458,9 @@ def find_objects(
     several: an object may have several boxes in a frame; else the first one counts."""
     samples: list[BoxSample] = []
     labelled: set[str] = set()
-    bad, twice = [], []
+    bad, twice, nameless = [], [], []
     for timed in frames:
+        nameless += [timed.frame for label in timed.boxes.labels if not label]
         seen: set[str] = set()
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
@@ -444,7 +477,13 @@ def find_objects(
     if bad:
         problems.append(
             f"{len(bad)} boxes, the first in frame {bad[0]}, have a centre, size or rotation that "
-            f"is not finite or zero; objects are built without them"
+            f"is not finite or zero, or a negative size; objects are built without them, "
+            f"and labels for trainers have them as DontCare or not at all"
+        )
+    if nameless:
+        problems.append(
+            f"{len(nameless)} boxes, the first in frame {nameless[0]}, have no label; they are of "
+            f"no category, and left out of labels for trainers"
         )
     if twice:
         name, frame = twice[0]
@@ -583,23 +622,20 @@ def _checked(drive: RawDrive) -> RawDrive:
     """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
     seems to be in another frame."""
     low, high = drive.path.min(axis=0), drive.path.max(axis=0)
-    near = [
+    is_near = [
         ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
         for sweep in drive.sweeps
     ]
     sweeps = tuple(
         sweep if keep.all() else sweep.select(keep)
-        for sweep, keep in zip(drive.sweeps, near, strict=True)
-    )
-    far = sum(int((~keep).sum()) for keep in near)
-    said = (
-        (
-            f"{far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path and "
-            f"are left out; coordinates must be metres",
-        )
-        if far
-        else ()
+        for sweep, keep in zip(drive.sweeps, is_near, strict=True)
     )
     timed = [(int(np.median(s.timestamps_ns)), s.points) for s in sweeps if len(s)]
-    frames = camera_problems(drive.frames) + lidar_problems(drive.frames, timed)
-    return replace(drive, sweeps=sweeps, problems=frames + said + drive.problems)
+    problems = [*camera_problems(drive.frames), *lidar_problems(drive.frames, timed)]
+    num_far = sum(int((~keep).sum()) for keep in is_near)
+    if num_far:
+        problems.append(
+            f"{num_far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path "
+            f"and are left out; coordinates must be metres"
+        )
+    return replace(drive, sweeps=sweeps, problems=(*problems, *drive.problems))

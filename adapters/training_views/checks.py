@@ -22,7 +22,6 @@ import torch
 
 from adapters.lidar_scene.depth import project_points
 from adapters.training_views.depth_priors import visible
-from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -34,6 +33,7 @@ from augment.geometry import (
     slerp,
 )
 from augment.labels import LidarSweep
+from augment.own_car import spread
 from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 

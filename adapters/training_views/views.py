@@ -14,11 +14,12 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
-from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
+from adapters.training_views.masks import read_ego_mask
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
+from augment.own_car import find_ego_mask, moving_frames
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.recorded_sky import lidar_top_rad, sky_mask
 from augment.scene import Scene

@@ -465,7 +465,7 @@ def test_folders_that_are_no_sequence_are_refused(own):
         (lambda: None, r"image 03\.jpg, but timestamps\.json ends with frame"),
         (lambda: [path.unlink() for path in left.glob("*.jpg")], "left_camera holds no images"),
         (lambda: shutil.rmtree(left), "no LiDAR returns in 3 frames"),
-        (lambda: (own / "camera").rename(own / "cam"), "camera does not exist"),
+        (lambda: (own / "camera").rename(own / "cam"), "camera holds no images <camera>/NN"),
         (lambda: own.rename(own.parent / "elsewhere"), "is not a folder"),
     )
     for path in (own / "lidar").glob("*.pkl.gz"):

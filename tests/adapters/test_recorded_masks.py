@@ -9,12 +9,18 @@ import cv2
 import drives
 import numpy as np
 import pytest
+import torch
 
-from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
+from adapters.training_views.masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
+from augment.cameras import Frame
 from augment.errors import AdapterError
+from augment.own_car import find_ego_mask, moving_frames, own_car_mask
 from augment.reconstruct.view import ViewKey
 from augment.recorded_sky import lidar_top_rad, looks_like_sky, sky_mask
+from augment.scene import Scene
+from augment.sky import ConstantSky
+from tests.scenes import one_gaussian
 
 NO_RETURNS = np.zeros(0, np.int32)
 SIZE = (160, 120)
@@ -174,6 +180,29 @@ def test_nothing_is_found_where_the_car_is_not_seen(monkeypatch):
     # A smooth road, and a car ahead that always keeps its distance.
     monkeypatch.setitem(globals(), "ROAD", np.full_like(ROAD, 100))
     assert not find_ego_mask(*drive_pictures(car_rows=None, lead_car=True)).any()
+
+
+@pytest.mark.parametrize("missing", [0, 8])
+def test_a_scene_tells_the_recording_car_in_its_photos_at_any_size(tmp_path, missing):
+    """Of twelve images; fewer than six tell nothing."""
+    cameras, pictures = drive_pictures(car_rows=np.full(160, 90))
+    frames = []
+    for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+        large, path = camera.scaled(4.0), tmp_path / f"{i}.png"
+        if i >= missing:
+            cv2.imwrite(str(path), cv2.resize(picture, (large.width, large.height)))
+        pose = torch.eye(4, dtype=torch.float64)
+        frames.append(Frame(i, camera.timestamp_ns, pose, {"a": large}, {"a": str(path)}))
+    scene = Scene("s", "test:", one_gaussian(), (), ConstantSky(torch.zeros(3)), tuple(frames))
+    whole = frames[3].cameras["a"]
+    mask = own_car_mask(scene, whole.scaled(0.5))
+    if missing:
+        assert mask is None
+        return
+    assert mask is not None and mask.shape == (240, 320)
+    assert np.abs(mask.argmax(axis=0) - 180).max() < 8 and mask[-1].all()
+    window = own_car_mask(scene, whole.cropped(100, 200, 300, 280))
+    assert window is not None and np.abs(window.argmax(axis=0) - 160).max() < 16
 
 
 def test_frames_are_taken_where_the_car_moved():

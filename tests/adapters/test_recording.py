@@ -278,6 +278,23 @@ def test_a_generated_variant_opens_as_a_rendered_one_does(tmp_path):
         assert boxes.track_ids == expected.labels.boxes(frame.index).track_ids
 
 
+def test_boxes_without_a_label_or_a_size_are_said_and_make_no_object(tmp_path):
+    root = write_recording(tmp_path / "odd")
+    path = root / "labels" / "boxes.parquet"
+    boxes = pq.ParquetFile(path).read()
+    track_ids, lengths = boxes["track_id"].to_pylist(), boxes["length_m"].to_pylist()
+    labels = [None if track == "parked" else "Car" for track in track_ids]
+    lengths[track_ids.index("car")] *= -1
+    for name, values in {"label": labels, "length_m": lengths}.items():
+        boxes = boxes.set_column(boxes.column_names.index(name), name, pa.array(values))
+    pq.write_table(boxes, path)
+    scene = open_recording(str(root), QUERY)
+    assert set(scene.labels.boxes(0).labels) == {"", "Car"}
+    problems = " ".join(scene.problems)
+    assert f"{track_ids.count('parked')} boxes, the first in frame 0, have no label" in problems
+    assert "1 boxes, the first in frame 0, have a centre, size or rotation" in problems
+
+
 def images_of(copy: Path):
     return find_images(copy, read_calibration(copy).frames)
 
@@ -544,8 +561,11 @@ def test_images_that_cannot_be_used_are_problems(copy):
     assert "images/roof belongs to no camera of calibration.json" in more[1]
     for path in copy.glob("images/front_camera/00000[02].png"):
         path.unlink()
-    for query in ({"held_out": "1:2"}, {"frames": "0:1"}):
-        with pytest.raises(AdapterError, match=r"no usable image of .* not held out.*: camera"):
+    for query, some in (
+        ({"held_out": "1:2"}, r"2 frames \(0, 2\) that are not held out"),
+        ({"frames": "0:1"}, r"1 frame \(0\);"),
+    ):
+        with pytest.raises(AdapterError, match=rf"no usable image in {some}.*camera"):
             open_recording(str(copy), QUERY | query)
 
 
