@@ -46,7 +46,7 @@ class ImageHeader:
     @property
     def turned_size(self) -> tuple[int, int]:
         """Width and height of the image turned as its EXIF orientation asks for."""
-        return self.size[::-1] if self.orientation >= _TURNED else self.size
+        return (self.height, self.width) if self.orientation >= _TURNED else self.size
 
 
 def read_image_header(path: str | Path) -> ImageHeader | None:
