@@ -380,6 +380,8 @@ def read_splats(
         return _reader_of(path, activated, level)(path)
     except MemoryError as error:
         raise SceneError(f"{path}: its Gaussians need more memory than there is: {error}") from None
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _reader_of(

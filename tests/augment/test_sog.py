@@ -332,6 +332,7 @@ def test_streamed_scenes_that_are_refused(tmp_path: Path) -> None:
         "another file": ({"filenames": ["lod-meta.json"], "tree": tree}, "in the same folder"),
         "a link": ({"filenames": ["link.sog"], "tree": tree}, "a link out of its folder"),
         "absent": ({"filenames": ["2_0/meta.json"], "tree": tree}, "2_0/meta.json, which is not"),
+        "a long name": ({"filenames": ["a" * 999 + ".sog"], "tree": tree}, "name too long"),
         "names": ({"filenames": [1] * 1000, "tree": tree}, r"filenames.0: .*; got 1$"),
     }
     (tmp_path / "f" / "link.sog").symlink_to(tmp_path / "outside.sog")
