@@ -154,13 +154,9 @@ def read_frames(
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
     world_from_ego, times_ns = read_ego_track(root)
     chosen = options.select(range(len(times_ns)), where=f"pandaset:{root}")
-    if not (root / "camera").is_dir():
-        raise AdapterError(
-            f"{root / 'camera'} does not exist; expected a PandaSet sequence's camera/"
-        )
-    folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir())
-    if not folders:
-        raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
+    has_images = any((root / "camera").glob("*/*.jpg"))
+    folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir()) if has_images else []
+    missing = () if folders else (f"{root / 'camera'} holds no images <camera>/NN.jpg",)
     cameras = {folder.name: _read_camera(folder, len(times_ns)) for folder in folders}
     pictures = [
         Picture(folder.name, n, folder / f"{n:02d}.jpg", cameras[folder.name].size)
@@ -184,11 +180,11 @@ def read_frames(
                 )
                 for name, camera in cameras.items()
             },
-            image_paths=images.paths[n],
+            image_paths=images.paths.get(n, {}),
         )
         for n in chosen.numbers
     )
-    return frames, chosen, origin, images.problems
+    return frames, chosen, origin, missing + images.problems
 
 
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +234,7 @@ def _read_times(path: Path, expected: int) -> np.ndarray:
         frame = int(np.argmin(np.diff(times) > 0)) + 1
         raise AdapterError(
             f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
-            f"{times[frame - 1]} s. Copy it again"
+            f"{times[frame - 1]} s. Correct the times in the file"
         )
     return np.round(times * 1e9).astype(np.int64)
 
@@ -255,7 +251,7 @@ def _read_poses(path: Path) -> np.ndarray:
         frame = int(np.argmax(off))
         raise AdapterError(
             f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
-            f"{headings[frame].tolist()}. Copy the file again"
+            f"{headings[frame].tolist()}. Divide it by its length"
         )
     positions = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
     return rigid(rotmat_from_quat(torch.from_numpy(headings)), torch.from_numpy(positions)).numpy()

@@ -29,17 +29,20 @@ LARGEST = 1e9  # metres or pixels: float64 tells a micrometre there, and no driv
 _MAX_BYTES = 1 << 30  # of a text; the longest table of nuScenes' training set has 0.6 GB
 _MAX_YAML = 1 << 18  # characters; the configurations of trained scenes have some 10 000
 _FROM_DATASET = "copy it from the dataset"
+# Whole files with a wrong value in them come from converters; another copy has it too.
+_MEND = "Correct the value in the file, or in the program that wrote it"
 Value = TypeVar("Value")
 
 
 def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
-    """A UTF-8 file. if_missing: what to do then, for the message."""
+    """A UTF-8 file, without the byte order mark that some editors begin it with. if_missing: what
+    to do then, for the message."""
     try:
         with open_file(path) as file:
             data = file.read(_MAX_BYTES + 1)
         if len(data) > _MAX_BYTES:
             raise AdapterError(f"{path} must have at most {_MAX_BYTES} bytes; it has more")
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except FileNotFoundError:
         raise AdapterError(f"{path} does not exist; {if_missing}") from None
     except (OSError, ValueError) as error:
@@ -115,9 +118,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def validated(
-    kind: type[Value], content: object, where: str, *, hint: str = "Copy the file again"
-) -> Value:
+def validated(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
     """What a file holds as a model, or as another type of pydantic's. where: file and place in it.
     hint: what to do where it is not such; both for messages."""
     try:

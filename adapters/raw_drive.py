@@ -11,7 +11,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from pydantic import BeforeValidator, Field
 
+from adapters.drive_checks import camera_problems, lidar_problems
 from adapters.plain_files import MISSING, read_image_size
 from adapters.uri import UriOptions
 from augment.cameras import Frame
@@ -31,6 +32,10 @@ from augment.scene import Gaussians, Ground, Scene
 from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
+# Returns further from the car's path than this are none: LiDARs of cars see some 300 m.
+_MAX_RANGE_M = 1000.0
+# Plan of a drive with what lies around it: maps of it have a cell a square metre.
+_MAX_AREA_M2 = 1 << 26
 MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatever its label says
 # Attributes that say so themselves, as PandaSet's and the street's boxes do.
 _STATIONARY = ("stationary", "is_parked")
@@ -471,10 +476,41 @@ class RawDrive:
     colour_every: int = 1
     has_metric_scale: bool = True
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            AdapterError: the car's path is wider than maps of it can be."""
+        path = self.path
+        width_m = np.ptp(path, axis=0)[:2]
+        if np.prod(width_m + 2 * _MAX_RANGE_M) > _MAX_AREA_M2:
+            steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            number = int(steps.argmax())
+            raise AdapterError(
+                f"{self.source}: the car's path is {width_m[0]:.3g} x {width_m[1]:.3g} m wide, "
+                f"more than a scene can be; it goes furthest, {steps[number]:.3g} m, between "
+                f"frames {self.frames[number].index} and {self.frames[number + 1].index}. Poses "
+                f"must be metres; of a longer drive choose some frames (frames=)"
+            )
+
+    @property
+    def path(self) -> np.ndarray:
+        """The car's places in the frames, float64 [F, 3]."""
+        return np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames])
+
     @property
     def used(self) -> tuple[Frame, ...]:
         """The frames that the scene is built from."""
         return tuple(frame for frame in self.frames if frame.index not in self.held_out)
+
+
+class IncompleteDrive(AdapterError):
+    """A drive of which no scene can be built, for it has no images or no LiDAR returns.
+
+    drive: what it has. ground: the road, where it is known from elsewhere."""
+
+    def __init__(self, message: str, drive: RawDrive, ground: Ground | None) -> None:
+        super().__init__(message)
+        self.drive, self.ground = drive, ground
 
 
 def scene_of_drive(
@@ -488,20 +524,53 @@ def scene_of_drive(
     background, and of the road, from elsewhere.
 
     Raises:
-        AdapterError: there is no return or no image to build from, or no image shows a return."""
+        IncompleteDrive: there is no return or no image to build from.
+        AdapterError: no image shows a return."""
     # Labels are read without the kernels that scenes are built by.
     from adapters.lidar_scene.scene import build_lidar_scene
 
+    drive = _checked(drive)
     numbers = some([frame.index for frame in drive.used])
+    held_out = " that are not held out" if drive.held_out else ""
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
-    if not any(map(len, drive.sweeps)):
-        raise AdapterError(
-            f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
-            f"without them, unpack the sweeps again{first}"
-        )
     if not any(frame.image_paths for frame in drive.used):
-        raise AdapterError(
-            f"{drive.source}: there is no usable image in {numbers} that are not held out; colours "
-            f"cannot be had without them, choose more frames or unpack the images again{first}"
+        raise IncompleteDrive(
+            f"{drive.source}: there is no usable image in {numbers}{held_out}; colours cannot be "
+            f"had without them, choose more frames or unpack the images again{first}",
+            drive,
+            ground,
+        )
+    if not any(map(len, drive.sweeps)):
+        raise IncompleteDrive(
+            f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
+            f"without them, unpack the sweeps again{first}",
+            drive,
+            ground,
         )
     return build_lidar_scene(drive, options, added=added, ground=ground)
+
+
+def _checked(drive: RawDrive) -> RawDrive:
+    """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
+    seems to be in another frame."""
+    low, high = drive.path.min(axis=0), drive.path.max(axis=0)
+    near = [
+        ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
+        for sweep in drive.sweeps
+    ]
+    sweeps = tuple(
+        sweep if keep.all() else sweep.select(keep)
+        for sweep, keep in zip(drive.sweeps, near, strict=True)
+    )
+    far = sum(int((~keep).sum()) for keep in near)
+    said = (
+        (
+            f"{far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path and "
+            f"are left out; coordinates must be metres",
+        )
+        if far
+        else ()
+    )
+    timed = [(int(np.median(s.timestamps_ns)), s.points) for s in sweeps if len(s)]
+    frames = camera_problems(drive.frames) + lidar_problems(drive.frames, timed)
+    return replace(drive, sweeps=sweeps, problems=frames + said + drive.problems)

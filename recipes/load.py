@@ -136,7 +136,7 @@ def read_text(path: Path, max_bytes: int, *, missing: str, too_large: str) -> st
     if len(data) > max_bytes:
         raise RecipeError(f"{source}: larger than {max_bytes} bytes: {too_large}")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")  # some editors begin with a byte order mark
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         text = f"not UTF-8 text (byte 0x{data[error.start]:02x}): save the file as UTF-8"

@@ -27,7 +27,7 @@ from tools.options import (
     SceneCommand,
     StyleTrainOptions,
 )
-from tools.output import LABELS_OF_STORES, JsonFile, check_local, write_json
+from tools.output import LABELS_OF_STORES, JsonFile, NoteHandler, check_local, write_json
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -164,6 +164,9 @@ class GenerateOptions(SceneCommand):
 class InspectOptions(SceneCommand):
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
+    Of a recorded drive without images or without LiDAR, of which no scene can be made, it shows
+    what is there and what is missing, and ends with exit code 1.
+
     Args:
         uri: The scene, as for render.
         camera_path: A JSON file of camera poses to look at instead of the scene's own.
@@ -175,9 +178,16 @@ class InspectOptions(SceneCommand):
     json_file: JsonFile = None
 
     def run(self) -> int:
-        from tools.explain import describe_scene, scene_text
+        from adapters.raw_drive import IncompleteDrive
+        from tools.explain import describe_drive, describe_scene, drive_text, scene_text
 
-        facts = describe_scene(open_with_path(self.uri, self.camera_path))
+        try:
+            facts = describe_scene(open_with_path(self.uri, self.camera_path))
+        except IncompleteDrive as error:
+            facts = describe_drive(error)
+            print(drive_text(facts))
+            write_json(self.json_file, facts)
+            return 1
         print(scene_text(facts))
         write_json(self.json_file, facts)
         return 0
@@ -627,7 +637,7 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     table, prog = COMMANDS, "climategs"
     description = "Weather for driving scenes made of 3D Gaussians."
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[NoteHandler()])
     try:
         check_arguments(arguments)
         if arguments and arguments[0] in ("bench", *GROUPS):

@@ -312,7 +312,7 @@ def _read_lenses(root: Path, ego_from: Mapping[str, np.ndarray]) -> dict[str, Le
         if not re.fullmatch(r"\w{1,100}", name, re.ASCII):
             raise AdapterError(f"{path}: {name!r:.200} cannot be a camera's folder")
         if name not in ego_from:
-            raise AdapterError(f"{path}: camera {name} has no pose in {SENSORS}; copy it again")
+            raise AdapterError(f"{path}: camera {name} has no pose in {SENSORS}; add its row")
         if min(fx, fy, width, height) <= 0:
             raise AdapterError(
                 f"{path}: camera {name}: fx_px, fy_px, width_px, height_px must be above 0; got "

@@ -443,11 +443,6 @@ def read_recording(
     listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
     frames, image_problems = find_images(root, listed)
     used = [frame for frame in frames if frame.index not in chosen.held_out]
-    if not any(frame.image_paths for frame in used):
-        raise AdapterError(
-            f"{root / 'images'} holds no usable image of {some(chosen.used)} that are not held "
-            f"out; colours cannot be had without them: " + "; ".join(image_problems[:3])
-        )
     objects = read_objects(root, frames, calibration.world_origin_m)
     lidar = read_lidar_drive(root, calibration, used)
     drive = RawDrive(
@@ -489,7 +484,7 @@ def _best_scene(
 ) -> Scene:
     """The scene from LiDAR, else from depth images, else from guesses."""
     count = sum(map(len, drive.sweeps))
-    if count >= _MIN_RETURNS:
+    if count >= _MIN_RETURNS or not any(frame.image_paths for frame in drive.used):
         return scene_of_drive(drive, options)
     start = f"{root / 'lidar'} holds {count or 'no'} returns"
     sweeps, problems = depth_sweeps(root, drive.used)

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
-from tqdm import tqdm
 
 import augment
 from augment.errors import OutputError
@@ -71,6 +70,7 @@ from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_jo
 from augment.jobs.scene_changes import SceneChange, changes_in
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
+from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from augment.trust import left_out_sentence, magnified_sentence
@@ -306,7 +306,7 @@ def resolve_recipes(
         ResolveTask(uri, name, tuple(dict.fromkeys(recipes)), keep): scene
         for (uri, name, scene), recipes in left.items()
     }
-    bar = tqdm(
+    bar = ProgressBar(
         total=len(tasks), unit="scene", desc="choosing settings", disable=not progress or not tasks
     )
 
@@ -681,7 +681,9 @@ class _Generation:
                 _log.warning("note: and %d more; `climategs inspect` says them", len(more))
             self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
         skipped, started = work.tally.skipped, time.perf_counter()
-        self._bar = tqdm(total=total, initial=skipped, unit="image", disable=not self._progress)
+        self._bar = ProgressBar(
+            total=total, initial=skipped, unit="image", disable=not self._progress
+        )
         with self._bar:
             try:
                 workers.do(work, idle=self._merge_at_times)
@@ -768,7 +770,7 @@ def _plan(
     changed = {change.record_path for change in changes}
     found: dict[tuple[str, str | None], SceneRecord | str] = {} if job.rescan else {**known}
     tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
-    with tqdm(
+    with ProgressBar(
         total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
     ) as bar:
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 import augment
 from augment.cameras import Camera, Frame
@@ -28,6 +27,7 @@ from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer, default_renderer
 from augment.memo import memo_of
 from augment.metrics.image import flip
+from augment.progress import ProgressBar
 from augment.scene import Scene
 from recipes.fields import replaced
 from recipes.schema import KNOBS, Recipe, Value, free_knobs, with_settings
@@ -318,7 +318,9 @@ def resolve_quality(
     # An object of its own, which takes along what is found of settings that are not chosen.
     tried_on = copy.copy(scene)
     options = _options(recipe)
-    bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
+    bar = ProgressBar(
+        unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress
+    )
     with bar:
         while True:
             reference = first_settings(options)

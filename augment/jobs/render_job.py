@@ -18,8 +18,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
-from tqdm import tqdm
-
 import augment
 from augment.base_photo import check_photos
 from augment.cameras import Frame
@@ -51,6 +49,7 @@ from augment.jobs.worker import (
     WorkTimes,
 )
 from augment.memo import memo_of
+from augment.progress import ProgressBar
 from augment.scene import Scene
 from recipes.fields import found, replaced
 from recipes.files import read_files, with_digest
@@ -351,7 +350,7 @@ class _Run:
                 if not self.job.overwrite:
                     pending = sorted({chunk.variant for chunk in chunks})
                     self._prepare([self.recipes[number] for number in pending])
-                self.bar = tqdm(
+                self.bar = ProgressBar(
                     total=self.total, initial=self.skipped, unit="image", disable=not self.progress
                 )
                 with self.bar:

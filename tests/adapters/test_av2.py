@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import re
@@ -211,6 +212,13 @@ def write(name: str, content: bytes | None) -> Callable[[Path], None]:
     return change
 
 
+def feather_of_zeros(count: int) -> bytes:
+    """A Feather file of some kB."""
+    sink = io.BytesIO()
+    feather.write_feather(pa.table({"qw": np.zeros(count, np.int8)}), sink, compression="zstd")
+    return sink.getvalue()
+
+
 POSES = Path("city_SE3_egovehicle.feather")
 LENSES = Path("calibration/intrinsics.feather")
 SENSORS = Path("calibration/egovehicle_SE3_sensor.feather")
@@ -218,9 +226,17 @@ BOXES = Path("annotations.feather")
 REFUSED = {
     "no path": (write(str(POSES), None), r"is not a log .* it has no city_SE3_egovehicle\.feather"),
     "no table": (write(str(LENSES), b"ARROW1 no"), r"intrinsics\.feather is not a whole Feather"),
+    "zeros without an end": (
+        write(str(SENSORS), feather_of_zeros(9_000_000)),
+        r"sensor\.feather is not a whole Feather table \(it states more than 8388608 rows",
+    ),
+    "lists in place of texts": (
+        table(SENSORS, sensor_name=lambda v: [[name] for name in v]),
+        r"sensor_name must hold texts; it holds list",
+    ),
     "no lenses": (write(str(LENSES), None), r"intrinsics\.feather does not exist; copy it"),
     "no column": (table(POSES, qz=None), r"must have one column qz; it has \["),
-    "texts": (table(POSES, qz=lambda v: v.astype(str)), r"qz must hold numbers .* holds object"),
+    "texts": (table(POSES, qz=lambda v: v.astype(str)), r"qz must hold numbers .* holds string"),
     "float stamps": (
         table(POSES, timestamp_ns=lambda v: v.astype(np.float64)),
         r"timestamp_ns must hold whole numbers; it holds float64",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,17 +19,20 @@ import pandas as pd
 import pandaset_folder
 import pyarrow.parquet as pq
 import pytest
+import waymo_files
 from drivestudio_files import write_run
-from recording_folder import write_recording
+from recording_folder import edit_calibration, write_recording
 from shown import assert_same_bits
 
 from adapters.av2.adapter import Av2Log
+from adapters.base import open_scene
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
+from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
 from adapters.procedural import StreetLabels
-from adapters.raw_drive import Picture, usable_images
+from adapters.raw_drive import IncompleteDrive, Picture, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.uri import SCHEMES
@@ -45,6 +49,8 @@ from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError
 from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
+from recipes.load import load_recipe
+from tools.explain import describe_drive, drive_text
 
 QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
 RAW: dict[str, tuple[Callable[[Path], Path], dict[str, str]]] = {
@@ -86,6 +92,85 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: 
     np.testing.assert_array_equal(labels.boxes(number).centers_m, scene.boxes(number).centers_m)
     assert len(scene.boxes(number)) >= 2
     np.testing.assert_array_equal(labels.lidar(0).points_m, scene.lidar(0).points_m)
+
+
+MARK = b"\xef\xbb\xbf"  # with which some editors begin UTF-8
+
+
+def test_texts_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    text, table, tree = tmp_path / "a.txt", tmp_path / "a.json", tmp_path / "a.yaml"
+    text.write_bytes(MARK + b"1 2")
+    table.write_bytes(MARK + b'{"a": 1}')
+    tree.write_bytes(MARK + b"a: 1")
+    assert read_numbers(text).tolist() == [1, 2]
+    assert read_json(table) == read_yaml(tree) == {"a": 1}
+    tree.write_bytes(MARK + b"name: fog\nweather: {smog: {visibility_m: 100}}\n")
+    assert load_recipe(str(tree)).name == "fog"
+
+
+def test_values_of_another_type_are_said_to_be_corrected_not_copied(tmp_path: Path) -> None:
+    with pytest.raises(AdapterError, match=r"x: must be a valid number.* Correct the value") as e:
+        validated(Number, "a", "x")
+    assert "opy" not in str(e.value)
+
+
+LACKS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
+    "pandaset": (RAW["pandaset"][0], "", "camera/*/*.jpg"),
+    "nuscenes": (RAW["nuscenes"][0], "scene=scene-0001", "*/CAM_*/*.jpg"),
+    "kitti": (RAW["kitti"][0], "", "image_*/data/*"),
+    "kitti-object": (kitti_files.write_object, "frame=1", "image_2/*"),
+    "av2": (RAW["av2"][0], "", "sensors/cameras/*/*.jpg"),
+    "recording": (write_recording, "", "images/*/*"),
+    "waymo": (waymo_files.write_segment, "", "camera_*/*.parquet"),
+    "pandaset-lidar": (RAW["pandaset"][0], "", "lidar/*.pkl.gz"),
+    "waymo-lidar": (waymo_files.write_segment, "", "lidar*/*.parquet"),
+}
+
+
+@pytest.mark.parametrize("case", LACKS)
+def test_a_drive_without_images_or_returns_is_described_and_makes_no_scene(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write, query, pattern = LACKS[case]
+    root = write(tmp_path / "2011_09_26")
+    files = list(root.glob(pattern))
+    assert files
+    for file in files:
+        file.unlink()
+    with pytest.raises(
+        IncompleteDrive, match=r"there (is no usable image|are no LiDAR returns)"
+    ) as e:
+        open_scene(f"{case.split('-')[0]}:{root}?{query}")
+    facts = describe_drive(e.value)
+    has_returns = "lidar" not in pattern
+    assert (facts["lidar"]["returns"] > 1000) == has_returns
+    assert (sum(camera["images"] for camera in facts["cameras"]) > 0) != has_returns
+    assert facts["frames"]["count"] >= 1
+    assert facts["boxes"]["count"] >= 2 or case == "waymo-lidar"  # whose pattern has lidar_box
+    page = drive_text(facts)
+    assert "scene       none: there" in page and "LiDAR       " in page and "boxes " in page
+
+
+def test_returns_beyond_any_reach_are_left_out_and_paths_must_be_metres(tmp_path: Path) -> None:
+    root = kitti_files.write_object(tmp_path)
+    (file,) = root.glob("velodyne/*.bin")
+    records = np.fromfile(file, "<f4").reshape(-1, 4)
+    records[100, 0], records[200, 1] = 1e20, -2000
+    records.tofile(file)
+    scene = SCHEMES["kitti"].open(str(root), QUERY)
+    said = "2 LiDAR returns lie further than 1000 m from the car's path and are left out"
+    assert any(said in problem for problem in scene.problems)
+    wide = write_recording(tmp_path / "wide")
+
+    def jump(calibration: dict) -> None:
+        for entry in calibration["frames"][2:]:
+            entry["world_from_ego"][0][3] += 4e7
+
+    edit_calibration(wide, jump)
+    shutil.rmtree(wide / "lidar")
+    with pytest.raises(AdapterError, match=r"4e\+07 x 0 m wide.*between frames 1 and 2"):
+        SCHEMES["recording"].open(str(wide), QUERY)
 
 
 CODES = np.array(

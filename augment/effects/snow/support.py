@@ -62,6 +62,9 @@ def support_key(
         digest.update(repr(about).encode())
         _add(digest, camera.camera_from_world)
     _add(digest, *(frame.world_from_ego for frame in scene.frames))
+    if scene.seen_frames is not None:  # wheel tracks are those of the recorded drive
+        digest.update(repr(settings.invented_tracks).encode())
+        _add(digest, *(frame.world_from_ego for frame in scene.seen_frames))
     return digest.hexdigest()
 
 
