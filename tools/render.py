@@ -51,7 +51,7 @@ from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video, write_rgb
-from tools.export import label_files, mirror_outputs, recipes_for_source
+from tools.export import clear_notes, label_files, mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
 from tools.output import (
     LABELS_OF_STORES,
@@ -362,6 +362,10 @@ def render_recipes(options: RenderOptions) -> int:
     chosen = parse_frames(options.frames).select([frame.index for frame in scene.frames])
     cameras = _cameras(options, scene, path)
     frames = [f for f in path or scene.frames if chosen is None or f.index in chosen]
+    if options.layout == "source":
+        of_sweeps = any(resolved.lidar == "weather" for resolved in recipes)
+        for note in clear_notes(scene, chosen, cameras, of_sweeps=of_sweeps):
+            print_note(f"note: {note}")
     scale = max(resolved.render.scale for resolved in recipes)
     for problem in judge_scene(scene, frames, cameras, scale=scale, count=1).problems:
         print_note(f"note: not fit for weather: {problem}")

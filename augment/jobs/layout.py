@@ -49,7 +49,7 @@ def variant_name(recipe: Recipe) -> str:
 # Kinds of files whose paths a row of the manifest has, but for those of effects.
 _IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
 _LAST = "calibration"
-TRUST = "trust"  # the mask of what of a picture can be believed, see augment.trust
+TRUST = "trust"  # the mask of how far a picture can be believed, 0 to 255, see augment.trust
 
 
 def path_kinds() -> tuple[str, ...]:
