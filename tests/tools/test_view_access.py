@@ -127,6 +127,8 @@ def test_a_connection_needs_the_token_this_machines_name_and_its_own_pages_origi
         (f"/?{token}", f"Host: 203.0.113.7:{port}\r\n"),
         (f"/?{token}", ""),
         (f"/?{token}", host + host),
+        (f"/?{token}", "Host: [:::]\r\n"),
+        (f"//[::?{token}x", host),
         # viser's page would connect to that server, or play that file.
         (f"/?{token}&websocket=wss://evil.example", host),
         (f"/?playbackPath=https://evil.example/x.viser&{token}", host),
@@ -250,6 +252,17 @@ def test_a_widget_takes_only_values_that_it_can_have(url, pages, caplog):
     assert len(pages.refusals) == sum(map(len, hostile.values())) - len(hostile["file"])
     assert "number: 11 is not within its ends, 0 to 10" in pages.refusals
     assert not caplog.records
+
+
+def test_a_page_moves_no_widgets_of_another(url, pages):
+    with PageClient(url) as one, PageClient(url) as other:
+        (flag,) = one.wait_for(lambda: one.widgets.get("flag"), "the page")
+        other.wait_for(lambda: other.widgets.get("file"), "the other page")
+        update = {"type": "GuiUpdateMessage", "uuid": flag["uuid"], "updates": {"value": True}}
+        other.send(update)
+        other.set("line", "from the other")
+        wait_until(lambda: pages.values)
+    assert pages.values == ["from the other"] and not flag["value"]
 
 
 def begun(name: str, size: int, parts: int) -> FileTransferStartUpload:
