@@ -216,7 +216,7 @@ def test_refusals(tmp_path: Path) -> None:
         "a mirror": (changed("nodes", 0, "scale", to=[-1, 1, 1]), "mirrors"),
         "no rotation": (changed("nodes", 0, "rotation", to=[0, 0, 0, 0]), "node 0 has no place"),
         "beyond float64": (changed("nodes", 0, "scale", to=[1e200] * 3), "no usable Gaussians"),
-        "nodes": (changed("nodes", to=[{}] * 100_001), "100001 nodes; at most 100000"),
+        "nodes": (changed("nodes", to=[{}] * 20_001), "20001 nodes; at most 20000"),
         "placed": (
             changed("nodes", to=[{"mesh": 0}] * 10_001) | {"scenes": [{"nodes": [*range(10_001)]}]},
             "more than 10000 primitives",
