@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, read_image_size, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -43,9 +43,11 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    class_of_air,
     drive_origin,
     find_objects,
     is_usable,
+    names_in,
     recentred,
     scene_of_drive,
     usable_images,
@@ -54,7 +56,7 @@ from adapters.raw_drive import (
 from adapters.safe_pickle import read_frame
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.codes import INDEX_COLUMN
+from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.labels import Boxes, LidarSweep
@@ -217,8 +219,8 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
-    size = next((found for found in seen if not isinstance(found, str)), None)
+    headers = (check_image(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((header.size for header in headers if not isinstance(header, str)), None)
     if size is None:
         raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
     return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))
@@ -422,9 +424,10 @@ _NO_SENSOR = -1  # the sensor of a box that was drawn around both sensors' retur
 SENSORS_M = np.array([[0.81, 0.0, 1.85], [1.35, 0.04, 1.65]])
 
 # The published classes.json, numbered from 1.
+_AIR = "Spray or rain"
 _S = SemanticClass
 _CLASSES: tuple[tuple[str, int], ...] = (
-    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), ("Spray or rain", NO_SURFACE),
+    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), (_AIR, NO_SURFACE),
     ("Reflection", NO_SURFACE), ("Vegetation", _S.VEGETATION), ("Ground", _S.TERRAIN),
     ("Road", _S.ROAD), ("Lane Line Marking", _S.LANE_MARKING),
     ("Stop Line Marking", _S.LANE_MARKING), ("Other Road Marking", _S.LANE_MARKING),
@@ -576,19 +579,25 @@ def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
     return shared / (np.prod(a[1]) + np.prod(b[1]) - shared)
 
 
-def class_meanings(root: Path) -> dict[int, int]:
-    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN.
-    Numbers are those of annotations/semseg/classes.json, or of the published list."""
+def class_names(root: Path) -> dict[int, str]:
+    """The sequence's classes by number: those of annotations/semseg/classes.json, or of the
+    published list."""
     path = root / "annotations" / "semseg" / "classes.json"
     if not path.exists():
-        return {number: meaning for number, (_, meaning) in enumerate(_CLASSES, start=1)}
-    names, meaning = read_json(path), dict(_CLASSES)
+        return {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
+    names = read_json(path)
     for key, name in names.items():
         if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
             raise AdapterError(
                 f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
             )
-    return {int(n): meaning.get(name, SemanticClass.UNKNOWN) for n, name in names.items()}
+    return {int(number): name for number, name in names.items()}
+
+
+def class_meanings(root: Path) -> dict[int, int]:
+    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN."""
+    meaning = dict(_CLASSES)
+    return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in class_names(root).items()}
 
 
 # ---- Labels --------------------------------------------------------------------------------------
@@ -653,6 +662,9 @@ class PandaSetLabels:
         if file == frame_file(self.root, "lidar", frame_index):
             for name in "xyzi":
                 table[name] = sweep.columns[name]
+        else:
+            air = class_of_air(class_meanings(self.root), class_names(self.root), _AIR)
+            table["class"] = np.where(is_in_air(sweep), air, table["class"].to_numpy())
         stream = io.BytesIO()
         table.to_pickle(stream, compression=None, protocol=4)
         return gzip.compress(stream.getvalue(), compresslevel=6, mtime=0)
@@ -678,7 +690,7 @@ def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
     positions = [table[f"position.{axis}"].to_numpy(dtype=np.float64) for axis in "xyz"]
     return Boxes(
         track_ids=tuple(str(v) for v in table["uuid"]),
-        labels=tuple(str(v) for v in table["label"]),
+        labels=names_in(table["label"]),
         centers_m=np.stack(positions, axis=1),
         sizes_m=np.stack(dimensions, axis=1),
         quats=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),

@@ -7,6 +7,8 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 
 from __future__ import annotations
 
+import itertools
+import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -21,11 +24,13 @@ import torch
 from pydantic import BeforeValidator, Field
 
 from adapters.drive_checks import camera_problems, lidar_problems
-from adapters.plain_files import MISSING, read_image_size
+from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
-from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
+from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
+from augment.files.image_size import ImageHeader
+from augment.files.recorded_images import exif_hint
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
@@ -186,7 +191,7 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
         AdapterError: a camera's size is known from no calibration and no image; or, for
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
-        look = partial(_size_or_fault, decode=len(pictures) <= _MAX_DECODED)
+        look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
         seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
@@ -194,7 +199,8 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
     paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
     sizes, problems = {}, []
     for camera, own in by_camera.items():
-        usual = Counter(seen[p] for p in own if not isinstance(seen[p], str)).most_common(1)
+        headers = [header for p in own if not isinstance(header := seen[p], str)]
+        usual = Counter(header.size for header in headers).most_common(1)
         size = own[0].size or (usual[0][0] if usual else None)
         faults = []
         for picture in own:
@@ -214,22 +220,48 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
             faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
         sizes[camera] = size
         problems += faults
-    return DriveImages(paths, sizes, tuple(problems))
+    used = [
+        (p, h) for p, h in seen.items() if p.camera in paths[p.frame] and not isinstance(h, str)
+    ]
+    return DriveImages(paths, sizes, (*problems, *image_notes(used)))
 
 
-def _size_or_fault(picture: Picture, *, decode: bool) -> tuple[int, int] | str:
-    return _NO_FILE if picture.path is None else read_image_size(picture.path, decode=decode)
+def _header_or_fault(picture: Picture, *, decode: bool) -> ImageHeader | str:
+    return _NO_FILE if picture.path is None else check_image(picture.path, decode=decode)
 
 
-def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:
-    if seen == expected:
-        return ""
+def _fault(picture: Picture, seen: ImageHeader | str, expected: tuple[int, int] | None) -> str:
     if picture.path is None:
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
+    if expected is None or seen.size == expected:
+        return ""
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
+    return (
+        f"image {picture.path} is {size(seen.size)} pixels, its camera {size(expected)}; left out"
+        f"{exif_hint(seen, expected)}"
+    )
+
+
+def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
+    """A sentence where usable images have an EXIF orientation, and where they have 16 bits."""
+    notes = []
+    turned = [(picture, header) for picture, header in images if header.orientation != 1]
+    if turned:
+        picture, header = turned[0]
+        notes.append(
+            f"{len(turned)} of {len(images)} images have an EXIF orientation, such as "
+            f"{header.orientation} in camera {picture.camera}, frame {picture.frame}; it is "
+            f"ignored: poses and intrinsics are of the pixels as they are stored"
+        )
+    deep = [picture for picture, header in images if header.bits == 16]
+    if deep:
+        notes.append(
+            f"{len(deep)} of {len(images)} images have 16 bits a channel, such as of camera "
+            f"{deep[0].camera}, frame {deep[0].frame}; they are read as their values / 256"
+        )
+    return notes
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------
@@ -287,14 +319,33 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
     return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
+def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
+    """The dataset's class number for returns that drops, flakes or fog made: that of the name, else
+    the lowest that stands for no surface, else the lowest of unknown meaning.
+
+    meaning, names: SemanticClass or NO_SURFACE, and the dataset's word, by class number."""
+    number = next((number for number, word in names.items() if word == name), None)
+    if number is not None:
+        return number
+    for wanted in (NO_SURFACE, SemanticClass.UNKNOWN):
+        if numbers := [number for number, what in meaning.items() if what == wanted]:
+            return min(numbers)
+    return next(number for number in itertools.count() if number not in meaning)
+
+
 def stored_records(
-    records: np.ndarray, columns: Sequence[str], sweep: LidarSweep, world_from_file: np.ndarray
+    records: np.ndarray,
+    columns: Sequence[str],
+    sweep: LidarSweep,
+    world_from_file: np.ndarray,
+    air: Mapping[str, float] = MappingProxyType({}),
 ) -> bytes:
     """Records float32 [N, C] of a file with a weathered sweep of them in their place.
 
-    columns: x, y, z, intensity and others, in the file's order. Returns that did not move keep
-    their coordinates to the bit; the others are carried back in float64, so that only float32's
-    rounding is left: less than 0.01 mm within 100 m of the sensor."""
+    columns: x, y, z, intensity and others, in the file's order. air: values of columns that say
+    what a return's surface is, for returns that drops, flakes or fog made. Returns that did not
+    move keep their coordinates to the bit; the others are carried back in float64, so that only
+    float32's rounding is left: less than 0.01 mm within 100 m of the sensor."""
     out = records[sweep.columns[INDEX_COLUMN]]
     changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
     offsets = sweep.points_m[changed] - world_from_file[:3, 3]
@@ -304,6 +355,8 @@ def stored_records(
     for axis, column in enumerate(axes):
         out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
+    for name, value in air.items():
+        out[is_in_air(sweep), columns.index(name)] = value
     return out.tobytes()
 
 
@@ -369,6 +422,14 @@ class TimedBoxes:
             yield sample, bool(moves[i])
 
 
+def names_in(values: Iterable[object]) -> tuple[str, ...]:
+    """The texts of a dataset's column of names; "" of what is missing (None or NaN)."""
+    return tuple(
+        "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+        for value in values
+    )
+
+
 def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
     return next((boxes.attributes[name] for name in names if name in boxes.attributes), None)
 
@@ -397,8 +458,9 @@ def find_objects(
     several: an object may have several boxes in a frame; else the first one counts."""
     samples: list[BoxSample] = []
     labelled: set[str] = set()
-    bad, twice = [], []
+    bad, twice, nameless = [], [], []
     for timed in frames:
+        nameless += [timed.frame for label in timed.boxes.labels if not label]
         seen: set[str] = set()
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
@@ -415,7 +477,13 @@ def find_objects(
     if bad:
         problems.append(
             f"{len(bad)} boxes, the first in frame {bad[0]}, have a centre, size or rotation that "
-            f"is not finite or zero; objects are built without them"
+            f"is not finite or zero, or a negative size; objects are built without them, "
+            f"and labels for trainers have them as DontCare or not at all"
+        )
+    if nameless:
+        problems.append(
+            f"{len(nameless)} boxes, the first in frame {nameless[0]}, have no label; they are of "
+            f"no category, and left out of labels for trainers"
         )
     if twice:
         name, frame = twice[0]

@@ -16,6 +16,7 @@ from drives import WHOLE, changed
 from scipy.spatial.transform import Rotation
 from shown import psnr, psnr_of, render
 
+from adapters.base import open_scene
 from adapters.pandaset import (
     NO_SURFACE,
     PandaSetLabels,
@@ -445,6 +446,16 @@ def test_a_sequence_that_contradicts_itself_is_refused(own):
         with changed(path, pattern, text), pytest.raises(AdapterError, match=message) as caught:
             open_pandaset(str(own), query)
         assert Path(name).name in str(caught.value)
+
+
+def test_a_lens_beyond_all_limits_is_refused_with_its_scene(own):
+    path = own / "camera/left_camera/intrinsics.json"
+    for focal in ("1e-320", "1e9"):
+        with (
+            changed(path, '(?<="fx": )[^,}]+', focal),
+            pytest.raises(AdapterError, match=r"'pandaset:.*': frame 0, camera 'left_.*: fx must"),
+        ):
+            open_scene(f"pandaset:{own}")
 
 
 def test_folders_that_are_no_sequence_are_refused(own):

@@ -32,7 +32,7 @@ from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
 from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
 from adapters.procedural import StreetLabels
-from adapters.raw_drive import IncompleteDrive, Picture, usable_images
+from adapters.raw_drive import NO_SURFACE, IncompleteDrive, Picture, class_of_air, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.uri import SCHEMES
@@ -44,11 +44,13 @@ from augment.effects.lidar import (
     SCATTERED,
     UNCHANGED,
     drop_lost,
+    is_in_air,
 )
 from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError
 from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
+from augment.semantics import SemanticClass
 from recipes.load import load_recipe
 from tools.cli import main
 from tools.explain import describe_drive, drive_text
@@ -193,6 +195,14 @@ CODES = np.array(
     [UNCHANGED, UNCHANGED, ATTENUATED, LOST, MOVED, SCATTERED, PRECIPITATION], np.uint8
 )
 PANOPTIC = "panoptic/v1.0-mini/0_panoptic.npz"
+# What returns that drops, flakes or fog made have in columns that say what was hit.
+OF_AIR: dict[str, dict[str, float]] = {
+    "pandaset": {"semantic": 3},  # Spray or rain
+    "nuscenes": {"semantic": 0},  # noise
+    "recording": {"semantic": 0},  # of no meaning in its calibration
+    "recording-of-ours": {"semantic": 0},
+    "waymo": {"flow_x": 0, "flow_y": 0, "flow_z": 0, "flow_class": -1, "ground": 0},
+}
 
 
 def test_images_of_long_drives_are_checked_by_header_and_end(
@@ -245,6 +255,7 @@ def _kitti(root: Path, matrix: np.ndarray | None = None):
 def _ours(root: Path) -> RecordingLabels:
     (root / "lidar").mkdir(parents=True)
     sweep = RecordingLabels(write_recording(root / "plain", frames=1)).lidar(0)
+    shutil.copy(root / "plain/calibration.json", root)
     columns = {**sweep.columns, "note": np.array(["a", "b"], object)[np.arange(len(sweep)) % 2]}
     columns["intensity"] = (np.arange(len(sweep)) % 256).astype(np.uint8)
     (root / "lidar/000000.parquet").write_bytes(lidar_bytes(LidarSweep(columns)))
@@ -308,9 +319,24 @@ def test_files_give_back_the_weathered_sweep(dataset: str, tmp_path: Path) -> No
     atol_m = 0.5 * 2**-5 * 2**0.5 if dataset == "av2" else 1e-5
     np.testing.assert_allclose(read.points_m, wanted.points_m, rtol=0, atol=atol_m)
     told = "timestamp_ns" if dataset == "nuscenes" else ""  # by the bearing, of those that moved
+    in_air = is_in_air(wanted)
+    assert 0 < in_air.sum() < len(wanted)
+    air = OF_AIR.get(dataset, {})
     for name in source.columns.keys() - {"x", "y", "z", told}:
-        np.testing.assert_array_equal(read.columns[name], wanted.columns[name], err_msg=name)
+        expected = np.array(wanted.columns[name])
+        expected[in_air] = air.get(name, expected[in_air])
+        np.testing.assert_array_equal(read.columns[name], expected, err_msg=name)
     assert labels.lidar_files(99) == ()
+
+
+def test_without_a_class_of_that_name_returns_of_the_air_have_none() -> None:
+    """By meaning then, and at last a number of no class."""
+    meaning = {4: SemanticClass.ROAD, 9: NO_SURFACE, 7: NO_SURFACE, 2: SemanticClass.UNKNOWN}
+    assert class_of_air(meaning, {4: "noise", 9: "fog"}, "noise") == 4
+    assert class_of_air(meaning, {}, "noise") == 7
+    del meaning[7], meaning[9]
+    assert class_of_air(meaning, {}, "noise") == 2
+    assert class_of_air({0: SemanticClass.ROAD, 1: SemanticClass.SIGN}, {}, "noise") == 2
 
 
 def test_pandas_opens_the_tables_and_their_rows_still_name_each_other(tmp_path: Path) -> None:
@@ -338,7 +364,8 @@ def test_labels_of_nuscenes_returns_stay_with_their_returns(tmp_path: Path) -> N
     panoptic.write_bytes(content)
     with np.load(panoptic) as archive:
         assert archive["data"].dtype == np.uint16
-        np.testing.assert_array_equal(archive["data"], wanted.columns["source_index"])
+        expected = np.where(is_in_air(wanted), 0, wanted.columns["source_index"])
+        np.testing.assert_array_equal(archive["data"], expected)
     panoptic.write_bytes(b"PK no archive")
     with pytest.raises(AdapterError, match=r"0_panoptic\.npz must hold an array `data`"):
         labels.lidar_content(0, panoptic, wanted)
