@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from augment.boxes import NEAR_M, Occlusion, Outlines, PlacedBoxes
 from augment.cameras import Camera
@@ -231,7 +231,7 @@ class _BoxesInView:
         # crane: depth that passes it, too, is right.
         if len(on) < max(MIN_RETURNS, behind):
             return None
-        nearest = cKDTree(np.concatenate([on, before])).query(centres[free])[1]
+        nearest = KDTree(np.concatenate([on, before])).query(centres[free])[1]
         shown = np.flatnonzero(free)[nearest < len(on)]
         if len(shown) <= free.sum() / 2 or len(shown) < MIN_SHOWN * outline.sum():
             return None
