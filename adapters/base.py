@@ -31,7 +31,7 @@ from adapters.uri import (
     known_schemes,
     parse_uri,
 )
-from augment.errors import AdapterError
+from augment.errors import AdapterError, SceneError
 from augment.scene import Ground, Scene
 from recipes.errors import nearest_word
 from recipes.job import JobScene
@@ -67,6 +67,10 @@ def open_scene(uri: str) -> Scene:
             scene = cached_scene(scheme, path, query, build) if entry.is_raw else build()
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
+        except AdapterError:
+            raise
+        except SceneError as error:
+            raise AdapterError(f"{uri!r}: {error}") from error
     if ground_z is not None:
         scene = _with_ground(scene, ground_z)
     if camera_path is None:
@@ -111,6 +115,7 @@ def _check_there(path: Path) -> None:
 
 # ---- Scenes of a job as its file names them: patterns expanded, relative paths made absolute -----
 
+_NAME_KEYS = ("files",)  # name files in the scene's folder, not beside the job
 MAX_ENTRIES = 200_000  # files and folders, for one pattern: a second or two
 
 
@@ -140,7 +145,9 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
 def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     scheme, path, query = parse_uri(entry.uri)
     known = SCHEMES.get(scheme) if scheme is not None else None
-    query = {key: _from(folder, value) for key, value in query.items()}
+    query = {
+        key: value if key in _NAME_KEYS else _from(folder, value) for key, value in query.items()
+    }
     if scheme is not None and known is None:
         return [entry]  # refused where it is opened
     if scheme is not None and known is not None and path in known.builtin:

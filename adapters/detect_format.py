@@ -17,6 +17,7 @@ from augment.errors import AdapterError
 from augment.files.ply import SPLAT_SUFFIXES
 from augment.files.scene_file import is_scene_file, is_scene_folder
 from augment.files.sog import META, is_sog_folder
+from augment.files.streamed_sog import LOD_META
 from augment.jobs.mirror import SourceTree
 from augment.scene import Scene
 from recipes.files import open_file
@@ -235,7 +236,11 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
 
 def _is_nuscenes(folder: Path) -> bool:
     versions = (name for name in _names(folder) if name.startswith("v1.0-"))
-    return any((folder / name / "scene.json").is_file() for name in versions)
+    if any((folder / name / "scene.json").is_file() for name in versions):
+        return True
+    from adapters.nuscenes.tables import table_folders  # under any other name
+
+    return (folder / "samples").is_dir() and bool(table_folders(folder))
 
 
 def _is_kitti(folder: Path) -> bool:
@@ -249,10 +254,10 @@ def _is_kitti(folder: Path) -> bool:
 
 
 def _is_waymo(folder: Path) -> bool:
-    tables = ("vehicle_pose", "lidar_calibration")
     splits = (folder, *(folder / name for name in WAYMO_SPLITS))
-    return any(all((split / name).is_dir() for name in tables) for split in splits) or all(
-        (folder / f"{name}.parquet").is_file() for name in tables
+    poses = "vehicle_pose"
+    return (folder / f"{poses}.parquet").is_file() or any(
+        (split / poses).is_dir() and any((split / poses).glob("*.parquet")) for split in splits
     )
 
 
@@ -273,12 +278,13 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    found = sum(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
-    return found == 1 or (found == 0 and is_sog_folder(folder))
+    if (folder / LOD_META).is_file() or is_sog_folder(folder):
+        return True
+    return any(name.lower().endswith(SPLAT_SUFFIXES) for name in _names(folder))
 
 
 def _is_splat_file(path: Path) -> bool:
-    if path.name == META and is_sog_folder(path.parent):
+    if path.name == LOD_META or (path.name == META and is_sog_folder(path.parent)):
         return True
     return path.suffix.lower() in SPLAT_SUFFIXES[1:] or _start_of(path)[:4] in (b"ply\n", b"ply\r")
 
@@ -307,11 +313,7 @@ FOLDERS = (
         "a PandaSet sequence (camera/ and lidar/)",
     ),
     Signature("nuscenes", _is_nuscenes, "a nuScenes dataset (v1.0-*/scene.json)"),
-    Signature(
-        "waymo",
-        _is_waymo,
-        "Waymo Open Dataset v2 tables (vehicle_pose/ and lidar_calibration/, of Parquet files)",
-    ),
+    Signature("waymo", _is_waymo, "Waymo Open Dataset v2 tables (vehicle_pose/, of Parquet files)"),
     Signature(
         "street_gaussians",
         _is_street_gaussians,
@@ -338,8 +340,8 @@ FOLDERS = (
     Signature(
         "gaussians",
         _holds_splats,
-        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply, "
-        ".splat, .spz, .sog, .glb, .gltf or .usd file, or meta.json and images of SOG, in it",
+        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), .ply, .splat, .spz, .sog, "
+        ".glb, .gltf or .usd files, a lod-meta.json, or meta.json and images of SOG, in it",
     ),
 )
 FILES = (
@@ -354,5 +356,9 @@ FILES = (
         lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
         "checkpoint_*.pth of drivestudio",
     ),
-    Signature("gaussians", _is_splat_file, "a .ply, .splat, .spz, .sog, .glb, .gltf or .usd file"),
+    Signature(
+        "gaussians",
+        _is_splat_file,
+        "a .ply, .splat, .spz, .sog, .glb, .gltf or .usd file or a lod-meta.json",
+    ),
 )

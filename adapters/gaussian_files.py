@@ -1,6 +1,11 @@
 """Scenes from plain splat files, such as a .ply, alone or in a trained 3DGS model's folder.
 
     gaussians:PATH?up=-y&scale=1&cameras=FILE
+    gaussians:FOLDER?files=a.ply,b.ply
+
+Several files of a folder are parts of one scene: those that `files` lists, else all of them, which
+must then be of one kind. A folder with a lod-meta.json is one streamed scene, of which `lod` picks
+the level of detail.
 
 Cameras are looked for beside the file (cameras.json, transforms.json, a COLMAP model in sparse/0)
 and above it in a model's folder; `adapters.camera_files.paths` says how images become frames, and
@@ -12,6 +17,7 @@ gets no path.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections.abc import Sequence
@@ -42,8 +48,10 @@ from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
+from augment.files.export import joined_gaussians
 from augment.files.ply import SPLAT_SUFFIXES, SplatFile, read_splats, recentring_origin
 from augment.files.sog import META, is_sog_folder
+from augment.files.streamed_sog import LOD_META
 from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
@@ -54,6 +62,13 @@ COLOURS = {"overcast": (0.85, 0.85, 0.85), "black": (0.0, 0.0, 0.0), "white": (1
 
 def _colour(text: str) -> Sequence[object]:
     return COLOURS.get(text) or text.split(",")
+
+
+def _names(text: str) -> Sequence[str]:
+    names = tuple(text.split(","))
+    if "" in names or len(set(names)) < len(names):
+        raise ValueError("an empty name, or one twice")
+    return names
 
 
 class GaussianOptions(UriOptions):
@@ -80,6 +95,22 @@ class GaussianOptions(UriOptions):
         ge=0,
         lt=10**9,
         description="the number N of a trained model's iteration_N; the newest by default",
+    )
+    files: Annotated[tuple[str, ...], BeforeValidator(_names)] | None = Field(
+        None,
+        description="the names of the folder's splat files that make up the scene, with commas, "
+        "such as a.ply,b.ply; all of the folder by default, where they are of one kind",
+    )
+    lod: int | None = Field(
+        None,
+        ge=0,
+        lt=10**9,
+        description="the level of detail of a lod-meta.json: 0, the default, is the finest",
+    )
+    activated: bool | None = Field(
+        None,
+        description="of a .ply: true if it stores opacities from 0 to 1 and scales as lengths, "
+        "false if it stores logits and logarithms, as trainers do; told by the values, or asked",
     )
     sky: Annotated[tuple[Part, Part, Part], BeforeValidator(_colour)] | None = Field(
         None,
@@ -306,6 +337,7 @@ def _snapped(up: np.ndarray) -> np.ndarray:
 
 _UP_TOLERANCE_DEG = 30.0
 _LEVEL_TOLERANCE_DEG = 15.0  # cameras on a car lean less; this vouches for an axis, not for degrees
+_NAMED_FILES = 8  # of one scene, that a sentence names
 _ITERATION = re.compile(r"iteration_(\d+)")
 _SAMPLED_VIEWS, _SAMPLED_POINTS = 16, 20_000
 _MIN_SEEN = 0.001
@@ -321,8 +353,9 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
         AdapterError: a query key or value, or a camera file, that cannot be used.
         SceneError: the splat file is missing, damaged, or something else."""
     options = GaussianOptions.from_query("gaussians", query)
-    file = find_splat_file(Path(path), options.iteration)
-    splats = read_splats(file)
+    files = find_splat_files(Path(path), options)
+    file = files[0]
+    splats = _read_parts(files, options)
     problems = list(splats.problems)
     found = _find_views(file, Path(path), options)
     views = found.views if found else ()
@@ -332,7 +365,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     gaussians = change.gaussians(splats.gaussians, splats.origin)
     frames, ground_z_m, about_frames = _frames_and_ground(gaussians, views, world, options)
     return Scene(
-        name=_scene_name(file, Path(path)),
+        name=_scene_name(files, Path(path)),
         source=format_uri("gaussians", path, query),
         background=gaussians,
         actors=(),
@@ -347,29 +380,104 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     )
 
 
-def find_splat_file(path: Path, iteration: int | None = None) -> Path:
-    """The splat file itself, the newest (or given) iteration of a model, or a folder's only one."""
+def find_splat_files(path: Path, options: GaussianOptions) -> tuple[Path, ...]:
+    """The splat file itself; of a folder the files that `files` lists, the newest (or given)
+    iteration of a model, the lod-meta.json, or all its splat files, which must be of one kind.
+    """
+    if options.files is not None:
+        return _listed_files(path, options.files)
     if not path.is_dir():
-        return path
-    found = {}
+        return (path,)
+    iterations = {}
     for file in path.glob("point_cloud/iteration_*/point_cloud.ply"):
         if match := _ITERATION.fullmatch(file.parent.name):
-            found[int(match[1])] = file
-    if found:
-        if iteration is not None and iteration not in found:
-            raise AdapterError(f"{path}: no iteration {iteration}; it has {sorted(found)}")
-        return found[max(found) if iteration is None else iteration]
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SPLAT_SUFFIXES)
+            iterations[int(match[1])] = file
+    if iterations:
+        number = max(iterations) if options.iteration is None else options.iteration
+        if number not in iterations:
+            raise AdapterError(f"{path}: no iteration {number}; it has {sorted(iterations)}")
+        return (iterations[number],)
+    if (path / LOD_META).is_file():
+        return (path / LOD_META,)
+    files = splat_files_of(path)
     if not files and is_sog_folder(path):
-        return path / META
-    if len(files) != 1:
-        names = [p.name for p in files[:8]]
+        return (path / META,)
+    kinds = {file.suffix.lower() for file in files}
+    if not files:
         raise AdapterError(
-            f"{path}: expected point_cloud/iteration_N/point_cloud.ply or exactly one .ply, "
-            f".splat, .spz, .sog, .glb, .gltf or .usd file, or meta.json and images of SOG, in "
-            f"this folder; found {names or 'none'}. Give the file itself"
+            f"{path}: expected point_cloud/iteration_N/point_cloud.ply, a {LOD_META}, .ply, "
+            f".splat, .spz, .sog, .glb, .gltf or .usd files, or meta.json and images of SOG, in "
+            f"this folder; found none. Give the file itself"
         )
-    return files[0]
+    if len(kinds) > 1:
+        names = [file.name for file in files[:8]]
+        raise AdapterError(
+            f"{path}: it holds splat files of several kinds, which may be one scene twice: found "
+            f"{names}{' and more' if len(files) > 8 else ''}. Give one of them, or list those that "
+            f"are parts of one scene: ?files={','.join(names[:2])}"
+        )
+    return files
+
+
+def splat_files_of(folder: Path) -> tuple[Path, ...]:
+    """The folder's splat files by their suffixes, in the order of their names."""
+    return tuple(sorted(file for file in folder.iterdir() if file.suffix.lower() in SPLAT_SUFFIXES))
+
+
+def _listed_files(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:
+    if not folder.is_dir():
+        raise AdapterError(f"{folder}: files lists names in a folder; this is a file")
+    for name in names:
+        if "/" in name or name in (".", "..") or not (folder / name).is_file():
+            there = ", ".join(file.name for file in splat_files_of(folder)[:8]) or "none"
+            raise AdapterError(
+                f"{folder}: files names {name!r:.100}, which is no file of this folder; its splat "
+                f"files: {there}"
+            )
+    return tuple(folder / name for name in names)
+
+
+def _read_parts(files: Sequence[Path], options: GaussianOptions) -> SplatFile:
+    """The Gaussians of all files as one, with a sentence about which they are.
+
+    Raises:
+        AdapterError: they say different things of up or unit. SceneError: one is damaged."""
+    parts = [read_splats(f, activated=options.activated, level=options.lod) for f in files]
+    if len(parts) == 1:
+        return parts[0]
+    notes = parts[0].notes
+    for key, given in (("up", options.up), ("unit", options.scale)):
+        said = {part.notes.get(key) for part in parts}
+        if len(said) > 1 and (given is None or len(said - {None}) > 1):
+            each = ", ".join(
+                f"{file.name} says {part.notes.get(key) or 'nothing'}"
+                for file, part in zip(files[:8], parts, strict=False)
+            )
+            raise AdapterError(
+                f"{files[0].parent}: its splat files differ in {key!r}: {each}. Parts of one scene "
+                f"must have the same axes and unit: export them alike, or open them one by one"
+            )
+    origin = next((part.origin for part in parts if part.origin.any()), parts[0].origin)
+    moved = []
+    for part in parts:
+        gaussians = part.gaussians
+        if (part.origin != origin).any():
+            means = gaussians.means.double() + torch.from_numpy(part.origin - origin)
+            gaussians = dataclasses.replace(gaussians, means=means.float())
+        moved.append(gaussians)
+    names = ", ".join(
+        f"{file.name} ({len(part.gaussians)})"
+        for file, part in zip(files[:_NAMED_FILES], parts, strict=False)
+    )
+    more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
+    sentence = (
+        f"{files[0].parent}: {len(files)} files are taken as parts of one scene: {names}{more}; "
+        "files=NAME,NAME takes others"
+    )
+    if len({part.sh_degree for part in moved}) > 1:
+        sentence += ". Colours by direction of a lower degree are filled up with zeros"
+    problems = (sentence, *(problem for part in parts for problem in part.problems))
+    return SplatFile(joined_gaussians(moved), origin, notes, problems)
 
 
 def _stand_in_sky(path: Path) -> tuple[float, float, float]:
@@ -554,8 +662,12 @@ def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]
     ]
 
 
-def _scene_name(file: Path, given: Path) -> str:
-    """The folder's name for a trained model, whose file is always called point_cloud.ply."""
+def _scene_name(files: Sequence[Path], given: Path) -> str:
+    """The folder's name for several files, and for a trained model or a streamed scene, whose files
+    are always called the same."""
+    file = files[0]
+    if len(files) > 1 or file.name == LOD_META:
+        return file.parent.resolve().name or file.stem
     if file == given and file.name != "point_cloud.ply":
         return file.stem
     folder = given if given.is_dir() else given.parent

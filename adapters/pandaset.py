@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, read_image_size, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -43,6 +43,7 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    class_of_air,
     drive_origin,
     find_objects,
     is_usable,
@@ -55,7 +56,7 @@ from adapters.raw_drive import (
 from adapters.safe_pickle import read_frame
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.codes import INDEX_COLUMN
+from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid, rigid, rotmat_from_quat
 from augment.labels import Boxes, LidarSweep
@@ -155,13 +156,9 @@ def read_frames(
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
     world_from_ego, times_ns = read_ego_track(root)
     chosen = options.select(range(len(times_ns)), where=f"pandaset:{root}")
-    if not (root / "camera").is_dir():
-        raise AdapterError(
-            f"{root / 'camera'} does not exist; expected a PandaSet sequence's camera/"
-        )
-    folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir())
-    if not folders:
-        raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
+    has_images = any((root / "camera").glob("*/*.jpg"))
+    folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir()) if has_images else []
+    missing = () if folders else (f"{root / 'camera'} holds no images <camera>/NN.jpg",)
     cameras = {folder.name: _read_camera(folder, len(times_ns)) for folder in folders}
     pictures = [
         Picture(folder.name, n, folder / f"{n:02d}.jpg", cameras[folder.name].size)
@@ -185,11 +182,11 @@ def read_frames(
                 )
                 for name, camera in cameras.items()
             },
-            image_paths=images.paths[n],
+            image_paths=images.paths.get(n, {}),
         )
         for n in chosen.numbers
     )
-    return frames, chosen, origin, images.problems
+    return frames, chosen, origin, missing + images.problems
 
 
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -222,8 +219,8 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
-    size = next((found for found in seen if not isinstance(found, str)), None)
+    headers = (check_image(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((header.size for header in headers if not isinstance(header, str)), None)
     if size is None:
         raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
     return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))
@@ -239,7 +236,7 @@ def _read_times(path: Path, expected: int) -> np.ndarray:
         frame = int(np.argmin(np.diff(times) > 0)) + 1
         raise AdapterError(
             f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
-            f"{times[frame - 1]} s. Copy it again"
+            f"{times[frame - 1]} s. Correct the times in the file"
         )
     return np.round(times * 1e9).astype(np.int64)
 
@@ -256,7 +253,7 @@ def _read_poses(path: Path) -> np.ndarray:
         frame = int(np.argmax(off))
         raise AdapterError(
             f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
-            f"{headings[frame].tolist()}. Copy the file again"
+            f"{headings[frame].tolist()}. Divide it by its length"
         )
     positions = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
     return rigid(rotmat_from_quat(torch.from_numpy(headings)), torch.from_numpy(positions)).numpy()
@@ -427,9 +424,10 @@ _NO_SENSOR = -1  # the sensor of a box that was drawn around both sensors' retur
 SENSORS_M = np.array([[0.81, 0.0, 1.85], [1.35, 0.04, 1.65]])
 
 # The published classes.json, numbered from 1.
+_AIR = "Spray or rain"
 _S = SemanticClass
 _CLASSES: tuple[tuple[str, int], ...] = (
-    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), ("Spray or rain", NO_SURFACE),
+    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), (_AIR, NO_SURFACE),
     ("Reflection", NO_SURFACE), ("Vegetation", _S.VEGETATION), ("Ground", _S.TERRAIN),
     ("Road", _S.ROAD), ("Lane Line Marking", _S.LANE_MARKING),
     ("Stop Line Marking", _S.LANE_MARKING), ("Other Road Marking", _S.LANE_MARKING),
@@ -581,19 +579,25 @@ def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
     return shared / (np.prod(a[1]) + np.prod(b[1]) - shared)
 
 
-def class_meanings(root: Path) -> dict[int, int]:
-    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN.
-    Numbers are those of annotations/semseg/classes.json, or of the published list."""
+def class_names(root: Path) -> dict[int, str]:
+    """The sequence's classes by number: those of annotations/semseg/classes.json, or of the
+    published list."""
     path = root / "annotations" / "semseg" / "classes.json"
     if not path.exists():
-        return {number: meaning for number, (_, meaning) in enumerate(_CLASSES, start=1)}
-    names, meaning = read_json(path), dict(_CLASSES)
+        return {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
+    names = read_json(path)
     for key, name in names.items():
         if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
             raise AdapterError(
                 f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
             )
-    return {int(n): meaning.get(name, SemanticClass.UNKNOWN) for n, name in names.items()}
+    return {int(number): name for number, name in names.items()}
+
+
+def class_meanings(root: Path) -> dict[int, int]:
+    """SemanticClass (or NO_SURFACE) by the sequence's class number; unknown names are UNKNOWN."""
+    meaning = dict(_CLASSES)
+    return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in class_names(root).items()}
 
 
 # ---- Labels --------------------------------------------------------------------------------------
@@ -658,6 +662,9 @@ class PandaSetLabels:
         if file == frame_file(self.root, "lidar", frame_index):
             for name in "xyzi":
                 table[name] = sweep.columns[name]
+        else:
+            air = class_of_air(class_meanings(self.root), class_names(self.root), _AIR)
+            table["class"] = np.where(is_in_air(sweep), air, table["class"].to_numpy())
         stream = io.BytesIO()
         table.to_pickle(stream, compression=None, protocol=4)
         return gzip.compress(stream.getvalue(), compresslevel=6, mtime=0)

@@ -7,31 +7,40 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import BeforeValidator, Field
 
-from adapters.plain_files import MISSING, read_image_size
+from adapters.drive_checks import camera_problems, lidar_problems
+from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
-from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
+from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
+from augment.files.image_size import ImageHeader
+from augment.files.recorded_images import exif_hint
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
 from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
+# Returns further from the car's path than this are none: LiDARs of cars see some 300 m.
+_MAX_RANGE_M = 1000.0
+# Plan of a drive with what lies around it: maps of it have a cell a square metre.
+_MAX_AREA_M2 = 1 << 26
 MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatever its label says
 # Attributes that say so themselves, as PandaSet's and the street's boxes do.
 _STATIONARY = ("stationary", "is_parked")
@@ -182,7 +191,7 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
         AdapterError: a camera's size is known from no calibration and no image; or, for
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
-        look = partial(_size_or_fault, decode=len(pictures) <= _MAX_DECODED)
+        look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
         seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
@@ -190,7 +199,8 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
     paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
     sizes, problems = {}, []
     for camera, own in by_camera.items():
-        usual = Counter(seen[p] for p in own if not isinstance(seen[p], str)).most_common(1)
+        headers = [header for p in own if not isinstance(header := seen[p], str)]
+        usual = Counter(header.size for header in headers).most_common(1)
         size = own[0].size or (usual[0][0] if usual else None)
         faults = []
         for picture in own:
@@ -210,22 +220,48 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
             faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
         sizes[camera] = size
         problems += faults
-    return DriveImages(paths, sizes, tuple(problems))
+    used = [
+        (p, h) for p, h in seen.items() if p.camera in paths[p.frame] and not isinstance(h, str)
+    ]
+    return DriveImages(paths, sizes, (*problems, *image_notes(used)))
 
 
-def _size_or_fault(picture: Picture, *, decode: bool) -> tuple[int, int] | str:
-    return _NO_FILE if picture.path is None else read_image_size(picture.path, decode=decode)
+def _header_or_fault(picture: Picture, *, decode: bool) -> ImageHeader | str:
+    return _NO_FILE if picture.path is None else check_image(picture.path, decode=decode)
 
 
-def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:
-    if seen == expected:
-        return ""
+def _fault(picture: Picture, seen: ImageHeader | str, expected: tuple[int, int] | None) -> str:
     if picture.path is None:
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
+    if expected is None or seen.size == expected:
+        return ""
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
+    return (
+        f"image {picture.path} is {size(seen.size)} pixels, its camera {size(expected)}; left out"
+        f"{exif_hint(seen, expected)}"
+    )
+
+
+def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
+    """A sentence where usable images have an EXIF orientation, and where they have 16 bits."""
+    notes = []
+    turned = [(picture, header) for picture, header in images if header.orientation != 1]
+    if turned:
+        picture, header = turned[0]
+        notes.append(
+            f"{len(turned)} of {len(images)} images have an EXIF orientation, such as "
+            f"{header.orientation} in camera {picture.camera}, frame {picture.frame}; it is "
+            f"ignored: poses and intrinsics are of the pixels as they are stored"
+        )
+    deep = [picture for picture, header in images if header.bits == 16]
+    if deep:
+        notes.append(
+            f"{len(deep)} of {len(images)} images have 16 bits a channel, such as of camera "
+            f"{deep[0].camera}, frame {deep[0].frame}; they are read as their values / 256"
+        )
+    return notes
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------
@@ -283,14 +319,33 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
     return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
+def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
+    """The dataset's class number for returns that drops, flakes or fog made: that of the name, else
+    the lowest that stands for no surface, else the lowest of unknown meaning.
+
+    meaning, names: SemanticClass or NO_SURFACE, and the dataset's word, by class number."""
+    number = next((number for number, word in names.items() if word == name), None)
+    if number is not None:
+        return number
+    for wanted in (NO_SURFACE, SemanticClass.UNKNOWN):
+        if numbers := [number for number, what in meaning.items() if what == wanted]:
+            return min(numbers)
+    return next(number for number in itertools.count() if number not in meaning)
+
+
 def stored_records(
-    records: np.ndarray, columns: Sequence[str], sweep: LidarSweep, world_from_file: np.ndarray
+    records: np.ndarray,
+    columns: Sequence[str],
+    sweep: LidarSweep,
+    world_from_file: np.ndarray,
+    air: Mapping[str, float] = MappingProxyType({}),
 ) -> bytes:
     """Records float32 [N, C] of a file with a weathered sweep of them in their place.
 
-    columns: x, y, z, intensity and others, in the file's order. Returns that did not move keep
-    their coordinates to the bit; the others are carried back in float64, so that only float32's
-    rounding is left: less than 0.01 mm within 100 m of the sensor."""
+    columns: x, y, z, intensity and others, in the file's order. air: values of columns that say
+    what a return's surface is, for returns that drops, flakes or fog made. Returns that did not
+    move keep their coordinates to the bit; the others are carried back in float64, so that only
+    float32's rounding is left: less than 0.01 mm within 100 m of the sensor."""
     out = records[sweep.columns[INDEX_COLUMN]]
     changed = np.flatnonzero(sweep.columns[CODE_COLUMN] != UNCHANGED)
     offsets = sweep.points_m[changed] - world_from_file[:3, 3]
@@ -300,6 +355,8 @@ def stored_records(
     for axis, column in enumerate(axes):
         out[changed[moved], column] = places[axis, moved]
     out[:, columns.index("intensity")] = sweep.columns["intensity"]
+    for name, value in air.items():
+        out[is_in_air(sweep), columns.index(name)] = value
     return out.tobytes()
 
 
@@ -487,10 +544,41 @@ class RawDrive:
     colour_every: int = 1
     has_metric_scale: bool = True
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            AdapterError: the car's path is wider than maps of it can be."""
+        path = self.path
+        width_m = np.ptp(path, axis=0)[:2]
+        if np.prod(width_m + 2 * _MAX_RANGE_M) > _MAX_AREA_M2:
+            steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            number = int(steps.argmax())
+            raise AdapterError(
+                f"{self.source}: the car's path is {width_m[0]:.3g} x {width_m[1]:.3g} m wide, "
+                f"more than a scene can be; it goes furthest, {steps[number]:.3g} m, between "
+                f"frames {self.frames[number].index} and {self.frames[number + 1].index}. Poses "
+                f"must be metres; of a longer drive choose some frames (frames=)"
+            )
+
+    @property
+    def path(self) -> np.ndarray:
+        """The car's places in the frames, float64 [F, 3]."""
+        return np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames])
+
     @property
     def used(self) -> tuple[Frame, ...]:
         """The frames that the scene is built from."""
         return tuple(frame for frame in self.frames if frame.index not in self.held_out)
+
+
+class IncompleteDrive(AdapterError):
+    """A drive of which no scene can be built, for it has no images or no LiDAR returns.
+
+    drive: what it has. ground: the road, where it is known from elsewhere."""
+
+    def __init__(self, message: str, drive: RawDrive, ground: Ground | None) -> None:
+        super().__init__(message)
+        self.drive, self.ground = drive, ground
 
 
 def scene_of_drive(
@@ -504,20 +592,50 @@ def scene_of_drive(
     background, and of the road, from elsewhere.
 
     Raises:
-        AdapterError: there is no return or no image to build from, or no image shows a return."""
+        IncompleteDrive: there is no return or no image to build from.
+        AdapterError: no image shows a return."""
     # Labels are read without the kernels that scenes are built by.
     from adapters.lidar_scene.scene import build_lidar_scene
 
+    drive = _checked(drive)
     numbers = some([frame.index for frame in drive.used])
+    held_out = " that are not held out" if drive.held_out else ""
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
-    if not any(map(len, drive.sweeps)):
-        raise AdapterError(
-            f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
-            f"without them, unpack the sweeps again{first}"
-        )
     if not any(frame.image_paths for frame in drive.used):
-        raise AdapterError(
-            f"{drive.source}: there is no usable image in {numbers} that are not held out; colours "
-            f"cannot be had without them, choose more frames or unpack the images again{first}"
+        raise IncompleteDrive(
+            f"{drive.source}: there is no usable image in {numbers}{held_out}; colours cannot be "
+            f"had without them, choose more frames or unpack the images again{first}",
+            drive,
+            ground,
+        )
+    if not any(map(len, drive.sweeps)):
+        raise IncompleteDrive(
+            f"{drive.source}: there are no LiDAR returns in {numbers}; a scene cannot be built "
+            f"without them, unpack the sweeps again{first}",
+            drive,
+            ground,
         )
     return build_lidar_scene(drive, options, added=added, ground=ground)
+
+
+def _checked(drive: RawDrive) -> RawDrive:
+    """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
+    seems to be in another frame."""
+    low, high = drive.path.min(axis=0), drive.path.max(axis=0)
+    is_near = [
+        ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
+        for sweep in drive.sweeps
+    ]
+    sweeps = tuple(
+        sweep if keep.all() else sweep.select(keep)
+        for sweep, keep in zip(drive.sweeps, is_near, strict=True)
+    )
+    timed = [(int(np.median(s.timestamps_ns)), s.points) for s in sweeps if len(s)]
+    problems = [*camera_problems(drive.frames), *lidar_problems(drive.frames, timed)]
+    num_far = sum(int((~keep).sum()) for keep in is_near)
+    if num_far:
+        problems.append(
+            f"{num_far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path "
+            f"and are left out; coordinates must be metres"
+        )
+    return replace(drive, sweeps=sweeps, problems=(*problems, *drive.problems))

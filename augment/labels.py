@@ -144,6 +144,7 @@ class StoresLidar(Protocol):
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
         """What one of those files holds when the sensor has seen `sweep` in place of the frame's
-        own: returns of that, some moved, as `source_index` names them, in that order.
+        own: returns of that, some moved, as `source_index` names them, in that order. Returns that
+        the weather in the air made (see codes) have the dataset's class for that, or none.
         """
         ...

@@ -65,7 +65,8 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
     """Pixels that show the recording car, bool [H, W], from one camera's images uint8 [H, W, 3] in
     the order in which the car moved (see `moving_frames`). Nothing is found in fewer than six,
-    above the horizon, or where the car shows no edge across the motion."""
+    above the horizon, or where the car shows no edge across the motion. The mask is of the first
+    image's size; the sizes of the others may differ a little."""
     height, width = images[0].shape[:2] if images else (0, 0)
     if len(images) < _MIN_IMAGES:
         return np.zeros((height, width), np.bool_)
@@ -80,9 +81,10 @@ def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np
 
 def _road_flow(cameras: Sequence[Camera]) -> np.ndarray:
     """Direction in which the road would move at each pixel, unit float32 [h, w, 2], coarsely; NaN
-    where it would be far away or hardly move."""
+    where it would be far away or hardly move. Images of other sizes are squeezed to the first's."""
     flows = []
-    coarse = [camera.scaled(_FLOW_WIDTH / camera.width) for camera in cameras]
+    first = cameras[0].scaled(_FLOW_WIDTH / cameras[0].width)
+    coarse = [camera.resized(first.width, first.height) for camera in cameras]
     for camera, after in itertools.pairwise(coarse):
         rays = camera.ray_directions().double().numpy()
         with np.errstate(divide="ignore", invalid="ignore"):

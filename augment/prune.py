@@ -26,16 +26,17 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int32
-from tqdm import tqdm
 
 from augment.base_photo import RECORDED
 from augment.cameras import Camera
 from augment.lod import keeps_levels
 from augment.memo import memo_of
+from augment.progress import ProgressBar
 from augment.render.constants import RasterSettings
 from augment.render.cpu.order import known_of
 from augment.render.threads import divided_threads, views_at_once
 from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.timing import counted
 from recipes.schema import Render
 
 MIN_VIEWS, MAX_VIEWS, MAX_WIDTH_PX = 8, 24, 320  # that are looked at
@@ -166,7 +167,10 @@ def _find_errors(scene: Scene, found: _Found, rounds: int, progress: bool) -> No
     steps, told = (rounds - found.rounds) * len(cameras), "finding splats to leave out"
     count = min(views_at_once(len(opaque)), len(cameras))
     pool = divided_threads(count) if count > 1 else None
-    with tqdm(desc=told, total=steps, unit="view", disable=not progress) as bar:
+    with (
+        ProgressBar(desc=told, total=steps, unit="view", disable=not progress) as bar,
+        counted(told, steps) as advance,
+    ):
 
         def look(camera: Camera) -> Changes:
             if not hasattr(spaces, "scratch"):
@@ -181,6 +185,7 @@ def _find_errors(scene: Scene, found: _Found, rounds: int, progress: bool) -> No
                 for view in (pool.map if pool else map)(look, cameras):
                     views.append(view)
                     bar.update()
+                    advance()
                 found.leave_out(views)
         finally:
             if pool:

@@ -58,7 +58,7 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     trust = dict[str, np.ndarray]()
     if recipe.output.trust:
         with timed("trust mask"):
-            trust[TRUST] = trust_mask(scene, camera, backend=backend).astype(np.uint8) * 255
+            trust[TRUST] = trust_mask(scene, camera, backend=backend)
     own_car = None
     if plan.on_photo and plan.finds_boxes:
         with timed("recording car"):
@@ -277,9 +277,10 @@ class WeatheredView:
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene
-    (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], 255 where an
-    effect is what the pixel shows, by name, and of TRUST. effects: what their labels are measured
-    from; of all effects that the recipe has. surface: None where nobody asks for boxes.
+    (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], by name: 255
+    where an effect is what the pixel shows, else 0; and of TRUST, 0 to 255. effects: what their
+    labels are measured from; of all effects that the recipe has. surface: None where nobody asks
+    for boxes.
     """
 
     camera: Camera

@@ -20,7 +20,7 @@ from recipes.ranges import is_number
 from recipes.recipe_file import Section, read_file, recipe_file
 from recipes.schema import VERSION, Recipe, free_knobs
 from recipes.template import RecipeTemplate
-from recipes.yaml_tree import MapNode, Node, ScalarNode, read_tree
+from recipes.yaml_tree import MapNode, Node, ScalarNode, check_text, read_tree
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,6 +89,7 @@ def read_overrides(
         place = Place(f"{option} {short(text, 100)}", None, folder or Path())
         if not equals or not path.strip():
             raise place.error("write PATH=VALUE, as in weather.smog.visibility_m=60")
+        check_text(path, place)
         overrides[path.strip()] = _value_node(value, place)
     return overrides
 
@@ -135,7 +136,7 @@ def read_text(path: Path, max_bytes: int, *, missing: str, too_large: str) -> st
     if len(data) > max_bytes:
         raise RecipeError(f"{source}: larger than {max_bytes} bytes: {too_large}")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")  # some editors begin with a byte order mark
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         text = f"not UTF-8 text (byte 0x{data[error.start]:02x}): save the file as UTF-8"

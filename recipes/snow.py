@@ -83,7 +83,7 @@ class Snow(EffectModel):
     """How many crystals glint at the sun; 0 is none."""
     tracks: Literal["auto", "always", "never"] = "auto"
     """Packed grey wheel tracks where the ego and the scene's vehicles drive; auto up to a depth of
-    0.3 m."""
+    0.3 m, and not along a drive that is invented for a splat file without cameras."""
     light: SnowLight = SnowLight()
     wind: SnowWind = SnowWind()
     shading: Literal["per_splat", "per_pixel"] = "per_splat"

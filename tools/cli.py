@@ -27,7 +27,7 @@ from tools.options import (
     SceneCommand,
     StyleTrainOptions,
 )
-from tools.output import LABELS_OF_STORES, JsonFile, check_local, write_json
+from tools.output import LABELS_OF_STORES, JsonFile, NoteHandler, check_local, write_json
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -130,7 +130,7 @@ class GenerateOptions(SceneCommand):
             large it gets. Nothing is written.
         status: Say how far the jobs of the output have come; needs no job file. The exit code is 0
             if all is done.
-        rescan: Open all scenes again, in case they have got frames since.
+        rescan: Open all scenes again, in place of what the output knows of them.
         scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
             on Ray the CPU.
@@ -164,6 +164,9 @@ class GenerateOptions(SceneCommand):
 class InspectOptions(SceneCommand):
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
+    Of a recorded drive without images or without LiDAR, of which no scene can be made, it shows
+    what is there and what is missing, and ends with exit code 1.
+
     Args:
         uri: The scene, as for render.
         camera_path: A JSON file of camera poses to look at instead of the scene's own.
@@ -175,9 +178,16 @@ class InspectOptions(SceneCommand):
     json_file: JsonFile = None
 
     def run(self) -> int:
-        from tools.explain import describe_scene, scene_text
+        from adapters.raw_drive import IncompleteDrive
+        from tools.explain import describe_drive, describe_scene, drive_text, scene_text
 
-        facts = describe_scene(open_with_path(self.uri, self.camera_path))
+        try:
+            facts = describe_scene(open_with_path(self.uri, self.camera_path))
+        except IncompleteDrive as error:
+            facts = describe_drive(error)
+            print(drive_text(facts))
+            write_json(self.json_file, facts)
+            return 1
         print(scene_text(facts))
         write_json(self.json_file, facts)
         return 0
@@ -627,8 +637,9 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     table, prog = COMMANDS, "climategs"
     description = "Weather for driving scenes made of 3D Gaussians."
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[NoteHandler()])
     try:
+        check_arguments(arguments)
         if arguments and arguments[0] in ("bench", *GROUPS):
             group, *arguments = arguments
             table = _bench_commands() if group == "bench" else GROUPS[group]
@@ -651,6 +662,20 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def check_arguments(arguments: list[str]) -> None:
+    """Raise ClimateGSError for one that is not UTF-8: paths go into manifests, which hold texts."""
+    for number, argument in enumerate(arguments, 1):
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            from augment.errors import ClimateGSError
+
+            raise ClimateGSError(
+                f"argument {number} is not UTF-8 text: {argument!a}. Texts and names of files "
+                f"must be; rename the file, or move it to a folder whose name is"
+            ) from None
 
 
 def _bench_commands() -> dict[str, Callable[..., int]]:

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 
 from adapters.base import open_scene
+from adapters.raw_drive import IncompleteDrive
 from augment import effects
-from augment.cameras import Camera
+from augment.cameras import Camera, Frame
 from augment.dataset.label_files import planned_labels
 from augment.errors import ClimateGSError, SceneError
 from augment.ground import ground_of, ground_sentence
@@ -64,8 +65,8 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "background": _describe_gaussians(scene.background),
         "actors": actors,
         "sky": type(scene.sky).__name__,
-        "cameras": _describe_cameras(scene),
-        "frames": _describe_frames(scene),
+        "cameras": _describe_cameras(scene.frames),
+        "frames": _describe_frames(scene.frames),
         "labels": _describe_labels(scene),
         "ground_z_m": scene.ground_z_m,
         "ground": _describe_ground(scene),
@@ -103,10 +104,50 @@ def _describe_gaussians(gaussians: Gaussians) -> dict[str, Any]:
     }
 
 
-def _describe_cameras(scene: Scene) -> list[dict[str, Any]]:
+def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
+    """Frames, cameras, returns, boxes and ground of a drive that no scene can be made of, what it
+    lacks, and the problems found.
+    """
+    drive, ground = incomplete.drive, incomplete.ground
+    boxes = {frame.index: drive.labels.boxes(frame.index) for frame in drive.frames}
+    sentence = "not known: it is measured as a scene is made, or told by a map"
+    if ground is not None:
+        sentence = ground_sentence(ground)
+    cameras = _describe_cameras(drive.frames)
+    for camera in cameras:
+        camera["images"] = sum(camera["name"] in frame.image_paths for frame in drive.frames)
+    return {
+        "name": drive.name,
+        "source": drive.source,
+        "missing": str(incomplete).split(";")[0].removeprefix(f"{drive.source}: "),
+        "frames": _describe_frames(drive.frames),
+        "cameras": cameras,
+        "lidar": {
+            "sweeps": sum(len(sweep) > 0 for sweep in drive.sweeps),
+            "returns": sum(map(len, drive.sweeps)),
+        },
+        "boxes": {
+            "count": sum(map(len, boxes.values())),
+            "frames": sum(len(found) > 0 for found in boxes.values()),
+            "labels": dict(Counter(label for found in boxes.values() for label in found.labels)),
+            "moving": len({box.object_id for box in drive.boxes}),
+        },
+        "ground": {"sentence": sentence}
+        if ground is None
+        else {**dataclasses.asdict(ground), "sentence": sentence},
+        "problems": list(drive.problems),
+    }
+
+
+def drive_text(facts: dict[str, Any]) -> str:
+    """The facts of `describe_drive` as a page of text."""
+    return fill("inspect_drive.txt", **facts)
+
+
+def _describe_cameras(frames: Sequence[Frame]) -> list[dict[str, Any]]:
     cameras = []
-    for name in scene.camera_names:
-        views = [f.cameras[name] for f in scene.frames if name in f.cameras]
+    for name in dict.fromkeys(name for frame in frames for name in frame.cameras):
+        views = [f.cameras[name] for f in frames if name in f.cameras]
         first = views[0]
         cameras.append(
             {
@@ -120,15 +161,15 @@ def _describe_cameras(scene: Scene) -> list[dict[str, Any]]:
     return cameras
 
 
-def _describe_frames(scene: Scene) -> dict[str, Any]:
-    if not scene.frames:
+def _describe_frames(frames: Sequence[Frame]) -> dict[str, Any]:
+    if not frames:
         return {"count": 0}
-    path = torch.stack([f.world_from_ego[:3, 3] for f in scene.frames])
+    path = torch.stack([f.world_from_ego[:3, 3] for f in frames])
     return {
-        "count": len(scene.frames),
-        "first": scene.frames[0].index,
-        "last": scene.frames[-1].index,
-        "duration_s": (scene.frames[-1].timestamp_ns - scene.frames[0].timestamp_ns) / 1e9,
+        "count": len(frames),
+        "first": frames[0].index,
+        "last": frames[-1].index,
+        "duration_s": (frames[-1].timestamp_ns - frames[0].timestamp_ns) / 1e9,
         "ego_path_m": float(path.diff(dim=0).norm(dim=1).sum()),
     }
 

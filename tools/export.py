@@ -6,7 +6,7 @@ trainers read.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +56,11 @@ from augment.jobs.mirror import (
     weathered_images,
     weathered_sweeps,
 )
+from augment.jobs.mirror_sweeps import frames_of_span, is_sweep_between, weather_sweeps_between
 from augment.jobs.processes import OutputLock
+from augment.labels import StoresLidar
 from augment.scene import Scene
+from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.output import fill, print_note
 
@@ -101,6 +104,67 @@ def recipes_for_source(
     return rendered
 
 
+def clear_notes(
+    scene: Scene,
+    frames: Collection[int] | None = None,
+    cameras: Collection[str] | None = None,
+    *,
+    of_sweeps: bool,
+) -> list[str]:
+    """Sentences, before anything starts: how many images and sweeps of the dataset will stay clear
+    in its copies, and why.
+
+    Args:
+        frames: numbers that will be rendered; None for all.
+        cameras: names that will be rendered; None for all.
+        of_sweeps: whether there are sweeps to be weathered.
+    """
+    tree, extent = _dataset(scene)
+    wanted = {
+        frame.index: [name for name in frame.cameras if cameras is None or name in cameras]
+        for frame in scene.frames
+        if frames is None or frame.index in frames
+    }
+    images = {
+        tree.relative(path): name in wanted.get(frame.index, ())
+        for frame in scene.frames
+        for name, path in frame.image_paths.items()
+    }
+    notes = _clear_note("camera images", extent.images, images, scene.name)
+    scheme, _, query = parse_uri(tree.uri)
+    if notes and scheme == "av2" and query.get("images") != "all":
+        notes[0] += "; images=all in its URI takes those between its sweeps"
+    if not of_sweeps:
+        return notes
+    if not isinstance(scene.labels, StoresLidar):
+        return [*notes, "no LiDAR sweep has a file of its own in the dataset: they stay clear"]
+    rendered = {number for number, names in wanted.items() if names}
+    span = frames_of_span(scene.frames, rendered, {n for names in wanted.values() for n in names})
+    sweeps = {
+        tree.relative(file): frame.index in span
+        for frame in scene.frames
+        for file in scene.labels.lidar_files(frame.index)[:1]
+    }
+    return notes + _clear_note("LiDAR sweeps", extent.sweeps, sweeps, scene.name)
+
+
+def _clear_note(what: str, total: int, places: Mapping[str | None, bool], scene: str) -> list[str]:
+    """places: files of the scene's, and whether they will be weathered."""
+    left_out, others = list(places.values()).count(False), total - len(places)
+    reasons = [f"{left_out} of frames or cameras that are not rendered"] if left_out else []
+    if others > 0:
+        reasons.append(
+            f"{others} that no frame of scene {scene!r} has (taken outside its frames, or of other "
+            f"scenes)"
+        )
+    if not reasons:
+        return []
+    clear = left_out + max(others, 0)
+    return [
+        f"{clear} of {total} {what} will stay clear in the dataset's copy: {', '.join(reasons)}"
+    ]
+
+
 def mirror_outputs(
     scene: Scene,
     out: Path,
@@ -125,6 +189,15 @@ def mirror_outputs(
     lines = []
     with OutputLock(out):
         found = _rows(scene, out, variants)
+        deleted = [name for name in found if not _recipe_file(scene, out, name).is_file()]
+        if variants is not None or len(deleted) == len(found):
+            _check_there(scene, out, deleted)
+        for name in deleted:
+            found.pop(name)
+            lines.append(
+                f"{_recipe_file(scene, out, name).parent} was deleted, so its copy of the dataset "
+                f"is not brought up to date; render it again, or delete {mirror_folder(out, name)}"
+            )
         try:
             for name, rows in found.items():
                 lines += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
@@ -139,17 +212,27 @@ def mirror_outputs(
 def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
     """`climategs mirror`: opens the scene, or all that the manifest has in turn, builds the copies,
     prints. Returns the exit code."""
-    rows = read_manifest(out).select(["source", "scene"]).to_pylist()
+    columns = ["source", "scene", "frame", "camera", "lidar"]
+    rows = read_manifest(out).select(columns).to_pylist()
     named: dict[str, list[str]] = {}  # a job can give scenes other names
     for source, name in sorted({(row["source"], row["scene"]) for row in rows}):
         named.setdefault(source, []).append(name)
+    of_scene: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        of_scene.setdefault(row["scene"], []).append(row)
     sources = [scene_uri] if scene_uri else sorted(named)
     if not sources:
         raise OutputError(f"{out / MANIFEST} lists no images; render some first")
     for source in sources:
         scene = open_scene(source)
         for name in named.get(scene.source, [scene.name]):
-            for sentence in mirror_outputs(dataclasses.replace(scene, name=name), out, links=links):
+            named_scene, own = dataclasses.replace(scene, name=name), of_scene.get(name, [])
+            if own:
+                frames, cameras = ({row[key] for row in own} for key in ("frame", "camera"))
+                of_sweeps = any(row["lidar"] == "weather" for row in own)
+                for note in clear_notes(named_scene, frames, cameras, of_sweeps=of_sweeps):
+                    print_note(f"note: {note}")
+            for sentence in mirror_outputs(named_scene, out, links=links):
                 print(sentence)
     return 0
 
@@ -177,14 +260,22 @@ def _mirror_rows(
 ) -> list[str]:
     folder = mirror_folder(out, name)
     record = read_record(tree, folder)
+    recipe = load_recipe(_recipe_file(scene, out, name)).resolve(0)
+    between = weather_sweeps_between(scene, recipe, rows, out, progress=progress)
     images, notes = weathered_images(out, rows, scene.frames, tree)
-    sweeps, unplaced = weathered_sweeps(out, rows, scene.labels, tree)
+    sweeps, unplaced = weathered_sweeps(out, [*rows, *between.rows], scene.labels, tree)
+    if between.faults:
+        first = min(between.faults)
+        unplaced.append(
+            f"{len(between.faults)} LiDAR sweeps without an image stay clear, the first of frame "
+            f"{first}: {between.faults[first]}"
+        )
     shown = {**record.replaced, **record.replaced_sweeps}
     of_others = {place: each for place, each in shown.items() if each.scene != scene.name}
     others = _of_other_scenes(out, name, of_others)
     if gone := sorted(p for p in of_others.keys() - others.keys() if of_others[p].image):
         unplaced.append(
-            f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the "
+            f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in {out} or its "
             f"manifest: the source's own stand there again"
         )
     scenes = {ours.shown.scene for ours in others.values()} & record.scenes.keys()
@@ -211,8 +302,14 @@ def _of_other_scenes(out: Path, variant: str, shown: Mapping[str, Shown]) -> dic
     rows = [row for row in table if row["status"] == OK]
     by_path = {row["lidar_path"]: Weathered.sweep(out, row) for row in rows if is_weathered(row)}
     by_path |= {row["image_path"]: Weathered.image(out, row) for row in rows}
+    for each in shown.values():
+        path = each.sweep
+        if path and path not in by_path and is_sweep_between(out, variant, each.scene, path):
+            by_path[path] = Weathered.sweep(out, {"scene": each.scene, "lidar_path": path})
     found = {place: by_path.get(each.image or each.sweep) for place, each in shown.items()}
-    return {place: ours for place, ours in found.items() if ours is not None}
+    return {
+        place: ours for place, ours in found.items() if ours is not None and ours.path.is_file()
+    }
 
 
 def _rows(
@@ -241,6 +338,18 @@ def _rows(
     for name, rows in found.items():
         _check_rows(scene, out, name, rows)
     return found
+
+
+def _recipe_file(scene: Scene, out: Path, name: str) -> Path:
+    return out / variant_folder(scene.name, name) / "recipe.yaml"
+
+
+def _check_there(scene: Scene, out: Path, deleted: Sequence[str]) -> None:
+    if deleted:
+        raise OutputError(
+            f"{_recipe_file(scene, out, deleted[0])} was deleted, though {out / MANIFEST} lists "
+            f"images of {deleted[0]}; render it again"
+        )
 
 
 def _check_rows(scene: Scene, out: Path, name: str, rows: list[dict[str, Any]]) -> None:

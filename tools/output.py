@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import re
 import sys
 import threading
@@ -14,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
+from tqdm import tqdm
 from tyro.conf import arg
 
 MAX_FAILURES = 20  # that are printed
@@ -22,8 +24,24 @@ JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
 
 
 def print_note(text: str) -> None:
-    """On stderr, beside the result on stdout."""
-    print(text, file=sys.stderr)
+    """Print to stderr, above the progress bars, beside the result on stdout."""
+    tqdm.write(text, file=sys.stderr)
+
+
+class NoteHandler(logging.Handler):
+    """Prints log records as notes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_note(self.format(record))
+
+
+def duration_text(seconds: float) -> str:
+    """A time in a unit that suits it."""
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
 
 
 def print_images(result: Any, took: str) -> None:
@@ -41,22 +59,26 @@ def print_images(result: Any, took: str) -> None:
 
 @contextlib.contextmanager
 def compiling_noted(modules: Sequence[str] = (), *, on_gpu: bool = False) -> Iterator[None]:
-    """Says that kernels are compiled before the first of them is, and at the end how long it took.
+    """Have other processes compile kernels from the first one on, and say how long it took.
 
-    From the first on, other processes compile those of the modules whose names begin so. What lies
-    in numba's cache is loaded in silence. Triton does not tell beforehand: on a GPU what takes
-    longer than SILENT_S is taken to compile.
+    That kernels are compiled is logged by augment.render.cpu.jit; what lies in numba's cache is
+    loaded in silence. Triton does not tell beforehand: on a GPU, whatever takes longer than
+    SILENT_S counts as compiling, and is said here.
+
+    Args:
+        modules: beginnings of names of modules, whose kernels the other processes compile.
+        on_gpu: if True, Triton's kernels are meant.
     """
     from numba.core.event import Event, TimingListener, install_listener
 
     from augment.render.compile_ahead import compile_ahead
 
-    note = "compiling kernels (once; kept for the next run) ..."
     beside, started = ExitStack(), time.perf_counter()
 
     @cache
     def say_once() -> float:
-        print_note(note)
+        if on_gpu:
+            print_note("compiling kernels (once; kept for the next run) ...")
         if modules:
             beside.enter_context(compile_ahead(modules))
         return time.perf_counter()

@@ -28,7 +28,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
-from tqdm import tqdm
 
 from augment.errors import OutputError
 from augment.jobs.atomic import (
@@ -41,6 +40,7 @@ from augment.jobs.atomic import (
 )
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.processes import OutputLock
+from augment.progress import ProgressBar
 from tools.options import length_of
 from tools.output import print_note
 
@@ -208,7 +208,7 @@ def run_training(
     with StopRequest() as stop:
         if trainer.step == 0 and not training.rows:
             score()
-        with tqdm(
+        with ProgressBar(
             total=steps, initial=trainer.step, desc=name, unit="step", disable=not progress
         ) as bar:
             while trainer.step < steps and not stop.requested:

@@ -13,15 +13,16 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather as feather
 import torch
+from pydantic import Field
 from tqdm import tqdm
 
 from adapters.av2.files import (
@@ -143,7 +144,8 @@ class Av2Log:
     columns x y z (float64, city), intensity (0 to 255), laser_number, both as in the file, and
     timestamp_ns, each return's own. Its classes are the map's: ROAD and TERRAIN.
 
-    stamps_ns: of the sweeps, by frame number. lenses: by camera. ego_from_sensor: of both LiDARs.
+    stamps_ns: of the sweeps, in order. lenses: by camera. ego_from_sensor: of both LiDARs. step:
+    from one sweep's frame number to the next; those between are frames of images alone.
     """
 
     root: Path
@@ -154,6 +156,7 @@ class Av2Log:
     annotations: Annotations | None = None
     ground: GroundMap | None = None
     problems: tuple[str, ...] = ()
+    step: int = 1
 
     @staticmethod
     def read(path: str) -> Av2Log:
@@ -245,7 +248,7 @@ class Av2Log:
         table = read_columns(self.root, str(file.relative_to(self.root))).table
         table = table.take(pa.array(sweep.columns[INDEX_COLUMN]))
         columns = Columns(table, file)
-        pose = self.city.at(np.array([self.stamps_ns[frame_index]]))[0]
+        pose = self.city.at(np.array([self._stamp(frame_index)]))[0]
         places = (sweep.points_m - pose[:3, 3]) @ pose[:3, :3]
         changed = np.asarray(sweep.columns[CODE_COLUMN]) != UNCHANGED
         was = np.stack([columns.floats(name).astype(np.float64) for name in _RETURN], axis=1)
@@ -284,8 +287,9 @@ class Av2Log:
             return points @ pose[:3, :3].T + pose[:3, 3]
 
     def _stamp(self, frame_index: int) -> int | None:
-        is_frame = 0 <= frame_index < len(self.stamps_ns)
-        return self.stamps_ns[frame_index] if is_frame else None
+        number, between = divmod(frame_index, self.step)
+        is_sweep = not between and 0 <= number < len(self.stamps_ns)
+        return self.stamps_ns[number] if is_sweep else None
 
 
 def _sweep_name(stamp_ns: int) -> str:
@@ -312,7 +316,7 @@ def _read_lenses(root: Path, ego_from: Mapping[str, np.ndarray]) -> dict[str, Le
         if not re.fullmatch(r"\w{1,100}", name, re.ASCII):
             raise AdapterError(f"{path}: {name!r:.200} cannot be a camera's folder")
         if name not in ego_from:
-            raise AdapterError(f"{path}: camera {name} has no pose in {SENSORS}; copy it again")
+            raise AdapterError(f"{path}: camera {name} has no pose in {SENSORS}; add its row")
         if min(fx, fy, width, height) <= 0:
             raise AdapterError(
                 f"{path}: camera {name}: fx_px, fy_px, width_px, height_px must be above 0; got "
@@ -326,8 +330,8 @@ def _read_lenses(root: Path, ego_from: Mapping[str, np.ndarray]) -> dict[str, Le
 
 def av2_labels(path: str, query: dict[str, str]) -> Av2Log:
     """The labels of a log; whatever frames= says, they are those of all its frames."""
-    DriveOptions.from_query("av2", query)
-    return Av2Log.read(path)
+    options = Av2Options.from_query("av2", query)
+    return replace(Av2Log.read(path), step=options.step)
 
 
 # ---- The scene -----------------------------------------------------------------------------------
@@ -341,20 +345,84 @@ _THREADS = 4  # NumPy and Arrow release the interpreter
 _GREY_LEVELS = 6  # apart, colours of a grey image are the JPEG's rounding
 
 
+class Av2Options(DriveOptions):
+    """images: nearest, or all for frames between the sweeps too, of the images that no sweep has.
+    The scene's surfaces and colours are the same."""
+
+    images: Literal["nearest", "all"] = Field(
+        "nearest",
+        description="nearest for the images nearest to the sweeps, all for the others too, in "
+        "frames between the sweeps",
+    )
+
+    @property
+    def step(self) -> int:
+        """From one sweep's frame number to the next."""
+        return 2 if self.images == "all" else 1
+
+
 def open_av2(path: str, query: dict[str, str]) -> Scene:
     """The scene of a log's folder, such as `sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out, see DriveOptions.
-    Opening is deterministic: the same files and options give the same bits.
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out, see DriveOptions;
+    images, see Av2Options. Opening is deterministic: the same files and options give the same bits.
 
     Raises:
         AdapterError: a wrong option; tables or maps that are missing or damaged; no usable sweep or
             image; a camera all of whose images are damaged. What single frames lack is in
             Scene.problems."""
-    options = DriveOptions.from_query("av2", query)
+    options = Av2Options.from_query("av2", query)
     log = Av2Log.read(path)
     drive = read_av2(log, format_uri("av2", path, query), options)
-    return scene_of_drive(drive, options, ground=_ground(log, drive))
+    scene = scene_of_drive(drive, options, ground=_ground(log, drive))
+    return scene if options.images == "nearest" else _with_images_between(scene, log, options.step)
+
+
+def _with_images_between(scene: Scene, log: Av2Log, step: int) -> Scene:
+    """The scene with frames between sweeps, of the images that no sweep has: each camera's nearest
+    to the middle. They have neither a sweep nor boxes."""
+    stamps_of = {name: _image_stamps(log, name)[0] for name in log.lenses}
+    times: dict[tuple[int, str], int] = {}
+    for first, second in zip(scene.frames, scene.frames[1:], strict=False):
+        if second.index != first.index + 1:
+            continue
+        middle_ns = (first.timestamp_ns + second.timestamp_ns) // 2
+        for name, stamps in stamps_of.items():
+            used = [f.cameras[name].timestamp_ns for f in (first, second) if name in f.cameras]
+            free = stamps[~np.isin(stamps, used)]
+            free = free[(free > first.timestamp_ns) & (free < second.timestamp_ns)]
+            if len(free):
+                times[first.index, name] = int(free[np.abs(free - middle_ns).argmin()])
+    pictures = [
+        Picture(name, number, _image_file(log, name, time), log.lenses[name].size)
+        for (number, name), time in times.items()
+    ]
+    images = usable_images(pictures, every_camera=False)
+    frames: list[Frame] = []
+    for frame in scene.frames:
+        frames.append(replace(frame, index=step * frame.index))
+        own = [time for (number, _), time in times.items() if number == frame.index]
+        if own:
+            stamp = round(sum(time - own[0] for time in own) / len(own)) + own[0]
+            between = _frame(log, frame.index, stamp, times, images, scene.world_origin_m)
+            frames.append(replace(between, index=step * frame.index + 1))
+    return replace(
+        scene,
+        frames=tuple(frames),
+        labels=replace(log, step=step),
+        problems=(*scene.problems, *images.problems),
+    )
+
+
+def _image_stamps(log: Av2Log, camera: str) -> tuple[np.ndarray, int]:
+    """The times of a camera's images that poses cover, int64, ascending, and how many others."""
+    stamps = np.array(_stamps(log.root / "sensors/cameras" / camera, ".jpg"), np.int64)
+    covered = np.array([log.city.covers(stamp) for stamp in stamps], bool)
+    return stamps[covered], int((~covered).sum())
+
+
+def _image_file(log: Av2Log, camera: str, stamp_ns: int) -> Path:
+    return inside(log.root, f"sensors/cameras/{camera}/{stamp_ns}.jpg", str(log.root))
 
 
 def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
@@ -363,8 +431,7 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
     origin = drive_origin(log.city.poses[:, :3, 3])
     times, image_problems = _image_times(log, chosen.numbers)
     files = {
-        key: inside(log.root, f"sensors/cameras/{key[1]}/{time}.jpg", str(log.root))
-        for key, time in times.items()
+        (number, camera): _image_file(log, camera, time) for (number, camera), time in times.items()
     }
     pictures = [
         Picture(camera, number, files[number, camera], log.lenses[camera].size)
@@ -373,7 +440,10 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
     images = usable_images(pictures) if pictures else DriveImages({}, {}, ())
     grey = _grey_cameras(images)
     coloured = sum(len(images.paths.get(n, {}).keys() - grey) for n in chosen.used)
-    frames = tuple(_frame(log, number, times, images, origin) for number in chosen.numbers)
+    frames = tuple(
+        _frame(log, number, log.stamps_ns[number], times, images, origin)
+        for number in chosen.numbers
+    )
     sweeps, spin, sweep_problems = _read_sweeps(log, chosen.used, origin)
     moving, box_problems = _moving_boxes(log, spin, frames, origin)
     return RawDrive(
@@ -407,14 +477,12 @@ def _image_times(
     problems = []
     for camera in sorted(log.lenses):
         folder = log.root / "sensors/cameras" / camera
-        stamps = np.array(_stamps(folder, ".jpg"), np.int64)
-        covered = np.array([log.city.covers(stamp) for stamp in stamps], bool)
-        if not covered.all():
+        stamps, num_others = _image_stamps(log, camera)
+        if num_others:
             problems.append(
-                f"camera {camera}: left out {int((~covered).sum())} images before or after all "
-                f"poses"
+                f"camera {camera}: left out {num_others} images before or after all poses"
             )
-        stamps, missing = stamps[covered], []
+        missing = []
         for number in numbers:
             apart = np.abs(stamps - log.stamps_ns[number])
             if len(apart) and apart.min() <= _NEAR_NS:
@@ -433,12 +501,12 @@ def _image_times(
 def _frame(
     log: Av2Log,
     number: int,
+    stamp: int,
     times: Mapping[tuple[int, str], int],
     images: DriveImages,
     origin: np.ndarray,
 ) -> Frame:
     own = {camera: time for (n, camera), time in times.items() if n == number}
-    stamp = log.stamps_ns[number]
     poses = log.city.at(np.array([stamp, *own.values()], np.int64))
     cameras = {}
     for (name, time), city_from_ego in zip(own.items(), poses[1:], strict=True):

@@ -9,7 +9,6 @@ map of its ground.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,13 +18,13 @@ from typing import Annotated
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.feather as feather
 from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation, Slerp
 
 from adapters.plain_files import LARGEST, Number, inside, read_json, validated
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError, read_npy
+from augment.files.stated_sizes import StatedSizeError, check_texts, read_feather
 from augment.semantics import SemanticClass
 from recipes.files import open_file
 
@@ -49,7 +48,7 @@ def read_columns(root: Path, name: str) -> Columns:
     path = inside(root, name, str(root))
     try:
         with open_file(path) as file:
-            table = feather.read_table(io.BytesIO(file.read()), memory_map=False)
+            table = read_feather(file.read())
     except FileNotFoundError:
         raise AdapterError(f"{path} does not exist; {_COPY}") from None
     except _TABLE_FAULTS as error:
@@ -83,19 +82,32 @@ class Columns:
         return self._numbers(name, "iu", "whole numbers")
 
     def _numbers(self, name: str, kinds: str, meaning: str) -> np.ndarray:
-        values = np.array(self._column(name).to_numpy())
+        column = self._column(name)
+        is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
+        values = np.array(column.to_numpy()) if is_number else np.empty(0, object)
         if values.dtype.kind not in kinds:
+            kind = values.dtype if is_number else column.type
             raise AdapterError(
-                f"{self.path}: the column {name} must hold {meaning}; it holds {values.dtype}"
+                f"{self.path}: the column {name} must hold {meaning}; it holds {kind}"
             )
         return values
 
     def texts(self, name: str) -> np.ndarray:
         """Objects [N]."""
-        values = self._column(name).to_pylist()
-        if not all(isinstance(value, str) for value in values):
-            raise AdapterError(f"{self.path}: the column {name} must hold texts")
-        return np.array(values, object)
+        column = self._column(name)
+        kind = column.type
+        if pa.types.is_dictionary(kind):
+            kind = kind.value_type
+        if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+            raise AdapterError(
+                f"{self.path}: the column {name} must hold texts; it holds {column.type}"
+            )
+        if pa.types.is_dictionary(column.type):
+            try:
+                check_texts(column)
+            except StatedSizeError as error:
+                raise AdapterError(f"{self.path}: the column {name}: {error}") from None
+        return np.array(column.to_pylist(), object)
 
     def vectors(self, names: Sequence[str]) -> np.ndarray:
         """Finite numbers, float64 [N, names]."""

@@ -17,6 +17,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from adapters.camera_files.colmap_tables import check_colmap_tables
 from adapters.plain_files import LARGEST, Number, read_json
 from adapters.world import invert_pose
 from augment.errors import AdapterError
@@ -270,9 +271,10 @@ def open_colmap_model(model: Path) -> Any:
             f"{model}: COLMAP models are read by pycolmap, which is not installed: "
             "pip install 'climategs[colmap]'"
         ) from None
+    check_colmap_tables(model)
     try:
         return pycolmap.Reconstruction(str(model))
-    except (ValueError, RuntimeError, IndexError) as error:
+    except (ValueError, RuntimeError, LookupError, ArithmeticError, MemoryError) as error:
         raise AdapterError(
             f"{model}: pycolmap cannot read this COLMAP model: {error}. Expected cameras, images "
             "and points3D, all .bin or all .txt"

@@ -569,6 +569,11 @@ def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
         )
     first = min((run.data / "images").glob(f"*_{number}.jpg"), default=None)
     header = None if first is None else read_image_header(first)
+    if header is not None and header.orientation != 1:
+        problems.append(
+            f"images of camera {kind.name} have an EXIF orientation, such as {header.orientation} "
+            f"in {first}; it is ignored: poses and intrinsics are of the pixels as they are stored"
+        )
     if header is not None and (header.width, header.height) != (kind.width, kind.height):
         problems.append(
             f"{first} is of {header.width}x{header.height} pixels; drivestudio takes the "
@@ -674,6 +679,8 @@ def _read_instances(path: Path, _written_ns: int) -> dict[int, Instance]:
 
 _MOVED = (("x", "y", "z"), ("origin_x", "origin_y", "origin_z"))
 _TURNED = ("flow_x", "flow_y", "flow_z")
+# Returns that drops, flakes or fog made: not the ground, and without flow, as Waymo marks those.
+_OF_AIR = {**dict.fromkeys(_TURNED, 0.0), "flow_class": -1.0, "ground": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -749,7 +756,8 @@ class DriveStudioLabels:
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
         names = self.run.convention.lidar_columns
         records = np.fromfile(file, "<f4").reshape(-1, len(names))
-        return stored_records(records, names, sweep, self._world_from_lidar(frame_index))
+        air = {name: value for name, value in _OF_AIR.items() if name in names}
+        return stored_records(records, names, sweep, self._world_from_lidar(frame_index), air)
 
     def _lidar_file(self, frame: int) -> Path:
         return self.run.data / "lidar" / f"{frame:03d}.bin"

@@ -409,7 +409,7 @@ def _frame(source: Source, images: DriveImages, number: int) -> Frame:
             )
             for name, camera in source.calibration.cameras.items()
         },
-        image_paths=images.paths[number],
+        image_paths=images.paths.get(number, {}),
     )
 
 
@@ -500,9 +500,9 @@ def _raw_images(root: Path) -> tuple[dict[str, dict[int, str]], tuple[str, ...]]
         if images:
             empty = [n for n in cameras if (root / n).is_dir() and n not in images]
             return images, tuple(f"camera {n}: {root / n / 'data'} holds no image" for n in empty)
-    raise AdapterError(
+    return {}, (
         f"{root} holds no images: expected image_02/data/NNNNNNNNNN.png, or image_03/, or the grey "
-        f"image_00/ or image_01/; colours cannot be had without them"
+        f"image_00/ or image_01/",
     )
 
 
@@ -554,28 +554,23 @@ def _object_source(root: Path, calibration_folder: Path, options: KittiOptions) 
     images = {n: numbered(root, n, IMAGE_SUFFIXES, OBJECT_DIGITS) for n in OBJECT_CAMERAS}
     number = _object_frame(root, options.frame, sorted(set(sweeps).union(*images.values())))
     digits = f"{number:0{OBJECT_DIGITS}d}"
-    if number not in sweeps:
-        raise AdapterError(
-            f"{root / 'velodyne' / digits}.bin does not exist; frame {number} has no sweep to "
-            f"build a scene from"
-        )
     images = {name: {number: files[number]} for name, files in images.items() if number in files}
+    problems = []
+    if number not in sweeps:
+        problems.append(f"{root / 'velodyne' / digits}.bin does not exist")
     if not images:
-        raise AdapterError(
-            f"{root / 'image_2' / digits}.png does not exist, nor in image_3/; colours cannot be "
-            f"had without an image"
-        )
+        problems.append(f"{root / 'image_2' / digits}.png does not exist, nor in image_3/")
     chosen = options.select([number], where=f"kitti:{root}, frame {number}")
     calibration = read_object_calibration(calibration_folder, digits, images)
     labels = KittiLabels(
         root,
-        {number: sweeps[number]},
+        {number: sweeps[number]} if number in sweeps else {},
         {number: 0},
         {number: np.eye(4)},
         velodyne_from_rectified=np.linalg.inv(calibration.rectified_from_velodyne),
     )
     path = object_label_file(root, number)
-    problems = list(chosen.problems)
+    problems += chosen.problems
     if not path.exists():
         problems.append(f"{path} does not exist: no boxes are known")
     elif ignored := int((read_object_lines(path)["type"] == "DontCare").sum()):

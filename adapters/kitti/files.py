@@ -272,7 +272,8 @@ def frame_times(
         if times[after] <= times[before]:
             raise AdapterError(
                 f"{root}: by timestamps.txt frame {after} was not taken after frame {before} "
-                f"({times[after]} ns and {times[before]} ns); copy the file again"
+                f"({times[after]} ns and {times[before]} ns); correct the file, or leave it "
+                f"out: ten frames a second are assumed then"
             )
     if not missing:
         return times, ()

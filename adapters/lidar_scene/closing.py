@@ -52,6 +52,8 @@ _CELLS_PER_LAB = 1.0  # a difference in colour (CIELAB) as a distance in the ima
 _SQUARE_M = 0.5  # of the map of the ground
 _ON_GROUND_M = 0.2
 _FURTHEST_M = 300.0
+_CAR_M = 3.0  # from a camera; so near, the recording car itself is in the way of most rays
+_NEAREST_DISC_M = 0.2  # depth; nothing of the world is nearer to a camera on a car
 _STRETCH = 20.0  # of a disc on the ground that is seen at a slant
 _SOLID = 0.4  # part of a box's narrower side that a ray must pass to meet what is in it
 _SKIN = 0.15  # how deep in a box, as part of the ray's way through it, paint and glass lie
@@ -186,8 +188,9 @@ def _meet_ground(
     ground: _GroundMap | None, centre: np.ndarray, rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """How often each ray [..., 3] goes from the centre to the ground, _FURTHEST_M at most, infinite
-    without ground; and the class there. The height at the place that was found last is taken for
-    the next, which settles on roads."""
+    where no ground is met; and the class there. The height at the place that was found last is
+    taken for the next, which settles on roads. Where ground rises above the eye it may not settle,
+    and end before the lens: that is no place on the ground."""
     shape = rays.shape[:-1]
     if ground is None:
         return np.full(shape, np.inf), np.zeros(shape, np.int16)
@@ -196,7 +199,10 @@ def _meet_ground(
     for _ in range(5):
         square = ground.square(centre[:2] + times[..., None] * rays[..., :2])
         times = np.clip((centre[2] - ground.heights[square]) / down, 0.1, _FURTHEST_M)
-    return times, ground.semantic[square]
+    under = ground.square(centre[:2] + times[..., None] * rays[..., :2])
+    over = centre[2] - times * down - ground.heights[under]
+    is_in_air = (times < _CAR_M) & (over > _ON_GROUND_M)
+    return np.where(is_in_air, np.inf, times), ground.semantic[square]
 
 
 class _Cells(NamedTuple):
@@ -380,7 +386,8 @@ def _discs(
         close[window] |= inside
         if box.part:  # beside a silhouette, what is behind may count as the object's
             close &= (part != box.part) | box.holds(centre + there[..., None] * rays)
-    depth = np.clip(there[close], 0.2, _FURTHEST_M)
+    close &= there >= _NEAREST_DISC_M  # nearer: no distance is known, and a disc would hide all
+    depth = np.minimum(there[close], _FURTHEST_M)
     points = centre + depth[:, None] * rays[close]
     colours = np.where(part[close][:, None] > 0, photo.whole[close], photo.still[close]) / 255
     return _Discs(

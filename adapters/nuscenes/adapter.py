@@ -38,6 +38,7 @@ from adapters.raw_drive import (
     RawDrive,
     Sweep,
     TimedBoxes,
+    class_of_air,
     drive_origin,
     find_objects,
     is_usable,
@@ -50,7 +51,7 @@ from adapters.raw_drive import (
 )
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
-from augment.effects.lidar.codes import INDEX_COLUMN
+from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
 from augment.files.pickles import read_npy
 from augment.geometry import invert_rigid
@@ -72,10 +73,12 @@ _STRAIGHT = 1e-9  # of the cosine: between nearly equal rotations a straight lin
 # in x -0.2..2.8, y -0.7..0.7, z 0.8..1.9; the car, 4.1 m by 1.8 m, reaches from -0.7 to 3.5.
 EGO_M = np.array([[-0.8, -1.0, -0.5], [3.6, 1.0, 2.3]])
 _EGO_CLASS = 31
+_NOISE = "noise"
+_PANOPTIC_STEP = 1000  # a number of the panoptic labels is that many times the class, and an object
 # lidarseg's classes as published, numbered from 0, and what they mean here.
 _S = SemanticClass
 _CLASSES: tuple[tuple[str, int], ...] = (
-    ("noise", NO_SURFACE), ("animal", _S.OTHER), ("human.pedestrian.adult", _S.PEDESTRIAN),
+    (_NOISE, NO_SURFACE), ("animal", _S.OTHER), ("human.pedestrian.adult", _S.PEDESTRIAN),
     ("human.pedestrian.child", _S.PEDESTRIAN),
     ("human.pedestrian.construction_worker", _S.PEDESTRIAN),
     ("human.pedestrian.personal_mobility", _S.TWO_WHEELER),
@@ -200,8 +203,10 @@ class NuScenesLabels:
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
         sensor, rows = self.frames[frame_index].sweep, sweep.columns[INDEX_COLUMN]
+        in_air = is_in_air(sweep)
+        noise = class_of_air(_class_meanings(self.tables), _class_names(self.tables), _NOISE)
         if file.suffix == ".npz":
-            return _panoptic_of(file, rows)
+            return _panoptic_of(file, rows, in_air, noise)
         content = np.fromfile(file, np.uint8)
         if file != _path(self.tables, sensor):
             if rows.max(initial=-1) >= len(content):
@@ -209,7 +214,7 @@ class NuScenesLabels:
                     f"{file} has {len(content)} classes, fewer than {sensor.filename} has returns; "
                     f"copy it again"
                 )
-            return content[rows].tobytes()
+            return np.where(in_air, np.uint8(noise), content[rows]).tobytes()
         records = content.view("<f4").reshape(-1, 5)
         return stored_records(records, _RECORD, sweep, sensor.world_from_sensor)
 
@@ -249,20 +254,32 @@ def _read_classes(
 
 
 def _class_meanings(tables: SceneTables) -> dict[int, int]:
-    """SemanticClass or NO_SURFACE by number; by the published ones where category.json has none."""
-    if not tables.class_names:
-        return {number: meaning for number, (_, meaning) in enumerate(_CLASSES)}
+    """SemanticClass or NO_SURFACE by number."""
     meaning = dict(_CLASSES)
-    return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in tables.class_names.items()}
+    return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in _class_names(tables).items()}
 
 
-def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
-    """The numbers of those returns in a file of nuScenes' panoptic labels."""
+# NotImplementedError, RuntimeError: a compression or a password that zipfile does not know.
+_NPZ_FAULTS = (
+    *(OSError, ValueError, LookupError, EOFError, zlib.error, zipfile.BadZipFile),
+    *(NotImplementedError, RuntimeError),
+)
+
+
+def _class_names(tables: SceneTables) -> Mapping[int, str]:
+    """The classes by number; the published ones where category.json has none."""
+    return tables.class_names or {number: name for number, (name, _) in enumerate(_CLASSES)}
+
+
+def _panoptic_of(file: Path, rows: np.ndarray, in_air: np.ndarray, noise: int) -> bytes:
+    """The numbers of those returns in a file of nuScenes' panoptic labels; those in the air have
+    the class noise, and are no object's."""
     try:
         with zipfile.ZipFile(file) as archive, archive.open("data.npy") as member:
             opened: Any = member
             numbers = read_npy(opened)[rows]
-    except (OSError, ValueError, KeyError, IndexError, zlib.error, zipfile.BadZipFile) as error:
+            numbers[in_air] = _PANOPTIC_STEP * noise
+    except _NPZ_FAULTS as error:
         raise AdapterError(
             f"{file} must hold an array `data`, one number a return ({error}); copy it again"
         ) from error

@@ -50,6 +50,7 @@ _MAX_SPREAD_RAD = np.radians(20)
 # The LiDAR turns in 50 ms; further from a sweep than two turns an image belongs to none.
 _NEAR_NS = 100_000_000
 LIDAR = "LIDAR_TOP"
+_PUBLISHED = "v1.0-"  # how the names of published versions begin
 _MAX_NAMES = 10  # that a message lists
 
 # ---- What rows must hold; later editions may have more fields ------------------------------------
@@ -172,7 +173,7 @@ class Row(NamedTuple):
 def read_rows(path: Path) -> Iterator[Row]:
     """The rows of a table, in its order."""
     try:
-        with io.TextIOWrapper(open_file(path), encoding="utf-8") as file:
+        with io.TextIOWrapper(open_file(path), encoding="utf-8-sig") as file:
             yield from _rows(path, file)
     except FileNotFoundError:
         raise AdapterError(f"{path} does not exist; copy it from the dataset") from None
@@ -192,7 +193,7 @@ def read_table(
         if row.token in kept:
             raise AdapterError(
                 f"{row}: the token of an earlier row too (row number {kept[row.token].number}); "
-                f"tokens must be unique, copy the table again"
+                f"tokens must be unique within a table"
             )
         kept[row.token] = row
     return kept
@@ -383,19 +384,34 @@ def _read_turn(lidar: Sequence[SensorFile], images: Mapping[str, tuple[SensorFil
 def _choose_version(root: Path, version: str | None) -> str:
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a nuScenes dataset with v1.0-*/")
-    found = sorted(path.parent.name for path in root.glob("v1.0-*/scene.json"))
-    if not found:
+    versions = table_folders(root)
+    if not versions:
         above = root.absolute().parent
-        is_above = any(above.glob("v1.0-*/scene.json")) or (root / "scene.json").is_file()
+        is_above = bool(table_folders(above)) or _holds_tables(root)
         raise AdapterError(
             f"{root} holds no nuScenes tables (v1.0-*/scene.json), such as those of v1.0-mini; "
             + (f"give the folder above it, {above}" if is_above else "unpack the metadata there")
         )
-    if version is None and len(found) > 1:
-        raise AdapterError(f"{root} holds several versions; add version= one of {_listed(found)}")
-    if version is not None and version not in found:
-        raise AdapterError(f"{root} has no tables of version={version}; it has {_listed(found)}")
-    return version or found[0]
+    if version is not None and version not in versions:
+        raise AdapterError(f"{root} has no tables of version={version}; it has {_listed(versions)}")
+    published = [name for name in versions if name.startswith(_PUBLISHED)]
+    choice = [version] if version is not None else published or versions
+    if len(choice) > 1:
+        raise AdapterError(f"{root} holds several versions; add version= one of {_listed(choice)}")
+    return choice[0]
+
+
+def table_folders(root: Path) -> list[str]:
+    """Names of the folders with nuScenes tables in a dataset's folder: v1.0-mini or such, or
+    whatever a converter called its own."""
+    folders = sorted(path.parent for path in root.glob("*/scene.json"))
+    return [folder.name for folder in folders if _holds_tables(folder)]
+
+
+def _holds_tables(folder: Path) -> bool:
+    others = ("sample", "sample_data", "calibrated_sensor")  # a missing one is told later
+    is_there = [(folder / f"{name}.json").is_file() for name in ("scene", *others)]
+    return is_there[0] and any(is_there[1:])
 
 
 def _choose_scene(folder: Path, scene: str | None) -> Row:

@@ -41,6 +41,7 @@ from adapters.raw_drive import (
     RecordedObjects,
     Sweep,
     TimedBoxes,
+    class_of_air,
     find_objects,
     is_in_box,
     names_in,
@@ -62,7 +63,7 @@ from adapters.recording.files import (
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.effects.lidar.beam import intensity_column
-from augment.effects.lidar.codes import INDEX_COLUMN
+from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError, OutputError
 from augment.jobs.files import decode_png, depth_in_metres
 from augment.jobs.layout import SWEEPS, folder_name
@@ -80,6 +81,7 @@ _VECTORS = {
     "quats": ("qw", "qx", "qy", "qz"),
 }
 _REQUIRED = ("frame", "track_id", "label", *(name for names in _VECTORS.values() for name in names))
+_CLASS = "semantic"  # the column of class numbers
 _CACHED_FILES = 4  # box files kept: every frame asks for its own part of one
 _DAMAGED = (OutputError, OSError, pa.ArrowException, KeyError, IndexError, TypeError, ValueError)
 _LIDAR_FILE = "a LiDAR file with columns x, y, z"
@@ -119,20 +121,34 @@ class RecordingLabels:
         """The same columns, types and notes."""
         with _reading(file, _LIDAR_FILE):
             table = read_table(file, str(file)).take(pa.array(sweep.columns[INDEX_COLUMN]))
-            for name in {*"xyz", intensity_column(sweep)} - {None}:
+            columns = {name: np.asarray(sweep.columns[name]) for name in "xyz"}
+            if (intensity := intensity_column(sweep)) is not None:
+                columns[intensity] = np.asarray(sweep.columns[intensity])
+            if _CLASS in sweep.columns and is_in_air(sweep).any():
+                columns[_CLASS] = self._classes_with_air(sweep)
+            for name, values in columns.items():
                 at = table.schema.get_field_index(name)
                 field = table.schema.field(at)
-                values = np.asarray(sweep.columns[name])
                 values = np.rint(values) if pa.types.is_integer(field.type) else values
                 table = table.set_column(at, field, pa.array(values).cast(field.type, safe=False))
             sink = pa.BufferOutputStream()
             pq.write_table(table, sink)
             return sink.getvalue().to_pybytes()
 
+    def _classes_with_air(self, sweep: LidarSweep) -> np.ndarray:
+        """The class numbers of a weathered sweep, with that of no surface, or of none, for returns
+        that drops, flakes or fog made; unchanged where numbers are not known to mean anything."""
+        classes = np.asarray(sweep.columns[_CLASS])
+        numbers = class_numbers(self.root / "lidar", classes)
+        meaning, _ = class_meanings(read_lidar_classes(self.root), [numbers])
+        if meaning is None:
+            return classes
+        return np.where(is_in_air(sweep), class_of_air(meaning, {}, ""), classes)
+
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
         mean anything."""
-        column = sweep.columns.get("semantic")
+        column = sweep.columns.get(_CLASS)
         if column is None or len(column) == 0:
             return None
         numbers = class_numbers(self.root / "lidar", column)
@@ -444,11 +460,6 @@ def read_recording(
     listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
     frames, image_problems = find_images(root, listed)
     used = [frame for frame in frames if frame.index not in chosen.held_out]
-    if not any(frame.image_paths for frame in used):
-        raise AdapterError(
-            f"{root / 'images'} holds no usable image of {some(chosen.used)} that are not held "
-            f"out; colours cannot be had without them: " + "; ".join(image_problems[:3])
-        )
     objects = read_objects(root, frames, calibration.world_origin_m)
     lidar = read_lidar_drive(root, calibration, used)
     drive = RawDrive(
@@ -490,7 +501,7 @@ def _best_scene(
 ) -> Scene:
     """The scene from LiDAR, else from depth images, else from guesses."""
     count = sum(map(len, drive.sweeps))
-    if count >= _MIN_RETURNS:
+    if count >= _MIN_RETURNS or not any(frame.image_paths for frame in drive.used):
         return scene_of_drive(drive, options)
     start = f"{root / 'lidar'} holds {count or 'no'} returns"
     sweeps, problems = depth_sweeps(root, drive.used)

@@ -51,14 +51,19 @@ from adapters.waymo.tables import (
     Segment,
     extract_images,
     find_segment,
-    is_number,
     read_segment,
 )
 from augment.cameras import Camera, Frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
 from augment.files.image_size import image_header
-from augment.files.packed_images import RowReader
+from augment.files.packed_images import (
+    FILE_BYTES,
+    NUMBER_LISTS,
+    WHOLE_NUMBERS,
+    ColumnKind,
+    RowReader,
+)
 from augment.geometry import invert_rigid
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
@@ -77,6 +82,8 @@ _THREADS = 4  # NumPy releases the interpreter
 # 1 where a return is in a zone without labels. A second image has the second return of each beam.
 
 _ROWS_AT_ONCE = 5  # a frame's five lasers: 21 MB
+_MAX_DIVISOR = 65_535  # labels have 16 bits
+_Columns = tuple[tuple[str, ColumnKind], ...]
 
 
 class Returns(NamedTuple):
@@ -274,7 +281,9 @@ def _range_images(
         return {}
     own = _index(segment, component, "key.laser_name", LASERS).get(frame, {})
     names = [f"[{COMPONENTS[component]}].range_image_return{n}" for n in returns]
-    columns = tuple(f"{name}.{part}" for name in names for part in ("values", "shape"))
+    columns = tuple(
+        (f"{name}.{part}", NUMBER_LISTS) for name in names for part in ("values", "shape")
+    )
     cells = _reader(segment, component, columns).read(list(own.values()))
     where = f"{segment.files.path(component)}: frame {segment.stamps_us[frame]}"
     return {
@@ -289,7 +298,7 @@ def _range_image(cells: dict[str, Any], name: str, channels: int, where: str) ->
         return None
     is_size = len(shape) == 3 and all(isinstance(n, int) and 1 <= n <= MAX_SIDE for n in shape)
     is_whole = is_size and shape[2] == channels and len(values) == np.prod(shape)
-    if not is_whole or values.null_count or not is_number(values.type):
+    if not is_whole or values.null_count:
         raise AdapterError(
             f"{where}: {name} must have height x width x {channels} numbers, none of them null, "
             f"and sides up to {MAX_SIDE}; got shape {shape} and {len(values)} of {values.type}. "
@@ -307,7 +316,8 @@ def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
     image, divisor = (
         f"[{COMPONENTS[component]}].{name}" for name in ("panoptic_label", "panoptic_label_divisor")
     )
-    cells = _reader(segment, component, (image, divisor)).read(list(own.values()))
+    columns = ((image, FILE_BYTES), (divisor, WHOLE_NUMBERS))
+    cells = _reader(segment, component, columns).read(list(own.values()))
     found = {}
     for number, row in own.items():
         name, path = CAMERAS[number - 1], segment.files.path(component)
@@ -318,24 +328,25 @@ def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
         panoptic = None
         if header and lens and header.format == "PNG" and size == (lens.width, lens.height):
             panoptic = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if panoptic is None or panoptic.ndim != 2 or not isinstance(step, int) or step < 1:
+        is_divisor = isinstance(step, int) and 1 <= step <= _MAX_DIVISOR
+        if panoptic is None or panoptic.ndim != 2 or not is_divisor:
             raise AdapterError(
                 f"{path}: frame {segment.stamps_us[frame]}, camera {name}: panoptic_label must be "
-                f"a grey PNG of the camera's size with a divisor > 0; got size {size}, divisor "
-                f"{step}. Copy it again"
+                f"a grey PNG of the camera's size with a divisor of 1 to {_MAX_DIVISOR}; got size "
+                f"{size}, divisor {step}. Copy it again"
             )
-        found[number] = (panoptic // step).clip(0, 255).astype(np.uint8)
+        found[number] = (panoptic.astype(np.int64) // step).clip(0, 255).astype(np.uint8)
     return found
 
 
-def _reader(segment: Segment, component: str, columns: tuple[str, ...]) -> RowReader:
+def _reader(segment: Segment, component: str, columns: _Columns) -> RowReader:
     # Another process must not go on with this one's files.
     return _reader_of(segment, component, columns, os.getpid())
 
 
 @lru_cache(maxsize=8)
-def _reader_of(segment: Segment, component: str, columns: tuple[str, ...], _pid: int) -> RowReader:
-    return RowReader(segment.files.path(component), columns, _ROWS_AT_ONCE)
+def _reader_of(segment: Segment, component: str, columns: _Columns, _pid: int) -> RowReader:
+    return RowReader(segment.files.path(component), dict(columns), _ROWS_AT_ONCE)
 
 
 @lru_cache(maxsize=8)
@@ -655,7 +666,8 @@ def read_sweeps(
     _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
     missing, faults, step = [], {}, 0
-    rows = _index(segment, "lidar", "key.laser_name", LASERS)
+    has_returns = segment.files.has("lidar")
+    rows = _index(segment, "lidar", "key.laser_name", LASERS) if has_returns else {}
     in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
     waiting: deque[tuple[int, Future[Sweep | None]]] = deque()
 

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from scipy.spatial.transform import Rotation
 
 from adapters.plain_files import LARGEST, checked_pose
@@ -26,7 +25,7 @@ from adapters.raw_drive import some
 from adapters.scene_cache import image_folder
 from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
-from augment.files.packed_images import Lens, PackedImages, reading
+from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, reading
 from augment.jobs.manifest import MAX_SIDE_PX
 from augment.jobs.tables import read_table
 
@@ -52,7 +51,7 @@ _CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0
 _LATEST_S = 9e9  # nanoseconds in int64 reach 9.2e18
 _NEAR_S = 0.25  # an image is taken this close to its frame's time
 _SPIN_NS = 100_000_000  # one turn of the TOP laser, from the frame's time on
-_ADVICE = "copy it again from the dataset"
+_ADVICE = "write it as the dataset does, or copy the dataset's own file"
 
 
 # ---- Which files ---------------------------------------------------------------------------------
@@ -81,7 +80,8 @@ def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
     if alone.has(WAYMO_REQUIRED[0]):
         file = alone.path(WAYMO_REQUIRED[0])
         with reading(file):
-            names = set(read_table(file, str(file), [SEGMENT]).column(SEGMENT).to_pylist())
+            table = read_table(file, str(file), [SEGMENT])
+        names = set(_segment_names(table, file))
         found = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
     else:
         found = {
@@ -116,6 +116,19 @@ def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
 # ---- Columns -------------------------------------------------------------------------------------
 
 
+def _segment_names(table: pa.Table, path: Path) -> list[str]:
+    """The segment of each row."""
+    if SEGMENT not in table.column_names:
+        raise AdapterError(f"{path}: column {SEGMENT} is missing; {_ADVICE}")
+    kind = table[SEGMENT].type
+    if not _is_text(kind) or table[SEGMENT].null_count:
+        raise AdapterError(
+            f"{path}: column {SEGMENT} must hold a text in every row; it holds {kind} with "
+            f"{table[SEGMENT].null_count} nulls; {_ADVICE}"
+        )
+    return table[SEGMENT].to_pylist()
+
+
 class Rows:
     """The rows of a segment in one component; columns go by their fields' names, keys by theirs."""
 
@@ -125,13 +138,11 @@ class Rows:
         wanted = [field if field == STAMP else self.name(field) for field in fields]
         with reading(self.path):
             table = read_table(self.path, str(self.path), [SEGMENT, *wanted])
-            there = set(table.column_names)
-            if SEGMENT not in there:
-                raise self.fault(SEGMENT, "is missing")
-            same = pc.equal(table[SEGMENT], files.name)
+            names = _segment_names(table, self.path)
+            same = pa.array([name == files.name for name in names], pa.bool_())
             self._table = table.append_column("row", pa.array(np.arange(len(table)))).filter(same)
         if not len(self._table):
-            held = ", ".join(map(repr, table[SEGMENT].unique().to_pylist()[:3])) or "none"
+            held = ", ".join(map(repr, list(dict.fromkeys(names))[:3])) or "none"
             raise self.fault(SEGMENT, f"must be {files.name!r} in some rows; got {held}")
 
     def __len__(self) -> int:
@@ -163,14 +174,14 @@ class Rows:
             return np.full(len(self), or_else)
         column = self.column(field)
         kind = column.type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        if not is_number(kind):
             raise self.fault(field, f"must hold numbers; it holds {kind}")
         if column.null_count and or_else is None:
             raise self.fault(
                 field, f"must have a value in every row; {column.null_count} have none"
             )
         if column.null_count:
-            column = pc.cast(column, pa.float64()).fill_null(or_else)
+            column = column.cast(pa.float64()).fill_null(or_else)
         return column.to_numpy(zero_copy_only=False)
 
     def finite(self, field: str, largest: float = LARGEST) -> np.ndarray:
@@ -200,7 +211,7 @@ class Rows:
         """Numbers from 1 of the words, which the file may have in their place, int64."""
         of = {word: number for number, word in enumerate(words, start=1)}
         of |= {number: number for number in of.values()}
-        values = self.column(field).to_pylist()
+        values = self._words(field)
         if strange := [value for value in values if value not in of]:
             expected = f"numbers from 1 to {len(words)} or {', '.join(words)}"
             raise self.fault(field, f"must hold {expected}; got {strange[0]!r}")
@@ -211,7 +222,14 @@ class Rows:
         stand for; else Unknown."""
         of = {number: word for number, word in enumerate(words, start=1)}
         of |= {f"TYPE_{word.upper()}": word for word in words}
-        return [of.get(value, "Unknown") for value in self.column(field).to_pylist()]
+        return [of.get(value, "Unknown") for value in self._words(field)]
+
+    def _words(self, field: str) -> list[Any]:
+        """Numbers, texts or None."""
+        column = self.column(field)
+        if not (is_number(column.type) or _is_text(column.type) or pa.types.is_null(column.type)):
+            raise self.fault(field, f"must hold whole numbers or texts; it holds {column.type}")
+        return column.to_pylist()
 
     def poses(self, field: str) -> np.ndarray:
         """Rigid transforms, float64 [N, 4, 4]."""
@@ -229,22 +247,16 @@ class Rows:
     def lists(self, field: str) -> list[np.ndarray | None]:
         """Float64 numbers of each row's list, None for null."""
         column = self.column(field)
-        if not _is_list(column.type) or not is_number(column.type.value_type):
-            raise self.fault(field, f"must hold lists of numbers; it holds {column.type}")
+        if not NUMBER_LISTS.matches(column.type):
+            raise self.fault(field, f"must hold {NUMBER_LISTS.words}; it holds {column.type}")
         found = [None if cell.values is None else _flat(cell) for cell in column]
         if any(values is not None and not np.isfinite(values).all() for values in found):
             raise self.fault(field, "holds numbers that are not finite")
         return found
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    return (
-        pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
-    )
-
-
-def is_number(kind: pa.DataType) -> bool:
-    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
 def _flat(cell: Any) -> np.ndarray:
@@ -335,24 +347,28 @@ class Segment:
 
 
 def read_segment(files: SegmentFiles) -> Segment:
-    """All but images, range images and labels."""
-    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
-        raise AdapterError(
-            f"segment {files.name} lacks {', '.join(str(files.path(name)) for name in missing)}; a "
-            f"scene needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
-        )
+    """All but images, range images and labels; what its components say that are there."""
     rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
     stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
     order = np.argsort(stamps, kind="stable")
     stamps, poses = stamps[order], poses[order]
+    if not (np.abs(stamps.astype(np.float64)) <= _LATEST_S * 1e6).all():
+        raise rows.fault(
+            STAMP, f"must be Unix time in microseconds; got {stamps[0]} to {stamps[-1]}"
+        )
     if (np.diff(stamps) <= 0).any():
         twice = stamps[1:][np.diff(stamps) <= 0][0]
         raise rows.fault(STAMP, f"must name each frame once; {twice} stands twice")
-    if np.abs(stamps).max() > _LATEST_S * 1e6:
-        raise rows.fault(STAMP, f"must be Unix time in microseconds; got {stamps.max()}")
-    cameras, lasers = _read_cameras(files), _read_lasers(files)
+    cameras = _read_cameras(files) if files.has("camera_calibration") else {}
+    lasers = _read_lasers(files) if files.has("lidar_calibration") else {}
     segment = Segment(files, stamps, poses, stamps * 1000 + _SPIN_NS // 2, cameras, lasers, {}, ())
-    shots, problems = _read_shots(segment)
+    shots, problems = _read_shots(segment) if cameras and files.has("camera_image") else ({}, ())
+    if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
+        lacks = (
+            f"the segment lacks {', '.join(str(files.path(name)) for name in missing)}; a scene "
+            f"needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
+        )
+        problems = (lacks, *problems)
     times = [
         own["FRONT"].pose_ns if "FRONT" in (own := shots.get(n, {})) else int(usual)
         for n, usual in enumerate(segment.pose_times_ns)
@@ -458,6 +474,8 @@ def extract_images(
     """Paths of the frames' images without lens distortion, by frame and camera, and a sentence for
     what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`): those
     of the frames in `now` at once, the others from when they are read on."""
+    if not segment.shots:
+        return {n: {} for n in numbers}, ()
     files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
     folder = image_folder(segment.files.name, files)
     shots = {

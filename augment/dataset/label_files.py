@@ -33,7 +33,14 @@ from augment.dataset.samples import moved_points
 from augment.dataset.weather_dataset import RowReader
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat
-from augment.jobs.atomic import copy_file, link_file, refusals_of, replaced_folder
+from augment.jobs.atomic import (
+    copy_file,
+    link_file,
+    path_below,
+    read_file,
+    refusals_of,
+    replaced_folder,
+)
 from augment.jobs.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
 from augment.jobs.claims import hold
 from augment.jobs.files import CameraRecord, box_tables, visibility
@@ -111,7 +118,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
     a part that is no name.
     """
     out = Path(out).absolute()
-    folder, store = out / LABELS, open_store(out)
+    folder, store = path_below(out, (LABELS,)), open_store(out)
     asked = asked or _asked_before(folder)
     if wrong := [part for part in asked.split if folder_name(part) != part]:
         raise ValueError(f"parts are names of files: letters, digits, -, _ and .; got {wrong[0]!r}")
@@ -140,7 +147,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
 
 def _asked_before(folder: Path) -> LabelsAsked:
     try:
-        return LabelsAsked.model_validate(json.loads((folder / RECORD).read_bytes())["asked"])
+        return LabelsAsked.model_validate(json.loads(read_file(folder / RECORD))["asked"])
     except (OSError, LookupError, TypeError, ValueError, RecursionError):
         return LabelsAsked()
 

@@ -236,10 +236,13 @@ def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
         if pose is not None:
             gaussians = moved_gaussians(gaussians, pose[:3, :3], pose[:3, 3])
         placed.append(gaussians)
-    return _joined(placed)
+    return joined_gaussians(placed)
 
 
-def _joined(parts: Sequence[Gaussians]) -> Gaussians:
+def joined_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+    """The Gaussians of all parts, one part after another. Colours of a lower degree are filled up
+    with zero bands, unknown classes with UNKNOWN.
+    """
     if len(parts) == 1:
         return parts[0]
     names = ("means", "quats", "scales", "opacities")

@@ -16,16 +16,25 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    ValidationError,
+)
 
 from augment.errors import SceneError
+from augment.files.limits import check_memory, parsed_json
 from augment.files.ply import SplatFile, join_placed
 from augment.geometry import rotmat_from_quat
 from augment.jobs.atomic import replaced_file
@@ -36,11 +45,16 @@ GLB = b"glTF"
 NOTES = {"up": "+y", "unit": "metre"}
 _CHUNKS = struct.Struct("<4sIIII"), struct.Struct("<II")  # with the first chunk's; of the second
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_MAX_JSON = 256 << 20
+_MAX_JSON = 256 << 20  # bytes of text, with buffers in it
+_MAX_VALUES = 2_000_000  # in the JSON, buffers left out
+_MAX_NODES = 100_000
+_MAX_ATTRIBUTES = 1000  # of a primitive
+_MAX_PLACED = 10_000  # primitives in the scene, copies among them
 _KNOWN = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _COLOURS = (None, "srgb_rec709_display", "BT.709-sRGB", "BT.709")  # the drafts' names are the rest
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_IS_COLOUR = ":SH_DEGREE_"  # in the names of attributes
 _LEAST_ROW = 12  # bytes of a Gaussian, whose first coefficients are floats
 _MAX_COPIES = 16  # of all Gaussians that the file has room for
 
@@ -84,22 +98,30 @@ class _PrimitiveExtensions(_Entry):
     KHR_gaussian_splatting: _Splatting | None = None
 
 
+def _of_few_keys(value: object) -> object:
+    if isinstance(value, dict) and len(value) > _MAX_ATTRIBUTES:
+        raise ValueError(f"it has {len(value)} attributes; at most {_MAX_ATTRIBUTES} are read")
+    return value
+
+
 class _Primitive(_Entry):
-    attributes: dict[str, NonNegativeInt] = {}
+    attributes: Annotated[dict[str, NonNegativeInt], BeforeValidator(_of_few_keys)] = {}
     mode: int = 4
     extensions: _PrimitiveExtensions = _PrimitiveExtensions()
 
 
 class _Mesh(_Entry):
-    primitives: tuple[_Primitive, ...]
+    primitives: Annotated[tuple[_Primitive, ...], Field(fail_fast=True)]
 
 
-_Numbers = tuple[FiniteFloat, ...]
+# A list with a wrong item is not looked at to its end: of millions of errors each costs a kilobyte.
+_Numbers = Annotated[tuple[FiniteFloat, ...], Field(fail_fast=True)]
+_Indices = Annotated[tuple[NonNegativeInt, ...], Field(fail_fast=True)]
 
 
 class _Node(_Entry):
     mesh: NonNegativeInt | None = None
-    children: tuple[NonNegativeInt, ...] = ()
+    children: _Indices = ()
     matrix: _Numbers | None = Field(None, min_length=16, max_length=16)
     translation: _Numbers = Field((0, 0, 0), min_length=3, max_length=3)
     rotation: _Numbers = Field((0, 0, 0, 1), min_length=4, max_length=4)
@@ -112,25 +134,27 @@ class _Node(_Entry):
             return np.array(self.matrix, np.float64).reshape(4, 4).T
         x, y, z, w = self.rotation
         out = np.eye(4)
-        turn = rotmat_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
+        turn = np.eye(3)
+        if self.rotation != (0, 0, 0, 1):
+            turn = rotmat_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64)).numpy()
         out[:3, :3] = turn * np.array(self.scale)
         out[:3, 3] = self.translation
         return out
 
 
 class _Scene(_Entry):
-    nodes: tuple[NonNegativeInt, ...] = ()
+    nodes: _Indices = ()
 
 
 class _Document(_Entry):
     asset: dict[str, Any]
-    extensionsRequired: tuple[str, ...] = ()
-    buffers: tuple[_Buffer, ...] = ()
-    bufferViews: tuple[_View, ...] = ()
-    accessors: tuple[_Accessor, ...] = ()
-    meshes: tuple[_Mesh, ...] = ()
-    nodes: tuple[_Node, ...] = ()
-    scenes: tuple[_Scene, ...] = ()
+    extensionsRequired: Annotated[tuple[str, ...], Field(fail_fast=True)] = ()
+    buffers: Annotated[tuple[_Buffer, ...], Field(fail_fast=True)] = ()
+    bufferViews: Annotated[tuple[_View, ...], Field(fail_fast=True)] = ()
+    accessors: Annotated[tuple[_Accessor, ...], Field(fail_fast=True)] = ()
+    meshes: Annotated[tuple[_Mesh, ...], Field(fail_fast=True)] = ()
+    nodes: Annotated[tuple[_Node, ...], Field(fail_fast=True)] = ()
+    scenes: Annotated[tuple[_Scene, ...], Field(fail_fast=True)] = ()
     scene: NonNegativeInt = 0
 
 
@@ -155,7 +179,7 @@ def read_gltf(path: str | Path) -> SplatFile:
     path = Path(path)
     try:
         return _File(path).read()
-    except (IndexError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (IndexError, RecursionError) as error:
         raise SceneError(f"{path}: not a whole glTF file ({error}); export it again") from error
     except ValidationError as error:
         first = error.errors()[0]
@@ -169,9 +193,7 @@ class _File:
     def __init__(self, path: Path) -> None:
         self.path = path
         text, self.chunk = _parts(path)
-        document = json.loads(text)
-        if not isinstance(document, dict):
-            raise self.error("its JSON is not an object")
+        document = parsed_json(text, str(path), max_values=_MAX_VALUES)
         self.document = _Document.model_validate(document)
         self.buffers: dict[int, np.ndarray] = {}
         self.problems: list[str] = []
@@ -185,18 +207,10 @@ class _File:
         return SceneError(f"{self.path}: {what}")
 
     def read(self) -> SplatFile:
-        placed, rows = list(self.placed_primitives()), 0
+        placed = list(self.placed_primitives())
         if not placed:
             raise self.error(f"its scene has no primitive with {EXTENSION}; splats are needed")
-        accessors = self.document.accessors
-        room = sum(buffer.byteLength for buffer in self.document.buffers) // _LEAST_ROW
-        for primitive, _ in placed:
-            rows += accessors[primitive.attributes.get("POSITION", 0)].count
-        if rows > _MAX_COPIES * room:
-            raise self.error(
-                f"it places {rows} Gaussians, more than {_MAX_COPIES} times the {room} that its "
-                "buffers have room for; place fewer copies"
-            )
+        self.check_rows([primitive for primitive, _ in placed])
         read: dict[int, _Columns] = {}
         parts = []
         for primitive, matrix in placed:
@@ -210,10 +224,29 @@ class _File:
             )
         return join_placed(parts, self.path, NOTES, self.problems)
 
+    def check_rows(self, primitives: Sequence[_Primitive]) -> None:
+        """Refuse more Gaussians, or copies of them, than the buffers that are there can hold."""
+        document = self.document
+        accessors = [document.accessors[p.attributes.get("POSITION", 0)] for p in primitives]
+        rows = sum(accessor.count for accessor in accessors)
+        views = {a.bufferView for a in accessors if a.bufferView is not None}
+        numbers = {document.bufferViews[view].buffer for view in views}
+        sizes = {document.buffers[n].uri: len(self.buffer(n)) for n in numbers}  # once a file
+        room = sum(sizes.values()) // _LEAST_ROW
+        if rows > _MAX_COPIES * room:
+            raise self.error(
+                f"it places {rows} Gaussians, more than {_MAX_COPIES} times the {room} that its "
+                "buffers have room for; place fewer copies"
+            )
+        functions = max(sum(_IS_COLOUR in name for name in p.attributes) for p in primitives)
+        check_memory(str(self.path), rows, functions=functions, size=sum(sizes.values()))
+
     def placed_primitives(self) -> Iterator[tuple[_Primitive, np.ndarray]]:
         """Primitives of Gaussians with world_from_node, in the order of the scene's nodes."""
         document, seen, others = self.document, set(), 0
-        roots: tuple[int, ...] = ()
+        if len(document.nodes) > _MAX_NODES:
+            raise self.error(f"it has {len(document.nodes)} nodes; at most {_MAX_NODES} are read")
+        count, roots = 0, tuple[int, ...]()
         if document.scenes:
             roots = document.scenes[document.scene].nodes
         else:
@@ -226,12 +259,27 @@ class _File:
                 raise self.error(f"node {number} has two parents; nodes must be a tree")
             seen.add(number)
             node = document.nodes[number]
-            matrix = world_from_parent @ node.parent_from_node
+            with np.errstate(over="ignore", invalid="ignore"):
+                matrix = world_from_parent @ node.parent_from_node
+                volume = np.linalg.det(matrix[:3, :3])
+            if not np.isfinite(matrix).all():
+                raise self.error(
+                    f"node {number} has no place in the scene: its rotation must be a quaternion "
+                    f"of length 1, its other numbers within float64; got the rotation "
+                    f"{list(node.rotation)}, translation {list(node.translation)}, scale "
+                    f"{list(node.scale)}"
+                )
             if node.mesh is not None:
                 for primitive in document.meshes[node.mesh].primitives:
                     if primitive.extensions.KHR_gaussian_splatting is not None:
-                        if np.linalg.det(matrix[:3, :3]) <= 0:
+                        if not volume > 0:
                             raise self.error(f"node {number} mirrors or flattens its Gaussians")
+                        count += 1
+                        if count > _MAX_PLACED:
+                            raise self.error(
+                                f"it places more than {_MAX_PLACED} primitives of Gaussians; join "
+                                "them, or place fewer copies"
+                            )
                         yield primitive, matrix
                     else:
                         others += 1
@@ -343,7 +391,7 @@ class _File:
                 raise self.error(f"a buffer's data cannot be read: {error}") from error
         root = self.path.parent.resolve()
         file = root / unquote(uri)
-        if ":" in uri or "\0" in file.name or not file.resolve().is_relative_to(root):
+        if ":" in uri or "\0" in unquote(uri) or not file.resolve().is_relative_to(root):
             raise self.error(f"a buffer must lie in the file's folder; got {uri[:200]!r}")
         if not file.is_file() or not file.stat().st_size:
             raise self.error(f"its buffer {uri[:200]!r} is not there; copy it beside the file")

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,14 +27,16 @@ from pydantic.dataclasses import dataclass
 
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import image_header
+from augment.files.recorded_images import decode_pixels
+from augment.files.stated_sizes import StatedSizeError, check_row_group
 from augment.jobs.atomic import temporary_beside
 from augment.jobs.tables import opened_parquet
 from recipes.files import open_file
 
 PACKED = "packed.json"
 _MAX_PACKED = 1 << 26  # bytes of it
-_DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError)
-_ADVICE = "copy it again from the dataset"
+_DAMAGED = (OutputError, OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError)
+_ADVICE = "write it as the dataset does, or copy the dataset's own file"
 _AT_ONCE = 16  # images: some 6 MB of JPEGs, decoded 0.1 GB
 _JPEG_QUALITY = 95
 _THREADS = 4  # decoders and encoders release the interpreter
@@ -51,20 +53,60 @@ def reading(path: Path) -> Iterator[None]:
         raise AdapterError(f"{path} cannot be read as Parquet ({error}); {_ADVICE}") from error
 
 
+class ColumnKind(NamedTuple):
+    """What a column must hold. words: that, for messages."""
+
+    words: str
+    matches: Callable[[pa.DataType], bool]
+
+
+def is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
+
+
+def is_list(kind: pa.DataType) -> bool:
+    return (
+        pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+    )
+
+
+NUMBER_LISTS = ColumnKind(
+    "lists of numbers", lambda kind: is_list(kind) and is_number(kind.value_type)
+)
+FILE_BYTES = ColumnKind(
+    "bytes of files", lambda kind: pa.types.is_binary(kind) or pa.types.is_large_binary(kind)
+)
+WHOLE_NUMBERS = ColumnKind("whole numbers", pa.types.is_integer)
+
+
 class RowReader:
     """Rows of a large file by number. Cheapest in ascending order: a row group is decoded from its
-    start on, in pieces, and goes on from where it was left. Thread-safe."""
+    start on, in pieces, and goes on from where it was left. Thread-safe.
 
-    def __init__(self, path: Path, columns: Sequence[str], rows_at_once: int) -> None:
+    Args:
+        path: a Parquet file.
+        columns: the columns to read, and what each must hold.
+        rows_at_once: how many rows are decoded together.
+
+    Raises:
+        AdapterError: the file is no Parquet file, or lacks a column of that kind."""
+
+    def __init__(self, path: Path, columns: Mapping[str, ColumnKind], rows_at_once: int) -> None:
         self._path, self._columns, self._rows_at_once = path, list(columns), rows_at_once
         self._stack, self._lock = ExitStack(), threading.Lock()
         with reading(path):
-            self._file = self._stack.enter_context(opened_parquet(path, str(path)))
-            metadata = self._file.metadata
+            self._content, self._file = self._stack.enter_context(opened_parquet(path, str(path)))
+            metadata, schema = self._file.metadata, self._file.schema_arrow
             sizes = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
-        missing = [name for name in columns if name not in self._file.schema_arrow.names]
-        if missing:
-            raise AdapterError(f"{path}: column {missing[0]} is missing; {_ADVICE}")
+        for name, kind in columns.items():
+            if schema.names.count(name) != 1:
+                fault = "stands there twice" if name in schema.names else "is missing"
+                raise AdapterError(f"{path}: column {name} {fault}; {_ADVICE}")
+            if not kind.matches(schema.field(name).type):
+                raise AdapterError(
+                    f"{path}: column {name} must hold {kind.words}; it holds "
+                    f"{schema.field(name).type}; {_ADVICE}"
+                )
         self._starts = np.cumsum([0, *sizes])
         self._batches: Iterator[pa.RecordBatch] = iter(())
         self._batch: pa.RecordBatch | None = None
@@ -86,6 +128,7 @@ class RowReader:
     def _batch_of(self, row: int) -> pa.RecordBatch:
         group = int(np.searchsorted(self._starts, row, side="right")) - 1
         if self._batch is None or group != self._group or row < self._first:
+            check_row_group(self._content, self._file, group, self._columns)
             self._batches = self._file.iter_batches(
                 self._rows_at_once, row_groups=[group], columns=self._columns
             )
@@ -198,7 +241,7 @@ class PackedImages(BaseModel):
         _write(folder / PACKED, self.model_dump_json().encode())
         faults: dict[str, str] = {}
         wanted = {name for name in now if not (folder / name).is_file()}
-        reader = RowReader(Path(self.table), [self.column], _AT_ONCE)
+        reader = RowReader(Path(self.table), {self.column: FILE_BYTES}, _AT_ONCE)
         names = sorted(asked, key=self.rows.__getitem__)
         with ThreadPoolExecutor(_THREADS) as pool:
             for start in range(0, len(names), _AT_ONCE):
@@ -231,7 +274,7 @@ class PackedImages(BaseModel):
 @lru_cache(maxsize=2)
 def _reader(table: str, column: str, _pid: int) -> RowReader:
     # Another process must not go on with this one's file.
-    return RowReader(Path(table), [column], _AT_ONCE)
+    return RowReader(Path(table), {column: FILE_BYTES}, _AT_ONCE)
 
 
 def is_packed(path: Path) -> bool:
@@ -286,8 +329,7 @@ def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
     if path is None:
         return ""
     if not lens.is_pinhole:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = decode_pixels(data, cv2.IMREAD_COLOR)
         if image is None:
             return "cannot be decoded"
         quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]

@@ -9,14 +9,16 @@ from __future__ import annotations
 import itertools
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from augment.errors import SceneError
 from augment.jobs.atomic import replaced_file
@@ -337,6 +339,7 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
 _USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf", *_USD_SUFFIXES)
 RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
+_FAR_M = 1e15  # beyond, float64 has no decimetres
 _SPLAT_RECORD = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
 )
@@ -357,33 +360,63 @@ class SplatFile:
     problems: tuple[str, ...] = ()
 
 
-def read_splats(path: str | Path) -> SplatFile:
-    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, or the
-    meta.json of a SOG folder. Raises SceneError: no such file, an unknown format, or damaged
-    content; says what was expected.
+def read_splats(
+    path: str | Path, *, activated: bool | None = None, level: int | None = None
+) -> SplatFile:
+    """Read a .ply, .splat, .spz, .sog, glTF or USD file, told apart by its first bytes, the
+    meta.json of a SOG folder, or the lod-meta.json of a streamed one.
+
+    Args:
+        path: the file.
+        activated: of a .ply alone, as of `read_ply`.
+        level: of a lod-meta.json alone, the level of detail; 0, the finest, by default.
+
+    Raises:
+        SceneError: no such file, an unknown format, damaged content, or Gaussians that need more
+            memory than there is; says what was expected.
     """
+    path = Path(path)
+    try:
+        return _reader_of(path, activated, level)(path)
+    except MemoryError as error:
+        raise SceneError(f"{path}: its Gaussians need more memory than there is: {error}") from None
+
+
+def _reader_of(
+    path: Path, activated: bool | None, level: int | None
+) -> Callable[[Path], SplatFile]:
     from augment.files.gltf import GLB, read_gltf  # which take this module's records
     from augment.files.sog import META, ZIP, read_sog
-    from augment.files.spz import GZIP, read_spz
+    from augment.files.spz import GZIP, read_spz, refuse_bare_spz
+    from augment.files.streamed_sog import LOD_META, read_streamed_sog
     from augment.files.usd import read_usd
 
-    path = Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a .ply, .splat, .spz, .sog, .glb or .usd")
     with path.open("rb") as file:
-        start = file.read(4)
-    if start[:3] == b"ply" and start[3:] in (b"\n", b"\r"):
-        return read_ply(path)
+        start = file.read(8)
+    if level is not None and path.name != LOD_META:
+        raise SceneError(f"{path} has no levels of detail, as a {LOD_META} has; leave lod out")
+    if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r"):
+        return partial(read_ply, activated=activated)
+    if activated is not None:
+        raise SceneError(
+            f"{path}: only a .ply may store values before or after their activation; leave "
+            f"activated out"
+        )
+    if path.name == LOD_META:
+        return partial(read_streamed_sog, level=level or 0)
     if start[:2] == GZIP:
-        return read_spz(path)
+        return read_spz
     if path.suffix.lower() in _USD_SUFFIXES:  # before ZIP, which a .usdz is too
-        return read_usd(path)
-    if start == ZIP or path.name == META:
-        return read_sog(path)
-    if start == GLB or path.suffix.lower() == ".gltf":
-        return read_gltf(path)
+        return read_usd
+    if start[:4] == ZIP or path.name == META:
+        return read_sog
+    if start[:4] == GLB or path.suffix.lower() == ".gltf":
+        return read_gltf
+    refuse_bare_spz(path, start)
     if path.suffix.lower() == ".splat":
-        return read_splat(path)
+        return read_splat
     raise SceneError(
         f"{path}: neither a .ply (its first line would be 'ply') nor a .spz, .sog or .glb, nor "
         "named .splat, .gltf or .usd; convert other splat formats (.ksplat) to .ply first, for "
@@ -391,11 +424,23 @@ def read_splats(path: str | Path) -> SplatFile:
     )
 
 
-def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
+def read_ply(
+    path: str | Path, element: str = "vertex", *, activated: bool | None = None
+) -> SplatFile:
     """Read Gaussians from one element of a .ply, binary of either byte order or ascii. Properties
     may stand in any order; unknown ones are ignored. `red green blue` (uint8) serve as colour where
-    f_dc is missing. Reads in pieces: peak memory is the Gaussians plus a few MB. Raises SceneError:
-    not a splat .ply (lists what is missing), truncated, empty, wrong f_rest count.
+    f_dc is missing. Reads in pieces: peak memory is the Gaussians plus a few MB.
+
+    Args:
+        path: the file.
+        element: the name of the table of Gaussians.
+        activated: True where the file stores opacities from 0 to 1 and scales as lengths, False
+            where it stores logits and logarithms, as trainers do. None: the latter, unless the
+            numbers look like the former.
+
+    Raises:
+        SceneError: not a splat .ply (lists what is missing), truncated, empty, wrong f_rest count,
+            or values that look activated while nobody says whether they are.
     """
     header = read_ply_header(path)
     table = header.element(element)
@@ -407,12 +452,23 @@ def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
         origin = recentring_origin(means)
         with np.errstate(over="ignore"):  # what overflows is left out as infinite, and reported
             means = (means - origin).astype(np.float32)
+    scales, opacities = torch.from_numpy(columns["scales"]), torch.from_numpy(columns["opacities"])
+    if activated is None and _looks_activated(scales, opacities):
+        raise SceneError(
+            f"{header.path}: all its opacities lie from {float(opacities.min()):.3g} to "
+            f"{float(opacities.max()):.3g} and all its scales are positive, from "
+            f"{float(scales.min()):.3g} to {float(scales.max()):.3g}, as in files that store them "
+            f"activated; trainers store logits and logarithms. Say which: ?activated=true takes "
+            f"them as they stand, ?activated=false as logits and logarithms"
+        )
+    if not activated:
+        scales, opacities = scales.exp_(), opacities.sigmoid_()
     semantic = columns.get(SEMANTIC)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(columns["quats"]),
-        scales=torch.from_numpy(columns["scales"]).exp_(),
-        opacities=torch.from_numpy(columns["opacities"]).sigmoid_(),
+        scales=scales,
+        opacities=opacities,
         sh=torch.from_numpy(columns["sh"]),
         semantic=None if semantic is None else torch.from_numpy(semantic),
     )
@@ -420,6 +476,14 @@ def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
     pairs = (comment.partition(":") for comment in header.comments)
     notes = {key.strip(): value.strip() for key, colon, value in pairs if colon}
     return SplatFile(gaussians, origin, notes, (*problems, *header.surplus_problems()))
+
+
+def _looks_activated(scales: Tensor, opacities: Tensor) -> bool:
+    """Whether every opacity is a fraction and every scale a length. Logits of trained scenes reach
+    from below 0 to above 1, and logarithms of scales are negative below one unit.
+    """
+    is_fraction = bool(((opacities >= 0) & (opacities <= 1)).all())
+    return is_fraction and bool((scales > 0).all())
 
 
 def read_splat(path: str | Path) -> SplatFile:
@@ -507,10 +571,10 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:
-    """Whole-metre origin to subtract from coordinates, float64 [3]: the median of the finite points
-    where it lies more than RECENTRE_BEYOND_M from zero, else zero.
+    """Whole-metre origin to subtract from coordinates, float64 [3]: the median of the points within
+    _FAR_M where it lies more than RECENTRE_BEYOND_M from zero, else zero.
     """
-    finite = points[np.isfinite(points).all(1)]
+    finite = points[(np.abs(points) < _FAR_M).all(1)]  # which NaN is not either
     if len(finite) == 0:
         return np.zeros(3)
     median = np.median(finite, axis=0).astype(np.float64)

@@ -41,6 +41,7 @@ from torch import Tensor
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import tensor
+from augment.files.limits import check_values
 from augment.jobs.atomic import replaced_file, replaced_folder
 from augment.lod import keep_levels
 from augment.scene import (
@@ -259,6 +260,7 @@ FORMAT = "climategs-scene"
 VERSION = 2
 MAX_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
 _MAX_PROBLEMS_SHOWN = 5
+_MAX_KEYS = 10_000  # of one object, such as a frame's cameras
 _ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
 Entry = TypeVar("Entry", bound=BaseModel)
 
@@ -300,7 +302,8 @@ def _is_rigid(rows: list) -> list:
 Precision = Literal["float32", "float16"]
 Text = Annotated[str, AfterValidator(_plain_text)]
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-Times = Annotated[list[Int64], BeforeValidator(_as_list)]
+# A list with a wrong item is not looked at to its end: of millions of errors each costs a kilobyte.
+Times = Annotated[list[Int64], Field(fail_fast=True), BeforeValidator(_as_list)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Phase = Annotated[float, Field(ge=-1e9, le=1e9)]  # of which sine and cosine are known
 Pixels = Annotated[int, Field(ge=1, le=100_000)]
@@ -310,7 +313,13 @@ Matrix3x4 = Annotated[list[Row4], Field(min_length=3, max_length=3), BeforeValid
 _Matrix4x4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
 _POSE = BeforeValidator(_pose_as_list), AfterValidator(_is_rigid)
 Pose = Annotated[_Matrix4x4, *_POSE]
-Poses = Annotated[list[_Matrix4x4], *_POSE]
+Poses = Annotated[list[_Matrix4x4], Field(fail_fast=True), *_POSE]
+
+
+def _of_few_keys(value: object) -> object:
+    if isinstance(value, Mapping) and len(value) > _MAX_KEYS:
+        raise ValueError(f"it has {len(value)} keys; at most {_MAX_KEYS} are read")
+    return value
 
 
 class _Closed(BaseModel):
@@ -319,6 +328,11 @@ class _Closed(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, from_attributes=True
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_few_keys(cls, value: object) -> object:
+        return _of_few_keys(value)
 
 
 class CameraEntry(_Closed):
@@ -346,8 +360,8 @@ class FrameEntry(_Closed):
     index: Int64
     timestamp_ns: Int64
     world_from_ego: Pose
-    cameras: dict[Text, CameraEntry]
-    image_paths: dict[Text, Text]
+    cameras: Annotated[dict[Text, CameraEntry], BeforeValidator(_of_few_keys)]
+    image_paths: Annotated[dict[Text, Text], BeforeValidator(_of_few_keys)]
 
 
 class TrackEntry(_Closed):
@@ -361,7 +375,7 @@ class WavesEntry(_Closed):
     """The times of an actor's colour waves; their coefficients are its array `waves`."""
 
     timestamps_ns: Times
-    phases: Annotated[list[Phase], BeforeValidator(_as_list)]
+    phases: Annotated[list[Phase], Field(fail_fast=True), BeforeValidator(_as_list)]
 
     @model_validator(mode="after")
     def _belong_together(self) -> WavesEntry:
@@ -421,13 +435,13 @@ class SceneDocument(_Closed):
     has_known_gravity: bool
     sky: Literal["constant", "latlong", "cubemap"]
     background_gaussians: Count
-    color_maps: dict[Text, Matrix3x4]
-    image_color_maps: list[ImageColorMapEntry]
+    color_maps: Annotated[dict[Text, Matrix3x4], BeforeValidator(_of_few_keys)]
+    image_color_maps: Annotated[list[ImageColorMapEntry], Field(fail_fast=True)]
     made_by: dict[str, Any]
-    problems: list[Text]
-    actors: list[ActorEntry]
-    frames: list[FrameEntry]
-    seen_frames: list[FrameEntry] | None = None
+    problems: Annotated[list[Text], Field(fail_fast=True)]
+    actors: Annotated[list[ActorEntry], Field(fail_fast=True)]
+    frames: Annotated[list[FrameEntry], Field(fail_fast=True)]
+    seen_frames: Annotated[list[FrameEntry], Field(fail_fast=True)] | None = None
 
     @model_serializer(mode="wrap")
     def _without_what_is_usual(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
@@ -452,8 +466,9 @@ def read_document(path: Path) -> SceneDocument:
 def parsed_document(text: bytes | str, where: str) -> SceneDocument:
     """The checked contents of a scene's JSON text."""
     try:
-        text = text.decode("utf-8") if isinstance(text, bytes) else text
-        raw = json.loads(text, parse_constant=_no_constant)
+        data = text if isinstance(text, bytes) else text.encode()
+        check_values(data, where)
+        raw = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # also what is no UTF-8
         raise SceneError(f"{where} is no JSON: {error or 'nested too deeply'}") from None
     if not isinstance(raw, dict):

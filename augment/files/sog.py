@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import lzma
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,6 +30,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from augment.errors import SceneError
 from augment.files.image_size import image_header
+from augment.files.limits import check_memory, parsed_json, row_slices
 from augment.files.ply import SplatFile
 from augment.files.scene_file import checked
 from augment.jobs.atomic import replaced_file
@@ -43,8 +46,10 @@ _COEFFICIENTS = (0, 3, 8, 15)  # a channel beyond the first, by bands
 _ROW = 64  # entries of the palette in a row of its image
 MAX_PALETTE = 1 << 16
 _MAX_META_BYTES = 1 << 20
-_MAX_PER_BYTE = 64  # Gaussians; files of scenes hold 0.05 to 0.1 a byte
 _MAX_SPARE = 1 << 16  # pixels beyond as many again as there are Gaussians
+
+_DAMAGED = (OSError, EOFError, RuntimeError, ValueError, struct.error, zipfile.BadZipFile)
+_DAMAGED += (zlib.error, lzma.LZMAError)
 
 # ---- meta.json -----------------------------------------------------------------------------------
 
@@ -150,9 +155,17 @@ class _Files:
                 f"{where} has {header.width} x {header.height} pixels for {count} Gaussians: "
                 f"{count} to {2 * count + _MAX_SPARE} are expected"
             )
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # sizes that it refuses
+            image = None
         if image is None or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] < 3:
             raise SceneError(f"{where} is damaged, or no image of 8 bits in three or four channels")
+        if image.shape[:2] != (header.height, header.width):
+            raise SceneError(
+                f"{where} is damaged: it says {header.width} x {header.height} pixels and holds "
+                f"{image.shape[1]} x {image.shape[0]}"
+            )
         if image.shape[2] == 3:  # decoders leave out an alpha that is 255 everywhere
             return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA)
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
@@ -168,6 +181,15 @@ def read_sog(path: str | Path) -> SplatFile:
     Raises SceneError: missing, truncated or damaged files, or another version.
     """
     path = Path(path)
+    raw, notes = read_stored_sog(path)
+    gaussians, problems = check_gaussians(raw, where=str(path))
+    return SplatFile(gaussians, notes=notes, problems=problems)
+
+
+def read_stored_sog(path: Path) -> tuple[Gaussians, dict[str, str]]:
+    """All Gaussians of a .sog in the file's order, those that cannot be drawn among them, and its
+    notes. Raises SceneError: as `read_sog`.
+    """
     try:
         with contextlib.closing(_Files(path)) as files:
             return _read(files)
@@ -175,64 +197,63 @@ def read_sog(path: str | Path) -> SplatFile:
         raise SceneError(f"{path}: not a whole .sog file: {error.args[0]}") from error
     except FileNotFoundError as error:
         raise SceneError(f"{path} names {error.filename}, which is missing") from error
-    except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGED as error:
         raise SceneError(
             f"{path}: not a whole .sog file ({error}); copy or export it again"
         ) from error
 
 
-def _read(files: _Files) -> SplatFile:
-    path, meta = files.path, _meta(files)
+def _read(files: _Files) -> tuple[Gaussians, dict[str, str]]:
+    meta = _meta(files)
     count, most = meta.count, max(2 * meta.count, _MAX_META_BYTES) * 4
-    low, high = (files.pixels(name, most, count) for name in meta.means.files)
-    fixed = _rows(low, count)[:, :3] | _rows(high, count)[:, :3].astype(np.uint16) << 8
+    low, high = (_rows(files.pixels(name, most, count), count) for name in meta.means.files)
     colours = _rows(files.pixels(meta.sh0.files[0], most, count), count)
-    scales = _rows(files.pixels(meta.scales.files[0], most, count), count)[:, :3]
+    scales = _rows(files.pixels(meta.scales.files[0], most, count), count)
     quats = _rows(files.pixels(meta.quats.files[0], most, count), count)
+    palette = None if meta.shN is None else _palette_entries(files, meta.shN, count, most)
     bands = 0 if meta.shN is None else meta.shN.bands
-    sh = np.empty((count, 1 + _COEFFICIENTS[bands], 3), np.float32)
-    sh[:, 0] = _decoded(meta.sh0.codebook, colours[:, :3])
-    if meta.shN is not None:
-        sh[:, 1:] = _from_palette(files, meta.shN, count, most)
+    raw = Gaussians(
+        means=torch.empty(count, 3),
+        quats=torch.empty(count, 4),
+        scales=torch.empty(count, 3),
+        opacities=torch.empty(count),
+        sh=torch.empty(count, 1 + _COEFFICIENTS[bands], 3),
+    )
+    arrays = {name: getattr(raw, name).numpy() for name in ("means", "quats", "scales", "sh")}
     mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out, and reported
-        logs = mins + (maxs - mins) * (fixed / _STEPS)
-        raw = Gaussians(
-            means=torch.from_numpy(np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)),
-            quats=torch.from_numpy(_turns(quats)),
-            scales=torch.from_numpy(np.exp(_decoded(meta.scales.codebook, scales))),
-            opacities=torch.from_numpy((colours[:, 3] / 255.0).astype(np.float32)),
-            sh=torch.from_numpy(sh),
-        )
-    gaussians, problems = check_gaussians(raw, where=str(path))
-    notes = {key: meta.climategs[key] for key in ("up", "unit") if key in meta.climategs}
-    return SplatFile(gaussians, notes=notes, problems=problems)
+    for rows in row_slices(count):
+        fixed = low[rows, :3] | high[rows, :3].astype(np.uint16) << 8
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is left out, and reported
+            logs = mins + (maxs - mins) * (fixed / _STEPS)
+            arrays["means"][rows] = np.copysign(np.expm1(np.abs(logs)), logs)
+            arrays["scales"][rows] = np.exp(_decoded(meta.scales.codebook, scales[rows, :3]))
+        arrays["quats"][rows] = _turns(quats[rows])
+        arrays["sh"][rows, 0] = _decoded(meta.sh0.codebook, colours[rows, :3])
+        if palette is not None and meta.shN is not None:
+            coded = palette.entries[palette.labels[rows]]
+            arrays["sh"][rows, 1:] = _decoded(meta.shN.codebook, coded)
+        raw.opacities.numpy()[rows] = colours[rows, 3] / 255.0
+    return raw, {key: meta.climategs[key] for key in ("up", "unit") if key in meta.climategs}
 
 
 def _meta(files: _Files) -> _Meta:
     where = str(files.path) if files.zip is None else f"{files.path}: {META}"
-    text = files.read(META, _MAX_META_BYTES)
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{where} is no JSON: {error or 'nested too deeply'}") from None
-    if not isinstance(found, dict) or "means" not in found:
+    content = parsed_json(files.read(META, _MAX_META_BYTES), where)
+    if "means" not in content:
         raise SceneError(f"{where} does not describe splats: it has no 'means'")
-    if found.get("version") != 2:
+    if content.get("version") != 2:
         raise SceneError(
-            f"{where}: only version 2 of SOG is read; got {found.get('version')!r:.20}. Save it "
+            f"{where}: only version 2 of SOG is read; got {content.get('version')!r:.20}. Save it "
             f"anew with SplatTransform or SuperSplat, or as .ply"
         )
-    meta = checked(_Meta, found, where)
+    meta = checked(_Meta, content, where)
     names = [*meta.means.files, *meta.scales.files, *meta.quats.files, *meta.sh0.files]
+    names += [] if meta.shN is None else meta.shN.files
     size = files.path.stat().st_size
     if files.zip is None:
-        size = sum((files.path.parent / Path(name).name).stat().st_size for name in names)
-    if meta.count > size * _MAX_PER_BYTE:
-        raise SceneError(
-            f"{where} announces {meta.count} Gaussians; {size} bytes hold {size * _MAX_PER_BYTE} "
-            f"at most: truncated, or its count is wrong"
-        )
+        size = sum((files.path.parent / Path(name).name).stat().st_size for name in {*names})
+    bands = 0 if meta.shN is None else meta.shN.bands
+    check_memory(where, meta.count, functions=1 + _COEFFICIENTS[bands], size=size)
     return meta
 
 
@@ -259,8 +280,16 @@ def _turns(pixels: np.ndarray) -> np.ndarray:
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
-def _from_palette(files: _Files, palette: _Palette, count: int, most: int) -> np.ndarray:
-    """float32 [N, K, 3]."""
+class _PaletteEntries(NamedTuple):
+    """entries: uint8 [P, K, 3], codes of the spherical harmonics beyond the first. labels: int64
+    [N], the entry of each Gaussian.
+    """
+
+    entries: np.ndarray
+    labels: np.ndarray
+
+
+def _palette_entries(files: _Files, palette: _Palette, count: int, most: int) -> _PaletteEntries:
     wide, rows = _ROW * _COEFFICIENTS[palette.bands], -(-palette.count // _ROW)
     entries = files.pixels(
         palette.files[0], 4 * wide * (rows + _ROW) + _MAX_META_BYTES, wide * rows
@@ -277,8 +306,7 @@ def _from_palette(files: _Files, palette: _Palette, count: int, most: int) -> np
             f"{files.path}: {palette.files[1]} names entry {labels.max()} of a palette of "
             f"{palette.count}"
         )
-    coded = entries[..., :3].reshape(-1, wide // _ROW, 3)
-    return _decoded(palette.codebook, coded[labels])
+    return _PaletteEntries(entries[..., :3].reshape(-1, wide // _ROW, 3), labels)
 
 
 # ---- Writing -------------------------------------------------------------------------------------

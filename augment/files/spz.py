@@ -6,7 +6,8 @@ components in 32 bits), spherical harmonics. Axes are RUB: x right, y up, z back
 Facts by github.com/nianticlabs/spz, README.md and src/cc/load-spz.cc (MIT).
 
 The header says how long the stream is, and deflate makes nothing more than 1032 times smaller: what
-a file cannot hold is refused before anything is allocated.
+a file cannot hold, or what is far more than its bytes (augment.files.limits), is refused before
+anything is allocated.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +23,7 @@ import numpy as np
 import torch
 
 from augment.errors import SceneError
+from augment.files.limits import check_memory, row_slices
 from augment.files.ply import SplatFile
 from augment.jobs.atomic import replaced_file
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
@@ -32,6 +35,7 @@ _MAGIC, _HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
 WRITTEN_VERSION = 3
 _EXTENDED = 0x2  # a flag: there are records of vendors, before the columns or after them
 _MAX_DEFLATED = 1032  # bytes out of one, at most (zlib's technical details)
+_PIECE = 1 << 22  # bytes that are unpacked together
 _BANDS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}  # coefficients a channel beyond the first, by degree
 _COLOUR = 0.15  # of f_dc, so that colours beyond 0 and 1 are kept
 _MAX_FRACTION_BITS = 12  # a quarter of a millimetre, up to 2 km from the origin
@@ -73,7 +77,7 @@ def read_spz(path: str | Path) -> SplatFile:
     try:
         with gzip.open(path) as stream:
             header = _check(path, stream.read(_HEADER.size))
-            read = {
+            stored = {
                 name: _column(path, stream, header.num, *kind)
                 for name, kind in header.columns.items()
             }
@@ -81,22 +85,54 @@ def read_spz(path: str | Path) -> SplatFile:
         raise SceneError(
             f"{path}: not a whole .spz file ({error}); copy or export it again"
         ) from error
-    bands = min(_BANDS[header.degree], SH_COUNTS[-1] - 1)
-    sh = np.zeros((header.num, 1 + bands, 3), np.float32)
-    sh[:, 0] = (read["colours"] / 255.0 - 0.5) / _COLOUR
-    rest = read["sh"].reshape(header.num, -1, 3)[:, :bands]
-    sh[:, 1:] = (rest.astype(np.float32) - 128) / 128
-    raw = Gaussians(
-        means=torch.from_numpy(_places(header, read["means"])),
-        quats=torch.from_numpy(_turns(header, read["quats"])),
-        scales=torch.from_numpy(np.exp(read["scales"] / 16.0 - 10).astype(np.float32)),
-        opacities=torch.from_numpy((read["opacities"][:, 0] / 255.0).astype(np.float32)),
-        sh=torch.from_numpy(sh),
-    )
+    raw = _gaussians(header, stored)
+    stored.clear()
     gaussians, problems = check_gaussians(raw, where=str(path))
     if header.degree == 4:
         problems = (*problems, f"{path}: spherical harmonics of degree 4 are cut off at 3")
     return SplatFile(gaussians, notes={"up": UP}, problems=problems)
+
+
+def refuse_bare_spz(path: Path, start: bytes) -> None:
+    """Say what a file is that begins with the mark of .spz and not with that of gzip. start: its
+    first bytes. Raises SceneError: it is such a file.
+    """
+    if start[:4] != _MAGIC.to_bytes(4, "little"):
+        return
+    version = int.from_bytes(start[4:8], "little")
+    if version < 4:
+        raise SceneError(
+            f"{path}: a .spz of version {version} that is not packed by gzip, as .spz files of "
+            f"versions 1 to 3 are; pack it (gzip -c {path.name} > packed.spz), or export it again"
+        )
+    raise SceneError(
+        f"{path}: a .spz of version {version}; versions 1 to 3 are read. Save it as version 3 "
+        f"(splat-transform --spz-version 3), or as .ply"
+    )
+
+
+def _gaussians(header: _Header, stored: Mapping[str, np.ndarray]) -> Gaussians:
+    """The Gaussians of the file's columns, decoded piece by piece."""
+    count = header.num
+    bands = min(_BANDS[header.degree], SH_COUNTS[-1] - 1)
+    means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
+    scales, opacities = np.empty((count, 3), np.float32), np.empty(count, np.float32)
+    sh = np.empty((count, 1 + bands, 3), np.float32)
+    for rows in row_slices(count):
+        means[rows] = _places(header, stored["means"][rows])
+        quats[rows] = _turns(header, stored["quats"][rows])
+        scales[rows] = np.exp(stored["scales"][rows] / 16.0 - 10)
+        opacities[rows] = stored["opacities"][rows, 0] / 255.0
+        sh[rows, 0] = (stored["colours"][rows] / 255.0 - 0.5) / _COLOUR
+        rest = stored["sh"][rows].reshape(rows.stop - rows.start, -1, 3)[:, :bands]
+        sh[rows, 1:] = (rest.astype(np.float32) - 128) / 128
+    return Gaussians(
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(quats),
+        scales=torch.from_numpy(scales),
+        opacities=torch.from_numpy(opacities),
+        sh=torch.from_numpy(sh),
+    )
 
 
 def _check(path: Path, data: bytes) -> _Header:
@@ -118,22 +154,28 @@ def _check(path: Path, data: bytes) -> _Header:
             f"{path}: it has vendors' extensions, whose place differs by version; save it without"
         )
     row = sum(np.dtype(kind).itemsize * width for kind, width in header.columns.values())
-    most = path.stat().st_size * _MAX_DEFLATED
+    size = path.stat().st_size
+    most = size * _MAX_DEFLATED
     if header.num == 0 or header.num * row > most:
         raise SceneError(
             f"{path}: its header announces {header.num} Gaussians of {row} bytes each; the file "
             f"holds 1 to {most // row} of them: truncated, or its header is wrong"
         )
+    functions = 1 + min(_BANDS[header.degree], SH_COUNTS[-1] - 1)
+    check_memory(str(path), header.num, functions=functions, size=size)
     return header
 
 
 def _column(path: Path, stream: gzip.GzipFile, count: int, kind: str, width: int) -> np.ndarray:
     """[N, width]."""
-    size = count * width * np.dtype(kind).itemsize
-    data = stream.read(size)
-    if len(data) < size:
-        raise SceneError(f"{path}: its columns end early; it is truncated: copy it again")
-    return np.frombuffer(data, kind).reshape(count, width)
+    column = np.empty((count, width), kind)
+    data = column.reshape(-1).view("u1")
+    for start in range(0, len(data), _PIECE):
+        piece = stream.read(min(_PIECE, len(data) - start))
+        data[start : start + len(piece)] = np.frombuffer(piece, "u1")
+        if len(piece) < min(_PIECE, len(data) - start):
+            raise SceneError(f"{path}: its columns end early; it is truncated: copy it again")
+    return column
 
 
 def _places(header: _Header, column: np.ndarray) -> np.ndarray:

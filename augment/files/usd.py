@@ -7,26 +7,34 @@ particle; each attribute has a form in halves, whose name ends in h. What lacks,
 has the schema's default, which is said. Facts by OpenUSD's usdVol/schema.usda.
 
 A file has to hold all its layers: references to others are refused. OpenUSD's own parser, which is
-C++, reads it.
+C++, reads it in a process of its own (`usd_stage.py`) with limits of memory and time.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 
 from augment.errors import SceneError
+from augment.files.limits import check_memory, parsed_json
 from augment.files.ply import SplatFile, join_placed
-from augment.jobs.atomic import replaced_file
+from augment.files.usd_stage import ATTRIBUTES, COEFFICIENTS
+from augment.jobs.atomic import make_folder, refusals_of, replaced_file
 from augment.scene import SH_COUNTS, Gaussians
 
-_LEAST_ROW = 6  # bytes of a place, in halves
-_MAX_COPIES = 16  # of all Gaussians that the file has room for
+_FREE_MEMORY = 2 << 30  # bytes of address space to read a file of any size
+_MEMORY_PER_BYTE = 16  # bytes beyond that for each byte of the file
+_FREE_SECONDS = 45  # to read a file of any size
+_BYTES_PER_SECOND = 4 << 20  # of the file, read in each second beyond that
 
 
 def _pxr() -> Any:
@@ -47,127 +55,118 @@ def _pxr() -> Any:
 
 def read_usd(path: str | Path) -> SplatFile:
     """Read all visible Gaussians of the stage, at the time of its first sample, in its axes, and in
-    metres where it says how long its unit is. Raises SceneError: no usd-core; damaged, without
-    Gaussians, or with layers in other files.
+    metres where it says how long its unit is.
+
+    Raises:
+        SceneError: no usd-core; damaged, without Gaussians, or with layers in other files; or
+            OpenUSD crashes on it, or needs more memory or time than such a file may take.
     """
-    path, pxr = Path(path), _pxr()
-    try:
-        layer = pxr.Sdf.Layer.FindOrOpen(str(path.absolute()))
-        if layer is None:
-            raise SceneError(f"{path}: OpenUSD cannot open it")
-        _check_layers(pxr, path, layer)
-        stage = pxr.Usd.Stage.Open(layer)
-        return _read(pxr, path, stage)
-    except pxr.Tf.ErrorException as error:
-        first = getattr(error.args[0], "commentary", error) if error.args else error
-        raise SceneError(f"{path}: not a whole OpenUSD file: {str(first).strip()[:300]}") from error
+    path = Path(path)
+    _pxr()  # without it the message says how to get it
+    with tempfile.TemporaryFile() as output:
+        _run_reader(path, output)
+        output.seek(0)
+        facts = parsed_json(output.readline(), f"{path}: OpenUSD's reader")
+        if "error" in facts:
+            raise SceneError(f"{path}: {facts['error']}")
+        return _splats(path, facts, output)
 
 
-def _check_layers(pxr: Any, path: Path, root: Any) -> None:
-    """That all layers lie in the file, which a .usdz can have several of."""
-    waiting, seen = [root], set()
-    while waiting:
-        layer = waiting.pop()
-        if layer.identifier in seen:
-            continue
-        seen.add(layer.identifier)
-        for name in filter(None, layer.GetCompositionAssetDependencies()):  # '': the layer itself
-            where = layer.ComputeAbsolutePath(name)
-            inner = None
-            if where.startswith(f"{path.absolute()}["):
-                inner = pxr.Sdf.Layer.FindOrOpen(where)
-            if inner is None:
-                raise SceneError(
-                    f"{path}: it refers to {name!r}, which is not in it; make one file of all: "
-                    f"usdcat --flatten {path.name} --out flat.usdc"
-                )
-            waiting.append(inner)
+def _run_reader(path: Path, output: IO[bytes]) -> None:
+    """Let `usd_stage.py` read the file in a process of its own, whose crash is an error here."""
+    size = path.stat().st_size
+    memory = _FREE_MEMORY + _MEMORY_PER_BYTE * size
+    seconds = _FREE_SECONDS + size // _BYTES_PER_SECOND
+    program = Path(__file__).with_name("usd_stage.py")
+    command = [sys.executable, "-P", str(program), str(path.absolute()), str(memory), str(seconds)]
+    threads = ("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+    environment = os.environ | dict.fromkeys(threads, "1")  # each thread would reserve memory
+    with tempfile.TemporaryFile() as messages:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, env=environment
+        )
+        try:
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            code = -signal.SIGXCPU
+        finally:
+            process.kill()
+            process.wait()
+        if code == 0:
+            return
+        if code == -signal.SIGXCPU:
+            raise SceneError(
+                f"{path}: OpenUSD did not read its {size} bytes within {seconds} s and was "
+                "stopped: the file is damaged, or made to take for ever"
+            )
+        messages.seek(0)
+        text = messages.read(1 << 16).decode(errors="replace").strip()
+        if "bad_alloc" in text:
+            raise SceneError(f"{path}: needs more than {memory >> 20} MiB of memory to be read")
+    last = text.splitlines()[-1][:300] if text else "it said nothing"
+    name = signal.Signals(-code).name if code < 0 else f"exit code {code} ({last})"
+    raise SceneError(
+        f"{path}: OpenUSD's reader ended with {name}: the file is damaged, or nested too deeply; "
+        "export it again"
+    )
 
 
-def _read(pxr: Any, path: Path, stage: Any) -> SplatFile:
+def _splats(path: Path, facts: dict[str, Any], output: IO[bytes]) -> SplatFile:
+    """The Gaussians of all prims. facts, output: what `usd_stage.py` wrote."""
     from augment.files.export import transformed_gaussians  # which writes by this module
 
-    time, geometry = pxr.Usd.TimeCode.EarliestTime(), pxr.UsdGeom
-    transforms = geometry.XformCache(time)
-    room = path.stat().st_size // _LEAST_ROW
-    parts, problems, unit, notes = [], [], 1.0, {}
-    if stage.HasAuthoredMetadata(geometry.Tokens.metersPerUnit):
-        unit = float(geometry.GetStageMetersPerUnit(stage))
-        notes["unit"] = "metre"
-        if not (np.isfinite(unit) and unit > 0):
-            raise SceneError(f"{path}: metersPerUnit must be positive; got {unit}")
-    if stage.HasAuthoredMetadata(geometry.Tokens.upAxis):
-        notes["up"] = f"+{geometry.GetStageUpAxis(stage).lower()}"
-    for prim in pxr.Usd.PrimRange(
-        stage.GetPseudoRoot(), pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)
-    ):
-        if prim.HasMetadata("clips"):
-            raise SceneError(f"{path}: {prim.GetPath()} takes values from other files (clips)")
-        if not prim.IsA(pxr.UsdVol.ParticleField3DGaussianSplat):
-            continue
-        if geometry.Imageable(prim).ComputeVisibility(time) == geometry.Tokens.invisible:
-            problems.append(f"{path}: {prim.GetPath()} is invisible and left out")
-            continue
-        matrix = np.array(transforms.GetLocalToWorldTransform(prim)).T * unit
-        if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) <= 0:
-            raise SceneError(f"{path}: {prim.GetPath()} mirrors or flattens its Gaussians")
-        places = _column(prim, "positions", time)
-        if places is None:
-            continue
-        room -= len(places) / _MAX_COPIES
-        if room < 0:
-            raise SceneError(
-                f"{path}: it places more than {_MAX_COPIES} times the Gaussians that it has room "
-                "for; place fewer copies"
-            )
-        own, about = _own_gaussians(prim, len(places), time)
-        problems += [f"{path}: {prim.GetPath()}: {sentence}" for sentence in about]
-        far = places.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        parts.append((far, transformed_gaussians(own, torch.from_numpy(matrix[:3, :3].copy()))))
-    if not parts:
+    problems = [f"{path}: {sentence}" for sentence in facts["problems"]]
+    prims = facts["prims"]
+    rows = sum(prim["columns"]["positions"][0] for prim in prims)
+    if rows == 0:
         raise SceneError(
             f"{path}: no visible ParticleField3DGaussianSplat with positions; splats are needed"
         )
-    return join_placed(parts, path, notes, problems)
+    highest = min(max(prim["degree"] for prim in prims), len(SH_COUNTS) - 1)
+    check_memory(str(path), rows, functions=SH_COUNTS[highest], size=path.stat().st_size)
+    parts = []
+    for prim in prims:
+        columns = {
+            name: np.fromfile(output, np.float32, count * width).reshape(count, width)
+            for name, (count, width) in prim["columns"].items()
+        }
+        matrix = np.array(prim["matrix"], np.float64).reshape(4, 4)
+        gaussians = _gaussians(columns, prim["degree"])
+        problems += [f"{path}: {prim['path']}: {sentence}" for sentence in prim["problems"]]
+        if prim["degree"] >= len(SH_COUNTS):
+            problems.append(
+                f"{path}: {prim['path']}: spherical harmonics of degree {prim['degree']} are cut "
+                f"off at {len(SH_COUNTS) - 1}"
+            )
+        with np.errstate(over="ignore", invalid="ignore"):  # left out as infinite, and reported
+            places = columns["positions"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        turned = transformed_gaussians(gaussians, torch.from_numpy(matrix[:3, :3].copy()))
+        parts.append((places, turned))
+    return join_placed(parts, path, facts["notes"], problems)
 
 
-def _column(prim: Any, name: str, time: Any) -> np.ndarray | None:
-    """float32, of floats or else of halves; None where there is neither. Quaternions are xyzw."""
-    for form in (name, f"{name}h"):
-        values = prim.GetAttribute(form).Get(time)
-        if values is not None and len(values):
-            return np.array(values, np.float32)
-    return None
+def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
+    """The Gaussians of a prim in its axes, at 0; columns that it lacks have the default."""
+    count, each = len(columns["positions"]), (degree + 1) ** 2
+    kept = min(each, SH_COUNTS[-1])
 
+    def values(name: str, rows: int) -> np.ndarray:
+        if name in columns:
+            return columns[name]
+        return np.tile(np.array(ATTRIBUTES[name], np.float32), (rows, 1))
 
-def _own_gaussians(prim: Any, count: int, time: Any) -> tuple[Gaussians, list[str]]:
-    """In the prim's axes, at 0, and a sentence for what is not as written."""
-    problems = []
-
-    def rows(name: str, default: list[float], each: int = 1) -> np.ndarray:
-        values = _column(prim, name, time)
-        if values is None or len(values) < count * each:
-            held = 0 if values is None else len(values)
-            problems.append(f"{name} has {held} of {count * each} values: the default is taken")
-            return np.tile(np.array(default, np.float32), (count * each, 1))
-        return values[: count * each]
-
-    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
-    if not 0 <= degree <= 16:
-        raise SceneError(f"{prim.GetPath()}: spherical harmonics of degree {degree}, not 0 to 16")
-    each = (degree + 1) ** 2
-    sh = rows("radiance:sphericalHarmonicsCoefficients", [0.0, 0.0, 0.0], each)
-    if each > SH_COUNTS[-1]:
-        problems.append(f"spherical harmonics of degree {degree} are cut off at 3")
-    sh = sh.reshape(count, each, 3)[:, : SH_COUNTS[-1]]
-    columns = {
-        "quats": rows("orientations", [0.0, 0.0, 0.0, 1.0])[:, [3, 0, 1, 2]],
-        "scales": rows("scales", [1.0, 1.0, 1.0]),
-        "opacities": rows("opacities", [1.0]).reshape(count),
+    if COEFFICIENTS in columns:
+        sh = columns[COEFFICIENTS].reshape(count, each, 3)[:, :kept]
+    else:
+        sh = values(COEFFICIENTS, count * kept).reshape(count, kept, 3)
+    ready = {
+        "quats": values("orientations", count)[:, [3, 0, 1, 2]],
+        "scales": values("scales", count),
+        "opacities": values("opacities", count).reshape(count),
         "sh": sh,
     }
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(c)) for name, c in columns.items()}
-    return Gaussians(means=torch.zeros(count, 3), **tensors), problems
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in ready.items()}
+    return Gaussians(means=torch.zeros(count, 3), **tensors)
 
 
 def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_metric: bool) -> None:
@@ -200,8 +199,11 @@ def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_me
     field.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
     coefficients = numbers(gaussians.sh.reshape(-1, 3))
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(coefficients))
-    with tempfile.TemporaryDirectory(dir=Path(path).parent) as folder:
-        made = Path(folder) / "a.usdc"
-        layer.Export(str(made))
-        with made.open("rb") as source, replaced_file(Path(path)) as file:
-            shutil.copyfileobj(source, file)
+    path = Path(path)
+    with refusals_of(path):
+        make_folder(path.parent)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            made = Path(folder) / "a.usdc"
+            layer.Export(str(made))
+            with made.open("rb") as source, replaced_file(path) as file:
+                shutil.copyfileobj(source, file)

@@ -39,7 +39,8 @@ from augment.boxes import (
 )
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs.atomic import write_atomic
+from augment.files.recorded_images import decode_pixels
+from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.box_tables import (
     BOXES_2D,
     MASKS,
@@ -69,7 +70,7 @@ class View(Protocol):
     depth_m: np.ndarray | None  # float32 [H, W], 0 = none
     semantic: np.ndarray | None  # uint8 [H, W]
     instance: np.ndarray | None  # uint16 [H, W]
-    masks: Mapping[str, np.ndarray]  # uint8 [H, W], 0 or 255, by name
+    masks: Mapping[str, np.ndarray]  # uint8 [H, W], by name: 0 or 255, of TRUST also between
     # What labels are measured from, as in augment.views.
     effects: Mapping[str, Any]  # EffectView by name, of the recipe's effects
     surface: Any  # SurfaceView, None without boxes
@@ -423,7 +424,7 @@ def calibration_bytes(
 def read_entries(path: Path) -> dict[int, dict[str, Any]]:
     """The frame entries of a calibration file by frame number."""
     try:
-        frames = json.loads(Path(path).read_bytes())["frames"]
+        frames = json.loads(read_file(path))["frames"]
         return {entry["frame"]: entry for entry in frames}
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise OutputError(f"{path} is missing or not a calibration file: {error!r}") from error
@@ -513,7 +514,7 @@ def encode_image(rgb: np.ndarray, output: Output) -> bytes:
 
 def decode_image(data: bytes) -> np.ndarray:
     """uint8 [H, W, 3] RGB. Raises ValueError where the bytes are no complete image."""
-    bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = _decode(data, cv2.IMREAD_COLOR)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
@@ -572,10 +573,7 @@ def _encode(extension: str, array: np.ndarray, settings: list[int]) -> bytes:
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise ValueError(f"not a readable image file ({len(data)} bytes): {error}") from error
+    image = decode_pixels(data, flags)
     if image is None:
         raise ValueError(f"not a readable image file ({len(data)} bytes)")
     return image
@@ -591,6 +589,11 @@ def _require(array: np.ndarray, dtype: type, ndim: int, name: str) -> None:
 
 
 # ---- The files of a view: its buffers first, its image last --------------------------------------
+
+
+def _mean_share(mask: np.ndarray) -> float:
+    """The mean of a mask, 0 to 1."""
+    return int(mask.sum(dtype=np.int64)) / (255 * mask.size)
 
 
 @dataclass(frozen=True)
@@ -663,7 +666,10 @@ def write_view(
     for kind, (buffer, encode) in _BUFFERS.items():
         if kind in used:
             files[used[kind]] = encode(getattr(view, buffer))
-    files |= {used[name]: encode_mask(mask) for name, mask in view.masks.items()}
+    files |= {
+        used[name]: encode_ids(mask, np.uint8) if name == TRUST else encode_mask(mask)
+        for name, mask in view.masks.items()
+    }
     files[used["image"]] = image = encode_image(view.rgb, recipe.output)
     checksum = hashlib.sha256(image).hexdigest()
     encoded = time.perf_counter()
@@ -671,7 +677,7 @@ def write_view(
         write_atomic(out_dir / relative, data, clear=False)
     write_s = time.perf_counter() - encoded
     columns = {mask: c for mask, c in share_columns().items() if mask in view.masks}
-    shares = {column: float((view.masks[mask] == 255).mean()) for mask, column in columns.items()}
+    shares = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
     return Written(checksum, tuple(files), encoded - started, write_s, shares)
 
 

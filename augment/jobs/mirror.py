@@ -2,10 +2,12 @@
 
     <out>/source/<variant>/<dataset's folder>/...                   what the dataset's tools read
     <out>/source/<variant>/climategs-mirror-<dataset's folder>.json what it is; once it is complete
+    <out>/source/<variant>/climategs-mirror-<dataset's folder>.files what was put there
 
 All that is not replaced is the source's own file under a second name (a hard link), or a copy of it
-where links cannot be had. Building again goes on after a kill, and brings an older copy up to date.
-A dataset of many scenes has one copy, to which each scene adds its images.
+where links cannot be had. Building again goes on after a kill, and brings an older copy up to date;
+what others have edited there stops it. A dataset of many scenes has one copy, to which each scene
+adds its images.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ from augment.jobs.atomic import (
 from augment.jobs.files import WritePump, decode_image, encode_image
 from augment.jobs.layout import folder_name, reading_back, resolve_inside
 from augment.jobs.manifest import OK
+from augment.jobs.placed_files import ANY_SIZE, PlacedFile, PlacedFiles, digest_of
 from augment.jobs.tables import read_lidar
 from augment.labels import LabelSource, StoresLidar
 from recipes.load import load_recipe
@@ -144,16 +147,17 @@ class SourceFolder(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """How many files a dataset has, and how many of them are camera images."""
+    """How many files a dataset has, and how many of them are camera images and LiDAR sweeps."""
 
     files: int
     images: int
+    sweeps: int = 0
 
 
 def survey(tree: SourceTree) -> Survey:
     """Look at all that belongs to a dataset, reading no file."""
-    are_images = [tree.is_image(file.relative) for folder in walk(tree) for file in folder.files]
-    return Survey(len(are_images), sum(are_images))
+    names = [file.relative for folder in walk(tree) for file in folder.files]
+    return Survey(len(names), sum(map(tree.is_image, names)), sum(map(tree.is_sweep, names)))
 
 
 def walk(tree: SourceTree, relative: str = "", path: str = "") -> Iterator[SourceFolder]:
@@ -545,8 +549,8 @@ def mirror_dataset(
     folder. weathered: by place in the dataset, all that shall stand in the copy. scenes: facts of
     those that it is of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or
     copy for a copy that shares nothing with source and images. Raises AdapterError: a file of the
-    source cannot be read, or a link leads out of it. OutputError: the system refused, or a link is
-    in the way; no file is left half-written.
+    source cannot be read, or a link leads out of it. OutputError: the system refused, a link is in
+    the way, or files were edited or were there before; no file is left half-written.
     """
     check_disjoint(tree, folder)
     files, sizes = dict.fromkeys(_FILES, 0), dict.fromkeys(_BYTES, 0)
@@ -574,11 +578,13 @@ class _Mirroring:
     def __post_init__(self) -> None:
         self.files, self.bytes = self.done.record.files, self.done.record.bytes
         self.record, self.begun = record_names(self.tree, self.folder)
+        self.placed = PlacedFiles(self.record.with_suffix(".files"))
         self.root = str(self.done.folder)
         self.jpeg_quality = cache(_jpeg_quality)
 
     def go(self, bar: tqdm) -> None:
         """Take back that the copy is complete, and make it so."""
+        self._check_untouched()
         for folder in (self.folder.parent, self.folder):
             self._own(str(folder))
         with refusals_of(self.record):
@@ -586,12 +592,14 @@ class _Mirroring:
                 os.replace(self.record, self.begun)
                 flush_folder(self.folder)
         self._own(self.root)
+        self.placed.begin()
         self.pump = WritePump()
         try:
             for folder in walk(self.tree):
                 self._fill(folder)
                 bar.update(len(folder.files))
         finally:
+            self.placed.close()
             self.pump.close()
         self.done.new += len(self.encoded)
         self.bytes["new_images"] += sum(os.lstat(path).st_size for path in self.encoded)
@@ -609,10 +617,57 @@ class _Mirroring:
                 flush_folder(Path(folder))
             if self.begun.is_file() and self.begun.read_bytes() == text:
                 os.replace(self.begun, self.record)
+        self.placed.finish()
         if not self.record.exists():
             write_atomic(self.record, text)
         with refusals_of(self.begun):
             self.begun.unlink(missing_ok=True)
+
+    def _check_untouched(self) -> None:
+        """Refuse to replace what others have put in the copy: edited labels, files of their own.
+        Copies of earlier versions say nothing of their files; those are taken as they are.
+        """
+        if not os.path.isdir(self.root):
+            return
+        is_new = not (self.record.exists() or self.begun.exists())
+        adopts = not (is_new or self.placed.is_there)
+        adopted: dict[str, PlacedFile] = {}
+        others: list[str] = []
+        for folder in walk(self.tree):
+            for file in folder.files:
+                target = self._target(file.relative)
+                facts = _facts(target)
+                if facts is None or not stat.S_ISREG(facts.st_mode):
+                    continue
+                if adopts:
+                    adopted[file.relative] = PlacedFile(facts.st_size, facts.st_mtime_ns)
+                elif not self._is_known(file, target, facts):
+                    others.append(file.relative)
+            for name, _ in folder.links:
+                facts = _facts(self._target(name))
+                if facts is not None and stat.S_ISREG(facts.st_mode):
+                    others.append(name)
+        if others:
+            raise self._edited(others)
+        if adopts:
+            self.placed.adopt(adopted)
+
+    def _is_known(self, file: SourceFile, target: str, facts: os.stat_result) -> bool:
+        """Whether a file of the copy is what was put there, or is about to be."""
+        if self.placed.known(file.relative, facts) or found_as(target, file.facts):
+            return True
+        ours = self.weathered.get(file.relative)
+        rendered = None if ours is None else _facts(str(ours.path))
+        return rendered is not None and rendered.st_mtime_ns == facts.st_mtime_ns
+
+    def _edited(self, names: list[str]) -> OutputError:
+        is_are = "file is" if len(names) == 1 else "files are"
+        return OutputError(
+            f"{len(names)} {is_are} not what was put in the copy {self.root}, such as {names[0]}: "
+            f"edited since, or there before. Nothing has been replaced. Move such files out of "
+            f"the copy to keep them, or delete them there to have them made again; or choose "
+            f"another output folder"
+        )
 
     def _fill(self, folder: SourceFolder) -> None:
         path = self._target(folder.relative)
@@ -628,7 +683,7 @@ class _Mirroring:
             self.files["lidar_sweeps"] += self.tree.is_sweep(file.relative)
             ours = self.weathered.get(file.relative)
             if ours is None or not self._replace(file, ours):
-                how = self._place(file.path, file.facts, self._target(file.relative))
+                how = self._place(file.path, file.facts, file.relative)
                 self.files[how] += 1
                 self.bytes[how] += file.facts.st_size
         for name, text in folder.links:
@@ -651,16 +706,19 @@ class _Mirroring:
                 return False
         rendered = _facts_of(ours.path)
         if ours.form is None or recorded is None:
-            if not self._write(target, rendered.st_mtime_ns, None, ours.content):
+            if not self._write_sweep(file, rendered.st_mtime_ns, ours.content):
                 done.outdated.append(file.relative)
                 return False
             done.record.replaced_sweeps[file.relative] = ours.shown
             return True
         if ours.form != recorded:
-            content = partial(_fitted, ours.path, recorded, self.jpeg_quality)
-            self._write(target, rendered.st_mtime_ns, recorded, content)
+            if _is_written(target, rendered.st_mtime_ns, recorded):
+                self.placed.keep(file.relative, PlacedFile(ANY_SIZE, rendered.st_mtime_ns))
+            else:
+                content = partial(_fitted, ours.path, recorded, self.jpeg_quality)
+                self._write(file.relative, PlacedFile(ANY_SIZE, rendered.st_mtime_ns), content)
             self.encoded.append(target)
-        elif self._place(str(ours.path), rendered, target) == COPIED:
+        elif self._place(str(ours.path), rendered, file.relative) == COPIED:
             done.new += 1
             self.bytes["new_images"] += rendered.st_size
         if ours.form.size != recorded.size:
@@ -668,35 +726,79 @@ class _Mirroring:
         done.record.replaced[file.relative] = ours.shown
         return True
 
-    def _place(self, original: str, facts: os.stat_result, target: str) -> str:
+    def _place(self, original: str, facts: os.stat_result, name: str) -> str:
         """Link or copy, where that has not been done; says which."""
+        target = self._target(name)
         may_link = self.done.record.links == "hard"
+        placed = PlacedFile(facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns)
         found = found_as(target, facts)
-        if found == COPIED or (found == LINKED and may_link):
-            return found
+        if found == LINKED and may_link:
+            # A link changes the original's time of change: the line stays as it was.
+            self.placed.keep(name, self.placed.known(name, facts) or placed)
+            return LINKED
+        if found == COPIED and self._is_copy(original, target, name, placed):
+            self.placed.keep(name, placed)
+            return COPIED
+        self.placed.add(name, placed)
         is_linked = may_link and link_file(original, target)
         if not is_linked:
             self.pump.submit(lambda: copy_file(original, target))
         self._changed(os.path.dirname(target))
         return LINKED if is_linked else COPIED
 
-    def _write(
-        self,
-        target: str,
-        mtime_ns: int,
-        form: ImageForm | None,
-        content: Callable[[], bytes] | None,
-    ) -> bool:
-        """Write a file of that time, and that form if it is an image, where there is none yet;
-        False where that would take what we do not have.
+    def _is_copy(self, original: str, target: str, name: str, placed: PlacedFile) -> bool:
+        """Whether a file of the original's size and time holds the same too: an edit may have kept
+        both. Raises OutputError: it does not, and was not put there.
         """
-        if _is_written(target, mtime_ns, form):
+        known = self.placed.known(name, os.lstat(target))
+        if known is not None and known.source_ctime_ns == placed.source_ctime_ns:
             return True
-        if content is None:
-            return False
-        self.pump.submit(lambda: write_file(content(), target, mtime_ns))
-        self._changed(os.path.dirname(target))
+        with refusals_of(Path(target)):
+            is_same = digest_of(original) == digest_of(target)
+        if not is_same and known is None:
+            raise self._edited([name])
+        return is_same
+
+    def _write_sweep(
+        self, file: SourceFile, mtime_ns: int, content: Callable[[], bytes] | None
+    ) -> bool:
+        """Write a file of a weathered sweep, of that time, where there is none yet or the source's
+        has changed; False where that would take what we do not have.
+        """
+        target, name, ctime_ns = self._target(file.relative), file.relative, file.facts.st_ctime_ns
+        is_written = _is_written(target, mtime_ns, None)
+        known = self.placed.known(name, os.lstat(target)) if is_written else None
+        if known is not None and known.source_ctime_ns == ctime_ns:
+            self.placed.keep(name, known)
+            return True
+        try:
+            digest = digest_of(file.path)
+        except OSError as error:
+            raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
+        placed = PlacedFile(ANY_SIZE, mtime_ns, ctime_ns, digest)
+        # Links elsewhere change the source's time too, and not what it holds.
+        if known is not None and known.source_digest == digest:
+            self.placed.keep(name, placed)
+            return True
+        if content is None:  # with what an earlier version wrote is not known
+            is_taken = is_written and not (known and known.source_digest)
+            if is_taken and known is not None:
+                self.placed.keep(name, known)
+            return is_taken
+        if is_written:
+            data = content()
+            if Path(target).read_bytes() == data:
+                self.placed.keep(name, placed)
+                return True
+            content = partial(bytes, data)
+        self._write(name, placed, content)
         return True
+
+    def _write(self, name: str, placed: PlacedFile, content: Callable[[], bytes]) -> None:
+        target = self._target(name)
+        self.placed.add(name, placed)
+        self.pump.submit(lambda: write_file(content(), target, placed.mtime_ns))
+        self._changed(os.path.dirname(target))
 
     def _own(self, folder: str) -> None:
         if own_folder(folder):

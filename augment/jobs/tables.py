@@ -22,7 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from augment.errors import OutputError
+from augment.files.stated_sizes import StatedSizeError, check_table, check_texts
 from augment.labels import Boxes, LidarSweep
+from recipes.files import open_file
 
 METADATA_KEY = b"climategs"
 
@@ -133,14 +135,29 @@ def read_table(
     """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
     where: the file, for errors. columns: only those of these that it has. without: none of these.
     """
-    with opened_parquet(source, where) as file:
+    with opened_parquet(source, where) as (content, file):
         there = Counter(file.schema_arrow.names)
         if repeated := [name for name, count in there.items() if count > 1]:
             raise OutputError(f"{where} has several columns {repeated[0]!r}; leave one")
         wanted = [n for n in columns or there if n in there and n not in without]
+        long_texts = check_table(content, file, wanted)
+        if long_texts:
+            file = pq.ParquetFile(content, read_dictionary=long_texts)
         # One thread: this runs in DataLoader workers, which bring their own parallelism.
         table = file.read(wanted, use_threads=False)
         table.validate(full=True)  # Arrow does not look at texts as it reads
+        return _with_plain_texts(table) if long_texts else table
+
+
+def _with_plain_texts(table: pa.Table) -> pa.Table:
+    """The table with plain texts in place of dictionaries of texts."""
+    for number, name in enumerate(table.column_names):
+        column = table[name]
+        if pa.types.is_dictionary(column.type):
+            check_texts(column)
+            table = table.set_column(number, name, column.cast(column.type.value_type))
+        elif pa.types.is_nested(column.type):
+            raise OutputError(f"column {name} has lists of texts that are too long to be read")
     return table
 
 
@@ -152,14 +169,14 @@ def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
 
 def read_note(path: Path) -> dict[str, Any]:
     """The metadata alone, without reading a column."""
-    with opened_parquet(path, str(path)) as file:
+    with opened_parquet(path, str(path)) as (_, file):
         schema = file.schema_arrow
     return _note(schema, path)
 
 
 def is_ours(path: Path) -> bool:
     """Whether a Parquet file has metadata as `parquet_bytes` writes it."""
-    with opened_parquet(path, str(path)) as file:
+    with opened_parquet(path, str(path)) as (_, file):
         return METADATA_KEY in (file.schema_arrow.metadata or {})
 
 
@@ -188,17 +205,24 @@ def as_described(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def opened_parquet(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
-    """The file, for as long as it is read; what Arrow then raises becomes an OutputError."""
+def opened_parquet(
+    source: Path | bytes, where: str
+) -> Iterator[tuple[pa.NativeFile, pq.ParquetFile]]:
+    """The file's content and its reader, for as long as it is read; what Arrow then raises becomes
+    an OutputError. A reader takes all the memory that the file asks for: what is read is checked
+    by `augment.files.stated_sizes` before.
+    """
     try:
+        if not isinstance(source, bytes):
+            open_file(source).close()  # refuses pipes, at which Arrow would wait without end
         with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:
             if _has_extension_types(at):
                 raise OutputError(
                     f"{where} has a column of an Arrow extension type, which is not read, for it "
                     f"could run code; write plain numbers and texts instead"
                 )
-            yield pq.ParquetFile(at)
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            yield at, pq.ParquetFile(at)
+    except (OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError) as error:
         raise OutputError(f"{where} is missing or not a readable Parquet file: {error}") from error
 
 

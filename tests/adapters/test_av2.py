@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import pickle
 import re
@@ -17,13 +19,13 @@ import pyarrow as pa
 import pyarrow.feather as feather
 import pytest
 from scipy.spatial.transform import Rotation
-from shown import psnr_of
+from shown import assert_same_bits, psnr_of
 
 from adapters.av2.adapter import Av2Log, open_av2, read_av2
 from adapters.av2.files import GroundMap, sensor_of_laser
 from adapters.base import recognise
 from adapters.raw_drive import DriveOptions
-from adapters.uri import format_uri
+from adapters.uri import SCHEMES, format_uri
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.ground import ground_of
@@ -49,6 +51,37 @@ def scene(folder):
 @pytest.fixture
 def copy(folder, tmp_path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / files.NAME))
+
+
+def test_images_between_sweeps_have_frames_of_their_own_where_asked(scene, folder):
+    query = QUERY | {"images": "all"}
+    whole = open_av2(str(folder), query)
+    assert_same_bits(scene, dataclasses.replace(whole, frames=whole.frames[::2]))
+    assert [frame.index for frame in whole.frames] == list(range(2 * len(scene.frames) - 1))
+    times = [frame.timestamp_ns for frame in whole.frames]
+    assert times == sorted(times)
+    for frame, same in zip(scene.frames, whole.frames[::2], strict=True):
+        assert dataclasses.replace(same, index=frame.index).image_paths == frame.image_paths
+        assert same.timestamp_ns == frame.timestamp_ns
+        assert len(whole.lidar(same.index)) == len(scene.lidar(frame.index))
+        assert whole.boxes(same.index).track_ids == scene.boxes(frame.index).track_ids
+    shown = [path for frame in whole.frames for path in frame.image_paths.values()]
+    assert len(set(shown)) == len(shown) == len(whole.frames) * len(files.CAMERAS)
+    between = whole.frames[3]
+    assert whole.lidar(3) is None and len(whole.boxes(3)) == 0
+    assert whole.labels.lidar_files(3) == () and whole.labels.lidar_files(99) == ()
+    for name, camera in between.cameras.items():
+        assert Path(between.image_paths[name]).stem == str(camera.timestamp_ns)
+        car = files.city_from_ego(camera.timestamp_ns)[:3, 3] - ORIGIN
+        centre = car + files.city_from_ego(camera.timestamp_ns)[:3, :3] @ mounting(scene, name)
+        np.testing.assert_allclose(camera.centre, centre, atol=1e-3)
+    labels = SCHEMES["av2"].open_labels(str(folder), query)
+    assert len(labels.lidar(2)) == len(scene.lidar(1)) and labels.lidar(1) is None
+
+
+def mounting(scene, name: str) -> np.ndarray:
+    """Where a camera is on the car."""
+    return scene.labels.lenses[name].ego_from_camera[:3, 3]
 
 
 def test_the_scene_is_described(scene, folder):
@@ -211,6 +244,13 @@ def write(name: str, content: bytes | None) -> Callable[[Path], None]:
     return change
 
 
+def feather_of_zeros(count: int) -> bytes:
+    """A Feather file of some kB."""
+    sink = io.BytesIO()
+    feather.write_feather(pa.table({"qw": np.zeros(count, np.int8)}), sink, compression="zstd")
+    return sink.getvalue()
+
+
 POSES = Path("city_SE3_egovehicle.feather")
 LENSES = Path("calibration/intrinsics.feather")
 SENSORS = Path("calibration/egovehicle_SE3_sensor.feather")
@@ -218,9 +258,17 @@ BOXES = Path("annotations.feather")
 REFUSED = {
     "no path": (write(str(POSES), None), r"is not a log .* it has no city_SE3_egovehicle\.feather"),
     "no table": (write(str(LENSES), b"ARROW1 no"), r"intrinsics\.feather is not a whole Feather"),
+    "zeros without an end": (
+        write(str(SENSORS), feather_of_zeros(9_000_000)),
+        r"sensor\.feather is not a whole Feather table \(it states more than 8388608 rows",
+    ),
+    "lists in place of texts": (
+        table(SENSORS, sensor_name=lambda v: [[name] for name in v]),
+        r"sensor_name must hold texts; it holds list",
+    ),
     "no lenses": (write(str(LENSES), None), r"intrinsics\.feather does not exist; copy it"),
     "no column": (table(POSES, qz=None), r"must have one column qz; it has \["),
-    "texts": (table(POSES, qz=lambda v: v.astype(str)), r"qz must hold numbers .* holds object"),
+    "texts": (table(POSES, qz=lambda v: v.astype(str)), r"qz must hold numbers .* holds string"),
     "float stamps": (
         table(POSES, timestamp_ns=lambda v: v.astype(np.float64)),
         r"timestamp_ns must hold whole numbers; it holds float64",

@@ -160,8 +160,34 @@ def test_damaged_colmap_models(tmp_path: Path) -> None:
     for name in ("cameras", "images", "points3D"):
         (tmp_path / "b").mkdir(exist_ok=True)
         (tmp_path / "b" / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\x01")
-    with pytest.raises(AdapterError, match="pycolmap cannot read"):
+    with pytest.raises(AdapterError, match=r"cameras\.bin is cut short at camera 1 of 5"):
         read_views(tmp_path / "b")
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_colmap_models_that_are_cut_short_are_named_by_table_and_entry(
+    form: str, tmp_path: Path
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    cameras = "1 PINHOLE 640 480 500 510 321 242\n2 OPENCV 640 480 400 401 320 240 0.1 0 0 0\n"
+    names = [f"{number}.jpg" for number in range(6)]
+    model = pycolmap.Reconstruction(str(write_colmap(tmp_path / "source", cameras, names)))
+    for _ in range(9):
+        model.add_point3D(np.ones(3), pycolmap.Track([]), np.zeros(3, np.uint8))
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    model.write_binary(str(whole)) if form == "binary" else model.write_text(str(whole))
+    assert len(read_views(whole).views) == 6
+    for path in sorted(whole.iterdir()):
+        data = path.read_bytes()
+        # A text's first lines are comments.
+        shares = (0.98, 0.6, 0.05) if form == "binary" else (0.98,)
+        for share in shares:
+            path.write_bytes(data[: int(len(data) * share)])
+            said = rf"{path.name} is cut short(: it has \d bytes| at \w+ \d+ of \d+:)"
+            with pytest.raises(AdapterError, match=said):
+                read_views(whole)
+        path.write_bytes(data)
 
 
 @pytest.mark.parametrize(

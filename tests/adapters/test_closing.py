@@ -65,6 +65,26 @@ def test_the_road_before_the_car_is_closed_at_its_height_in_the_photos_colour(tm
     assert len(again) - len(closed) < 0.05 * len(new)
 
 
+def test_no_disc_stands_before_the_lens_where_the_ground_rises_above_the_camera(tmp_path):
+    background, points = road(6.0)[0], road(0.0)[1]
+    xyz = points.points.copy()
+    patch = (xyz[:, :2] // 2).astype(int) @ [31, 1] % 997  # of 2 m
+    heights = np.random.default_rng(7).uniform(-HEIGHT_M, 3.0, 997)
+    xyz[:, 2] = np.where(xyz[:, 0] > 9, heights[patch], xyz[:, 2])
+    rough = PointSet(xyz, points.semantic)
+    view = photo(tmp_path / "a.png", GREY)
+    (closed,) = close_parts([background], (), (), [view], rough, max_gaussians=10**6)
+    new = closed.means[len(background) :]
+    assert len(new) > 50 and (new[:, 0] > 1).all()
+
+
+def test_nothing_is_closed_where_no_distance_is_known(tmp_path):
+    nothing = PointSet(np.zeros((0, 3), np.float32), np.zeros(0, np.int16))
+    view = photo(tmp_path / "a.png", GREY)
+    (closed,) = close_parts([empty()], (), (), [view], nothing, max_gaussians=10**6)
+    assert len(closed) == 0
+
+
 def test_the_hole_in_a_moving_object_is_of_the_object(tmp_path):
     background, points = road(4.0)
     pose = np.eye(4)

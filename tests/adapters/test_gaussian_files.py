@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -15,10 +16,12 @@ from splat_scenes import gaussians_at, street
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import look_at_pose
 from adapters.camera_files.paths import solid_points
+from adapters.detect_format import recognised
 from adapters.gaussian_files import (
+    GaussianOptions,
     doubt_about_metres,
     find_ground,
-    find_splat_file,
+    find_splat_files,
     open_gaussians,
     scale_from_cameras,
 )
@@ -253,19 +256,51 @@ def test_which_file_of_a_folder(tmp_path: Path) -> None:
     early = model / "point_cloud" / "iteration_7000"
     early.mkdir()
     write_ply(early / "point_cloud.ply", street(length=8))
-    assert find_splat_file(model).parent.name == "iteration_30000"
-    assert find_splat_file(model, 7000).parent.name == "iteration_7000"
+    (newest,) = find_splat_files(model, GaussianOptions())
+    assert newest.parent.name == "iteration_30000"
+    (chosen,) = find_splat_files(model, GaussianOptions(iteration=7000))
+    assert chosen.parent.name == "iteration_7000"
     with pytest.raises(AdapterError, match=r"no iteration 8; it has \[7000, 30000\]"):
-        find_splat_file(model, 8)
+        find_splat_files(model, GaussianOptions(iteration=8))
     folder = tmp_path / "f"
     folder.mkdir()
-    with pytest.raises(AdapterError, match=r"exactly one .* found none"):
-        find_splat_file(folder)
+    with pytest.raises(AdapterError, match=r"expected .* found none"):
+        find_splat_files(folder, GaussianOptions())
     write_splat(folder / "a.splat", street(length=8))
-    assert find_splat_file(folder).name == "a.splat"
+    (only,) = find_splat_files(folder, GaussianOptions())
+    assert only.name == "a.splat"
     write_ply(folder / "b.ply", street(length=8))
-    with pytest.raises(AdapterError, match=r"found \['a\.splat', 'b\.ply'\]"):
+    with pytest.raises(AdapterError, match=r"several kinds.* found \['a\.splat', 'b\.ply'\]"):
         open_gaussians(folder, {})
+    assert len(open_scene(f"gaussians:{folder}?files=b.ply").background) == len(street(length=8))
+
+
+def test_files_of_a_folder_are_parts_of_one_scene(tmp_path: Path) -> None:
+    """Two halves of a street, of which one has colours by direction and lies far from zero."""
+    whole = street(length=8)
+    left = whole.means[:, 1] > 0
+    near, far = whole.select(left), whole.select(~left)
+    bands = torch.nn.functional.pad(far.sh, (0, 0, 0, 4 - far.sh.shape[1]))
+    write_ply(tmp_path / "b.ply", dataclasses.replace(far, sh=bands))
+    write_ply(tmp_path / "a.ply", near)
+    assert recognised(tmp_path) == "gaussians"
+    scene = open_scene(f"{tmp_path}?up=+z&scale=1")
+    said = problem_with(scene, "2 files are taken as parts of one scene")
+    assert f"a.ply ({len(near)}), b.ply ({len(far)})" in said and "filled up with zeros" in said
+    assert scene.name == tmp_path.name and scene.background.sh_degree == 1
+    assert torch.equal(scene.background.means, torch.cat([near.means, far.means]))
+    assert not scene.background.sh[: len(near), 1:].any()
+    turned_round = open_scene(f"gaussians:{tmp_path}?files=b.ply,a.ply&up=+z&scale=1")
+    assert torch.equal(turned_round.background.means, torch.cat([far.means, near.means]))
+    write_ply(tmp_path / "b.ply", far, notes={"up": "-y"})
+    with pytest.raises(AdapterError, match=r"differ in 'up': a\.ply says nothing, b\.ply says -y"):
+        open_gaussians(tmp_path, {})
+    write_ply(tmp_path / "a.ply", near, notes={"up": "+z"})
+    with pytest.raises(AdapterError, match="differ in 'up'"):
+        open_gaussians(tmp_path, {"up": "+z"})
+    for files in ("c.ply", "../a.ply"):
+        with pytest.raises(AdapterError, match=r"no file of this folder.* a\.ply, b\.ply"):
+            open_gaussians(tmp_path, {"files": files})
 
 
 @pytest.mark.parametrize(
@@ -281,13 +316,18 @@ def test_which_file_of_a_folder(tmp_path: Path) -> None:
         ({"iteration": "last"}, "iteration must be the number"),
         ({"sky": "blue"}, "sky must be .*overcast .a light grey., black, white"),
         ({"sky": "0,0,2"}, "sky must be"),
+        ({"files": "a.ply,"}, "files must be the names"),
+        ({"files": "a.ply"}, "this is a file"),
+        ({"lod": "fine"}, "lod must be the level of detail"),
+        ({"lod": "1"}, "no levels of detail"),
+        ({"activated": "maybe"}, "activated must be of a .ply"),
         ({"cameras": "absent.json"}, r"absent\.json: no such file"),
         ({"up": "cameras"}, "up=cameras needs cameras"),
     ],
 )
 def test_bad_queries(tmp_path: Path, query: dict[str, str], message: str) -> None:
     write_ply(tmp_path / "a.ply", street(length=8))
-    with pytest.raises(AdapterError, match=message):
+    with pytest.raises(SceneError, match=message):
         open_gaussians(tmp_path / "a.ply", query)
 
 

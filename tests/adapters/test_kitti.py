@@ -663,8 +663,6 @@ OBJECT_REFUSALS = [
     ("", "", {"frame": "1", "held_out": "0::1"}, r"holds out all 1 frames"),
     ("calib/000001.txt", None, {"frame": "1"}, r"calib/000001\.txt does not exist"),
     ("calib/000001.txt", "^Tr_velo_to_cam", {"frame": "1"}, r"has no 'Tr_velo_to_cam'; it has P0"),
-    ("velodyne/000001.bin", None, {"frame": "1"}, r"velodyne/000001\.bin does not exist"),
-    ("image_2/000001.png", None, {"frame": "1"}, r"image_2/000001\.png does not exist"),
     (
         "label_2/000001.txt",
         " [^ ]+$",
@@ -684,6 +682,10 @@ def test_an_object_folder_that_contradicts_itself_is_refused(all_objects):
         with damaged, pytest.raises(AdapterError, match=message):
             find_source(str(all_objects), query)
     assert find_source(str(all_objects), {"frame": "12"})[0].name == "000012"
+    for name in ("velodyne/000001.bin", "image_2/000001.png"):
+        with changed(all_objects / name, None):
+            source = find_source(str(all_objects), {"frame": "1"})[0]
+        assert f"{name} does not exist" in source.problems[0]
 
 
 def test_the_only_object_frame_needs_no_name_and_no_labels(tmp_path):

@@ -413,6 +413,17 @@ def test_the_only_version_and_scene_need_no_name(tmp_path):
     assert tables(root, files.token("scene", TWO)).name == TWO
 
 
+def test_tables_of_other_writers_go_by_any_folder_name_and_may_begin_with_a_mark(tmp_path):
+    root = files.write_dataset(tmp_path / "test", version="converted", scenes=[TWO])
+    for path in (root / "converted").glob("*.json"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert recognise(root) == "nuscenes"
+    assert tables(root, None).version == "converted"
+    shutil.copytree(root / "converted", root / "v1.0-mini")
+    assert tables(root, None).version == "v1.0-mini"  # the dataset's own name comes first
+    assert read_tables(root, "converted", None).version == "converted"
+
+
 IMAGE = files.data_token(0, "CAM_FRONT", 1)
 BOX = files.token("annotation", files.instance_token(0, files.CAR), files.sample_token(0, 0))
 CALIBRATION = files.token("calibration", ONE, "CAM_FRONT")

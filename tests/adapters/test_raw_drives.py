@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,17 +19,20 @@ import pandas as pd
 import pandaset_folder
 import pyarrow.parquet as pq
 import pytest
+import waymo_files
 from drivestudio_files import write_run
-from recording_folder import write_recording
+from recording_folder import edit_calibration, write_recording
 from shown import assert_same_bits
 
 from adapters.av2.adapter import Av2Log
+from adapters.base import open_scene
 from adapters.drivestudio.adapter import drivestudio_labels
 from adapters.kitti.adapter import KittiLabels
 from adapters.nuscenes.adapter import nuscenes_labels
 from adapters.pandaset import PandaSetLabels
+from adapters.plain_files import Number, read_json, read_numbers, read_yaml, validated
 from adapters.procedural import StreetLabels
-from adapters.raw_drive import Picture, usable_images
+from adapters.raw_drive import NO_SURFACE, IncompleteDrive, Picture, class_of_air, usable_images
 from adapters.recording.adapter import RecordingLabels
 from adapters.street_gaussians.adapter import StreetGaussiansLabels
 from adapters.uri import SCHEMES
@@ -40,11 +44,16 @@ from augment.effects.lidar import (
     SCATTERED,
     UNCHANGED,
     drop_lost,
+    is_in_air,
 )
 from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError
 from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
+from augment.semantics import SemanticClass
+from recipes.load import load_recipe
+from tools.cli import main
+from tools.explain import describe_drive, drive_text
 
 QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
 RAW: dict[str, tuple[Callable[[Path], Path], dict[str, str]]] = {
@@ -88,10 +97,112 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scheme: str, tmp_path: 
     np.testing.assert_array_equal(labels.lidar(0).points_m, scene.lidar(0).points_m)
 
 
+MARK = b"\xef\xbb\xbf"  # with which some editors begin UTF-8
+
+
+def test_texts_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    text, table, tree = tmp_path / "a.txt", tmp_path / "a.json", tmp_path / "a.yaml"
+    text.write_bytes(MARK + b"1 2")
+    table.write_bytes(MARK + b'{"a": 1}')
+    tree.write_bytes(MARK + b"a: 1")
+    assert read_numbers(text).tolist() == [1, 2]
+    assert read_json(table) == read_yaml(tree) == {"a": 1}
+    tree.write_bytes(MARK + b"name: fog\nweather: {smog: {visibility_m: 100}}\n")
+    assert load_recipe(str(tree)).name == "fog"
+
+
+def test_values_of_another_type_are_said_to_be_corrected_not_copied(tmp_path: Path) -> None:
+    with pytest.raises(AdapterError, match=r"x: must be a valid number.* Correct the value") as e:
+        validated(Number, "a", "x")
+    assert "opy" not in str(e.value)
+
+
+LACKS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
+    "pandaset": (RAW["pandaset"][0], "", "camera/*/*.jpg"),
+    "nuscenes": (RAW["nuscenes"][0], "scene=scene-0001", "*/CAM_*/*.jpg"),
+    "kitti": (RAW["kitti"][0], "", "image_*/data/*"),
+    "kitti-object": (kitti_files.write_object, "frame=1", "image_2/*"),
+    "av2": (RAW["av2"][0], "", "sensors/cameras/*/*.jpg"),
+    "recording": (write_recording, "", "images/*/*"),
+    "waymo": (waymo_files.write_segment, "", "camera_*/*.parquet"),
+    "pandaset-lidar": (RAW["pandaset"][0], "", "lidar/*.pkl.gz"),
+    "waymo-lidar": (waymo_files.write_segment, "", "lidar*/*.parquet"),
+}
+
+
+@pytest.mark.parametrize("case", LACKS)
+def test_a_drive_without_images_or_returns_is_described_and_makes_no_scene(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write, query, pattern = LACKS[case]
+    root = write(tmp_path / "2011_09_26")
+    files = list(root.glob(pattern))
+    assert files
+    for file in files:
+        file.unlink()
+    with pytest.raises(
+        IncompleteDrive, match=r"there (is no usable image|are no LiDAR returns)"
+    ) as e:
+        open_scene(f"{case.split('-')[0]}:{root}?{query}")
+    facts = describe_drive(e.value)
+    has_returns = "lidar" not in pattern
+    assert (facts["lidar"]["returns"] > 1000) == has_returns
+    assert (sum(camera["images"] for camera in facts["cameras"]) > 0) != has_returns
+    assert facts["frames"]["count"] >= 1
+    assert facts["boxes"]["count"] >= 2 or case == "waymo-lidar"  # whose pattern has lidar_box
+    page = drive_text(facts)
+    assert "scene       none: there" in page and "LiDAR       " in page and "boxes " in page
+
+
+def test_inspect_shows_a_drive_without_images_and_render_refuses_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = av2_files.write_log(tmp_path / "log", cameras=list(av2_files.CAMERAS)[:1])
+    shutil.rmtree(root / "sensors/cameras")
+    facts = tmp_path / "facts.json"
+    assert main(["inspect", str(root), "--json", str(facts)]) == 1
+    page = capsys.readouterr().out
+    assert "scene       none: there is no usable image in 4 frames" in page
+    assert "; map, " in page and "usable returns in 4 sweeps of 4 frames" in page
+    assert read_json(facts)["boxes"]["count"] == 8
+    assert main(["render", "dense-fog", "--scene", str(root), "--out", str(tmp_path / "out")]) == 2
+    assert "no usable image" in capsys.readouterr().err
+
+
+def test_returns_beyond_any_reach_are_left_out_and_paths_must_be_metres(tmp_path: Path) -> None:
+    root = kitti_files.write_object(tmp_path)
+    (file,) = root.glob("velodyne/*.bin")
+    records = np.fromfile(file, "<f4").reshape(-1, 4)
+    records[100, 0], records[200, 1] = 1e20, -2000
+    records.tofile(file)
+    scene = SCHEMES["kitti"].open(str(root), QUERY)
+    said = "2 LiDAR returns lie further than 1000 m from the car's path and are left out"
+    assert any(said in problem for problem in scene.problems)
+    wide = write_recording(tmp_path / "wide")
+
+    def jump(calibration: dict) -> None:
+        for entry in calibration["frames"][2:]:
+            entry["world_from_ego"][0][3] += 4e7
+
+    edit_calibration(wide, jump)
+    shutil.rmtree(wide / "lidar")
+    with pytest.raises(AdapterError, match=r"4e\+07 x 0 m wide.*between frames 1 and 2"):
+        SCHEMES["recording"].open(str(wide), QUERY)
+
+
 CODES = np.array(
     [UNCHANGED, UNCHANGED, ATTENUATED, LOST, MOVED, SCATTERED, PRECIPITATION], np.uint8
 )
 PANOPTIC = "panoptic/v1.0-mini/0_panoptic.npz"
+# What returns that drops, flakes or fog made have in columns that say what was hit.
+OF_AIR: dict[str, dict[str, float]] = {
+    "pandaset": {"semantic": 3},  # Spray or rain
+    "nuscenes": {"semantic": 0},  # noise
+    "recording": {"semantic": 0},  # of no meaning in its calibration
+    "recording-of-ours": {"semantic": 0},
+    "waymo": {"flow_x": 0, "flow_y": 0, "flow_z": 0, "flow_class": -1, "ground": 0},
+}
 
 
 def test_images_of_long_drives_are_checked_by_header_and_end(
@@ -144,6 +255,7 @@ def _kitti(root: Path, matrix: np.ndarray | None = None):
 def _ours(root: Path) -> RecordingLabels:
     (root / "lidar").mkdir(parents=True)
     sweep = RecordingLabels(write_recording(root / "plain", frames=1)).lidar(0)
+    shutil.copy(root / "plain/calibration.json", root)
     columns = {**sweep.columns, "note": np.array(["a", "b"], object)[np.arange(len(sweep)) % 2]}
     columns["intensity"] = (np.arange(len(sweep)) % 256).astype(np.uint8)
     (root / "lidar/000000.parquet").write_bytes(lidar_bytes(LidarSweep(columns)))
@@ -207,9 +319,24 @@ def test_files_give_back_the_weathered_sweep(dataset: str, tmp_path: Path) -> No
     atol_m = 0.5 * 2**-5 * 2**0.5 if dataset == "av2" else 1e-5
     np.testing.assert_allclose(read.points_m, wanted.points_m, rtol=0, atol=atol_m)
     told = "timestamp_ns" if dataset == "nuscenes" else ""  # by the bearing, of those that moved
+    in_air = is_in_air(wanted)
+    assert 0 < in_air.sum() < len(wanted)
+    air = OF_AIR.get(dataset, {})
     for name in source.columns.keys() - {"x", "y", "z", told}:
-        np.testing.assert_array_equal(read.columns[name], wanted.columns[name], err_msg=name)
+        expected = np.array(wanted.columns[name])
+        expected[in_air] = air.get(name, expected[in_air])
+        np.testing.assert_array_equal(read.columns[name], expected, err_msg=name)
     assert labels.lidar_files(99) == ()
+
+
+def test_without_a_class_of_that_name_returns_of_the_air_have_none() -> None:
+    """By meaning then, and at last a number of no class."""
+    meaning = {4: SemanticClass.ROAD, 9: NO_SURFACE, 7: NO_SURFACE, 2: SemanticClass.UNKNOWN}
+    assert class_of_air(meaning, {4: "noise", 9: "fog"}, "noise") == 4
+    assert class_of_air(meaning, {}, "noise") == 7
+    del meaning[7], meaning[9]
+    assert class_of_air(meaning, {}, "noise") == 2
+    assert class_of_air({0: SemanticClass.ROAD, 1: SemanticClass.SIGN}, {}, "noise") == 2
 
 
 def test_pandas_opens_the_tables_and_their_rows_still_name_each_other(tmp_path: Path) -> None:
@@ -237,7 +364,8 @@ def test_labels_of_nuscenes_returns_stay_with_their_returns(tmp_path: Path) -> N
     panoptic.write_bytes(content)
     with np.load(panoptic) as archive:
         assert archive["data"].dtype == np.uint16
-        np.testing.assert_array_equal(archive["data"], wanted.columns["source_index"])
+        expected = np.where(is_in_air(wanted), 0, wanted.columns["source_index"])
+        np.testing.assert_array_equal(archive["data"], expected)
     panoptic.write_bytes(b"PK no archive")
     with pytest.raises(AdapterError, match=r"0_panoptic\.npz must hold an array `data`"):
         labels.lidar_content(0, panoptic, wanted)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import drives
 import numpy as np
@@ -238,6 +241,27 @@ def test_views_know_the_own_car(bonnet_drive):
     assert (view.weight == 1).all() and len(view.depth_pixels) > 100
     # The floor behind the bonnet is not seen.
     assert not mask.reshape(-1)[view.depth_pixels].any()
+
+
+def test_images_that_differ_by_a_few_rows_share_a_mask(bonnet_drive):
+    def cut(frame):
+        """The frame without up to four of its lowest rows."""
+        camera = frame.cameras["front"]
+        height = camera.height - 2 * (frame.index % 3)
+        path = Path(frame.image_paths["front"])
+        drives.paint(path, cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)[:height])
+        camera = camera.cropped(0, 0, camera.width, height)
+        return dataclasses.replace(frame, cameras={"front": camera})
+
+    whole = RecordedViews(bonnet_drive, scale=1.0).ego_masks["front"]
+    drive = dataclasses.replace(bonnet_drive, frames=tuple(map(cut, bonnet_drive.frames)))
+    views = RecordedViews(drive, scale=1.0)
+    assert (views.ego_masks["front"] != whole).mean() < 0.03
+    for key in views.train:
+        mask = views.own_car(key)
+        assert mask.shape == (120 - 2 * (key.frame % 3), 160)
+        assert mask[102:].all() and not mask[:90].any()
+        assert not mask.reshape(-1)[views.load(key).depth_pixels].any()
 
 
 def test_masks_from_files(bonnet_drive, tmp_path):

@@ -31,7 +31,7 @@ from augment.scene import Scene
 from recipes.schema import Recipe
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot
-from tools.export import mirror_outputs, recipes_for_source
+from tools.export import clear_notes, mirror_outputs, recipes_for_source
 
 SMALL = {"voxel_m": "0.5", "image_scale": "0.5", "sky_size": "16", "max_gaussians": "3000"}
 
@@ -130,6 +130,19 @@ def test_an_argoverse_log(tmp_path):
     assert_same_but_colours(scene, again, root, copy / root.name)
     # Images come twice as often as sweeps.
     assert "  12 of 27 camera images are weathered; 15 stay clear, as recorded" in said
+    (note,) = clear_notes(scene, of_sweeps=False)
+    assert note.endswith("; images=all in its URI takes those between its sweeps")
+
+
+def test_all_images_of_an_argoverse_log(tmp_path):
+    """Those before the first sweep and after the last belong to no span."""
+    root = av2_files.write_log(tmp_path / av2_files.NAME)
+    scene = open_scene(format_uri("av2", root, {**SMALL, "images": "all"}))
+    assert len(scene.frames) == 7
+    copy, said = weather(scene, tmp_path / "out")
+    assert changed_files(root, copy / root.name) == relative_images(scene, root)
+    assert "  21 of 27 camera images are weathered; 6 stay clear, as recorded" in said
+    assert "images=all" not in clear_notes(scene, of_sweeps=False)[0]
 
 
 def test_a_nuscenes_dataset(tmp_path):

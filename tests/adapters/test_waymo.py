@@ -18,7 +18,7 @@ from shown import psnr_of
 from waymo_files import DRIVER, ORIGIN, PARKED, Form, Rig, Street, car_pose, changed
 
 from adapters.base import open_scene, recognise
-from adapters.raw_drive import RawDrive
+from adapters.raw_drive import IncompleteDrive, RawDrive
 from adapters.waymo.adapter import WaymoOptions, read_waymo, waymo_labels
 from adapters.waymo.tables import Rows, SegmentFiles
 from augment.effects.lidar.beam import reflectances
@@ -362,10 +362,12 @@ def _first(value):
     return lambda values: [value, *values[1:]]
 
 
-POSE, LASER, IMAGE, CAMERA = (
+POSE, LASER, IMAGE, CAMERA, BOX = (
     f"[{files.CLASSES[tag]}]."
-    for tag in ("vehicle_pose", "lidar_calibration", "camera_image", "camera_calibration")
-)
+    for tag in (
+        "vehicle_pose", "lidar_calibration", "camera_image", "camera_calibration", "lidar_box"
+    )
+)  # fmt: skip
 REFUSED = [
     ("vehicle_pose", _without(POSE + "world_from_vehicle.transform"), "transform is missing"),
     ("vehicle_pose", _set(POSE + "world_from_vehicle.transform", lambda v: [[0.0] * 16] * 3),
@@ -388,7 +390,45 @@ REFUSED = [
      "lists of numbers"),
     ("lidar_box", _set("key.laser_object_id", list(range(6)), pa.int32()),
      "must hold a text in every row"),
+    ("lidar_box", _set(BOX + "type", [[1]] * 6, pa.list_(pa.int8())), "whole numbers or texts"),
+    ("camera_calibration", _set("key.camera_name", [[]] * 5, pa.list_(pa.int8())),
+     "whole numbers or texts; it holds list"),
+    ("vehicle_pose", _set("key.segment_context_name", [7] * 3, pa.int8()), "a text in every row"),
+    ("vehicle_pose", _set("key.frame_timestamp_micros", _first(-(2**63))), "Unix time in micro"),
 ]  # fmt: skip
+
+
+def _zeros(table: pa.Table) -> pa.Table:
+    """A lidar table of 3 kB with 5 million zeros in one row."""
+    array = pa.ListArray.from_arrays(pa.array([0, ZEROS], pa.int32()), pa.array(np.zeros(ZEROS)))
+    table = table.slice(0, 1)
+    return table.set_column(table.column_names.index(RANGES.format(1, "values")), "v", array)
+
+
+ZEROS = 5_000_000
+RANGES = "[LiDARComponent].range_image_return{}.{}"
+LABELS = "[LiDARSegmentationLabelComponent].range_image_return{}.{}"
+SWEEPS_LEFT_OUT = [
+    ("lidar", _set(RANGES.format(2, "values"), lambda v: [-1] * len(v), pa.int64()),
+     "return2.values must hold lists of numbers; it holds int64"),
+    ("lidar_segmentation", _set(LABELS.format(2, "shape"), lambda v: [-1] * len(v), pa.int64()),
+     "return2.shape must hold lists of numbers; it holds int64"),
+    ("lidar_segmentation", _set("key.laser_name", lambda v: [[]] * len(v), pa.list_(pa.int8())),
+     "key.laser_name must hold whole numbers or texts; it holds list"),
+    ("lidar", lambda t: _zeros(t).rename_columns(t.column_names),
+     "states 5000000 values in 1 rows; at most 4194304 a row are read"),
+]  # fmt: skip
+
+
+def test_sweeps_in_columns_of_other_types_or_sizes_are_left_out_and_said(copy: Path) -> None:
+    for tag, change, message in SWEEPS_LEFT_OUT:
+        path = files.table_path(copy, tag)
+        before = path.read_bytes()
+        changed(copy, tag, change, Form())
+        drive = read(copy, frames="1:2")
+        assert len(drive.sweeps) == 0
+        assert any(message in problem and str(path) in problem for problem in drive.problems)
+        path.write_bytes(before)
 
 
 def test_contradictions_are_refused_by_file_and_column(copy: Path) -> None:
@@ -404,8 +444,8 @@ def test_contradictions_are_refused_by_file_and_column(copy: Path) -> None:
         path = files.table_path(copy, tag)
         content = path.read_bytes()
         path.unlink()
-        with pytest.raises(AdapterError, match=rf"lacks .*{tag}.*download them too"):
-            read(copy)
+        with pytest.raises(IncompleteDrive, match=rf"lacks .*{tag}.*download them too"):
+            open_scene(f"waymo:{copy}")
         path.write_bytes(content[:-100])
         with pytest.raises(AdapterError, match=rf"{tag}.*cannot be read as Parquet"):
             read(copy)

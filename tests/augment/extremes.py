@@ -171,7 +171,7 @@ class Place:
             sky=sky,
         )
         for slope in SLOPES_DEG:
-            settings = placement_settings(snow_model(max_slope_deg=slope))
+            settings = placement_settings(snow_model(max_slope_deg=slope), base)
             memo_of(scene).put(("snow support", settings), support_of(base, settings))
         return scene
 

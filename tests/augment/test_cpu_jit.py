@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import io
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numba
@@ -14,15 +16,18 @@ import numpy as np
 import pytest
 from numba import prange
 
+from augment.progress import ProgressBar
 from augment.render import threads
 from augment.render.compile_ahead import describe_type, find_type, read_signatures
 from augment.render.cpu import jit as cpu_jit
 from augment.render.cpu import simd as v8
-from augment.render.cpu.jit import KERNELS, kernel
+from augment.render.cpu.jit import KERNELS, kernel, seconds_compiling
+from augment.render.cpu.kernel_cache import KEEP_DAYS, SECONDS_A_DAY, UserCacheLocator, make_folder
 from augment.render.cpu.simd import exp2, exp2_fine, log2
 from augment.render.threads import kernel_threads
 
 U = np.uint64
+ROOT = Path(__file__).parents[2]
 
 
 def double(values):
@@ -58,7 +63,10 @@ def apply(which, x):
     return out[: x.size].astype(np.float64)
 
 
-def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch):
+def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch, tmp_path):
+    # numba reads NUMBA_CACHE_DIR when it is imported.
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
     def hits(kernel_function):
         values = np.ones(4)
         with kernel_threads():
@@ -73,6 +81,63 @@ def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch):
     )
     assert hits(kernel(double)) == 0
     assert hits(kernel(double)) == 1
+
+
+def test_compiled_kernels_lie_in_the_users_cache_folder_and_not_beside_the_sources(tmp_path):
+    code = (
+        "from augment.render.cpu.jit import KERNELS\n"
+        "from adapters.street import raycast\n"
+        "kernel = KERNELS['adapters.street.raycast:trace']\n"
+        "print(kernel._cache.cache_path)"
+    )
+    paths = []
+    for name, expected in (("cache", "climategs/kernels"), ("file", "__pycache__")):
+        if name == "file":  # a cache folder that cannot be made
+            (tmp_path / name).write_bytes(b"")
+        environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / name)}
+        environment.pop("NUMBA_CACHE_DIR", None)
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        )
+        paths.append(Path(done.stdout.strip()))
+        assert expected in done.stdout
+    assert paths[0].is_relative_to(tmp_path / "cache/climategs/kernels")
+
+
+def test_the_time_of_a_progress_bar_leaves_out_compiling(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    values = np.ones(4, np.float32)
+    with ProgressBar(total=2, file=io.StringIO()) as bar:
+        started = time.perf_counter()
+        with kernel_threads():
+            kernel(double)(values)
+        bar.update()
+        passed_s = time.perf_counter() - started
+        assert seconds_compiling() > 0 and bar.format_dict["elapsed"] < passed_s / 2
+
+
+def test_the_folder_of_a_kernel_is_named_by_all_its_sources(tmp_path):
+    def folder(text: str, sources_digest: str) -> str:
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.py"
+        path.write_text(text)
+        place = type("Place", (UserCacheLocator,), {"digest_of_others": sources_digest})
+        return place(double, str(path)).get_cache_path()
+
+    assert folder("a", "x") == folder("a", "x")
+    assert len({folder("a", "x"), folder("b", "x"), folder("a", "y")}) == 3
+
+
+def test_folders_of_kernels_go_when_unused_for_long(tmp_path):
+    recent, old = tmp_path / "recent", tmp_path / "old"
+    for path, days in ((recent, KEEP_DAYS - 1), (old, KEEP_DAYS + 1)):
+        path.mkdir()
+        then = time.time() - days * SECONDS_A_DAY
+        os.utime(path, (then, then))
+    make_folder(tmp_path / "new")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "recent"]
+    make_folder(recent)  # in use again
+    assert time.time() - recent.stat().st_mtime < 60
 
 
 def test_the_list_of_signatures_names_kernels_and_types():
@@ -183,7 +248,6 @@ def test_turned_rows_stop_at_the_last_and_masked_lanes_are_zero():
         assert out[544 + 8 * row : 552 + 8 * row].tolist() == [*range(row, v8.WIDE, each)]
 
 
-ROOT = Path(__file__).parents[2]
 SECONDS = 120  # for a fresh process on a busy machine; a worker that hangs would wait for ever
 
 FORKED_WORKERS = """
@@ -318,6 +382,31 @@ def test_tbb_is_chosen():
     with threads.kernel_threads():
         pass
     assert numba.threading_layer() == "tbb"
+
+
+NAMED_LAYER = """
+from augment.errors import BackendUnavailable
+from augment.render import threads
+try:
+    print(threads.select_thread_pool(), end=" ")
+    with threads.kernel_threads():
+        print(threads.thread_count() > 0)
+except BackendUnavailable as error:
+    print(error)
+"""
+
+
+@needs_tbb
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [("tbb", "tbb True"), ("bogus", "NUMBA_THREADING_LAYER=bogus: The threading layer requested")],
+)
+def test_a_layer_that_the_user_names_is_used_or_refused_in_our_words(layer: str, message: str):
+    result = subprocess.run(
+        [sys.executable, "-c", NAMED_LAYER], cwd=ROOT, capture_output=True, text=True, check=True,
+        env={**os.environ, "NUMBA_THREADING_LAYER": layer},
+    )  # fmt: skip
+    assert result.stdout.startswith(message)
 
 
 @needs_tbb

@@ -18,15 +18,19 @@ from augment.errors import OutputError, SceneError
 from augment.files.export import (
     baked,
     export_cameras,
+    export_glb,
     export_losses,
     export_ply,
     export_ply_parts,
+    export_sog,
     export_splat,
+    export_spz,
+    export_usd,
     inria_cameras,
     is_parts_folder,
     moved_gaussians,
 )
-from augment.files.ply import read_ply
+from augment.files.ply import read_ply, read_splats
 from augment.geometry import rigid, rotmat_from_quat, transform_points
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
@@ -190,6 +194,18 @@ def test_an_exported_ply_opens_as_the_scene_was(tmp_path):
     ours = image(tuple(scene.parts_at(NOW)))
     theirs = image(tuple(again.parts_at(0)))
     assert np.quantile(differences(ours, theirs), 0.999) < 2
+
+
+def test_missing_folders_are_made_and_a_file_in_their_place_is_named(tmp_path):
+    scene = drive(actors=())
+    (tmp_path / "file").write_text("")
+    kinds = (export_ply, export_splat, export_spz, export_sog, export_glb, export_usd)
+    for export in kinds:
+        name = export.__name__.removeprefix("export_").replace("usd", "usdc")
+        export(scene, tmp_path / name / "below" / f"a.{name}", NOW)
+        assert len(read_splats(tmp_path / name / "below" / f"a.{name}").gaussians) == 300
+        with pytest.raises(OutputError, match=r"cannot write .* in the way"):
+            export(scene, tmp_path / "file" / "below" / f"a.{name}", NOW)
 
 
 def test_a_moment_with_nothing_in_it_is_refused(tmp_path):

@@ -229,7 +229,7 @@ def test_deeper_snow_never_lowers_the_surface(
     relief_m: float | None, depths: list[float], coverage: float, drift: float, tracks: str, seed
 ):
     if relief_m is None:
-        cells = support_of(street(), placement_settings(snow_model())).ground
+        cells = support_of(street(), placement_settings(snow_model(), street())).ground
     else:
         cells = rough_cells(seed, relief_m)
     more = {"coverage": coverage, "wind": {"drift": drift}, "tracks": tracks}

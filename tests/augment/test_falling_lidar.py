@@ -65,6 +65,26 @@ def echoes_of(points: np.ndarray, intensity: float | np.ndarray = 0.3) -> Echoes
     return Echoes.of(sweep_of(points, intensity), origins, WORLD_ORIGIN_M, MODEL)
 
 
+@pytest.mark.parametrize(
+    ("recorded", "highest"),
+    [
+        (np.float32([0.1, 1.0, 0.5]), 1.0),  # fractions
+        (np.float32([3.0, 180.0, 20.0]), 255.0),
+        (np.float32([3.0, 4000.0, 20.0]), 4000.0),  # another scale: as bright as the sweep has it
+        (np.float32([np.nan, np.inf, 20.0]), 255.0),
+        (np.uint8([3, 180, 20]), 255),
+        (np.int32([3, 180, 20]), 255),
+    ],
+)
+def test_no_echo_is_brighter_than_the_sensor_reports(recorded: np.ndarray, highest: float) -> None:
+    echoes = echoes_of(some_points(3), recorded)
+    echoes.source.columns["intensity"] = recorded
+    echoes.replace(np.array([2]), np.array([2.0]), np.array([1e4]), PRECIPITATION)
+    found = echoes.sweep().columns["intensity"]
+    assert found.dtype == recorded.dtype and found[2] == highest
+    np.testing.assert_array_equal(found[:2], recorded[:2])
+
+
 def test_a_sphere_gives_back_what_traced_rays_say() -> None:
     """dsigma/dOmega = b db / (sin theta dtheta) of rays that leave almost straight back."""
     index = 1.3275

@@ -214,6 +214,23 @@ def test_refusals(tmp_path: Path) -> None:
         "copies": (changed("nodes", to=many) | {"scenes": [{"nodes": [*range(200)]}]}, "copies"),
         "a loop": (changed("nodes", to=[{"children": [0]}]), "two parents"),
         "a mirror": (changed("nodes", 0, "scale", to=[-1, 1, 1]), "mirrors"),
+        "no rotation": (changed("nodes", 0, "rotation", to=[0, 0, 0, 0]), "node 0 has no place"),
+        "beyond float64": (changed("nodes", 0, "scale", to=[1e200] * 3), "no usable Gaussians"),
+        "nodes": (changed("nodes", to=[{}] * 100_001), "100001 nodes; at most 100000"),
+        "placed": (
+            changed("nodes", to=[{"mesh": 0}] * 10_001) | {"scenes": [{"nodes": [*range(10_001)]}]},
+            "more than 10000 primitives",
+        ),
+        "an absent buffer": (
+            changed("nodes", to=many)
+            | {
+                "scenes": [{"nodes": [*range(200)]}],
+                "buffers": [*document()["buffers"], {"byteLength": 10**9, "uri": "none"}],
+            },
+            "copies",
+        ),
+        "half a character": (changed("buffers", 0, "uri", to="\ud800"), "half a character"),
+        "a zero byte": (changed("buffers", 0, "uri", to="a%00/b"), "in the file's folder"),
         "no node": (changed("scenes", 0, "nodes", to=[7]), "not a whole glTF"),
         "a type": (changed("accessors", 0, "count", to="many"), "accessors.0.count"),
         "outside": (changed("buffers", 0, "uri", to="../outside.bin"), "in the file's folder"),
@@ -234,7 +251,8 @@ def test_refusals(tmp_path: Path) -> None:
         (whole[:-100], "truncated|found"),
         (whole[:12], "header ends early"),
         (whole[:8] + struct.pack("<III", 0, 1 << 31, 0x4E4F534A) + whole[20:], "begins with JSON"),
-        (whole.replace(b"{", b"[", 1), "not a whole glTF"),
+        (whole.replace(b'"scene":0', b'"scene":9' + b"9" * 5000), "its JSON cannot be read"),
+        (whole.replace(b"{", b"[", 1), "its JSON cannot be read"),
     ):
         path.write_bytes(data)
         with pytest.raises(SceneError, match=message):

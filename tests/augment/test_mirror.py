@@ -141,7 +141,7 @@ def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
         if not stopped:
             break
         half = trees.contents(copy) if copy.is_dir() else {}
-        final = {name: half[name] for name in half if not name.endswith(TEMPORARY_SUFFIX)}
+        final = {n: half[n] for n in half if not n.endswith((TEMPORARY_SUFFIX, ".files"))}
         assert all(whole.get(name) == final[name] for name in final), f"stopped at {calls}"
         trees.mirror(source, out, links="copy")
         assert trees.contents(copy) == whole, f"stopped at {calls}"
@@ -184,7 +184,8 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
     known = read_record(trees.tree_of(source), record.parent)
     assert set(known.replaced) == {"camera/front/00.png", "camera/rear/00.png"}
     trees.mirror(source, out)
-    assert [p.name for p in record.parent.iterdir() if p.is_file()] == [record.name]
+    names = {p.name for p in record.parent.iterdir() if p.is_file()}
+    assert names == {record.name, "climategs-mirror-drive.files"}
     assert len(json.loads(record.read_text())["replaced"]) == 8
 
 
@@ -242,6 +243,92 @@ def test_a_copy_that_shares_nothing(source, out):
             path.write_bytes(b"mine")
     assert trees.snapshot(source) == before
     assert image_of(out, "front", 0).read_bytes() != b"mine"
+
+
+def edit(path: Path, links: str) -> None:
+    """As editors save: of a hard link into a new file, lest the source change too."""
+    if links == "hard":
+        path.unlink()
+    path.write_bytes(b"edited by hand")
+
+
+@pytest.mark.parametrize("links", ["hard", "copy"])
+def test_edits_in_the_copy_stop_it_before_anything_changes(source, out, links):
+    done = trees.mirror(source, out, links=links)
+    label, image = done.folder / "lidar/raw/00.bin", done.folder / "camera/front/01.png"
+    edit(label, links)
+    edit(image, links)
+    (source / "README.md").unlink()
+    (source / "README.md").write_text("Another text.\n")
+    before = trees.snapshot(out / "source")
+    with pytest.raises(OutputError, match=r"2 files are not what was put .*front/01\.png.* them"):
+        trees.mirror(source, out, links=links)
+    assert trees.snapshot(out / "source") == before
+    image.unlink()
+    with pytest.raises(OutputError, match=r"1 file is not what was put .*lidar/raw/00\.bin"):
+        trees.mirror(source, out, links=links)
+    label.unlink()
+    assert trees.mirror(source, out, links=links).changed == 3
+    assert label.read_bytes() == (source / "lidar/raw/00.bin").read_bytes()
+    assert (done.folder / "README.md").read_text() == "Another text.\n"
+
+
+def test_files_that_were_there_before_stop_it(source, out):
+    """Also where the dataset has a link, and of the same size and time as the dataset's."""
+    (source / "camera/also").symlink_to("front")
+    copy = out / "source/fog-000/drive"
+    content, time_ns = b"other" * 1000, (source / "lidar/raw/00.bin").stat().st_mtime_ns
+    for place in ("README.md", "camera/also", "camera/front/00.png", "lidar/raw/00.bin"):
+        (copy / place).parent.mkdir(parents=True, exist_ok=True)
+        (copy / place).write_bytes(content)
+        if place == "lidar/raw/00.bin":
+            os.utime(copy / place, ns=(time_ns, time_ns))
+        with pytest.raises(OutputError, match=f"1 file is not what was put .*{place}"):
+            trees.mirror(source, out)
+        assert (copy / place).read_bytes() == content
+        (copy / place).unlink()
+    trees.mirror(source, out)
+    assert trees.listing(copy) == trees.listing(source)
+
+
+@pytest.mark.parametrize("links", ["hard", "copy"])
+def test_a_source_of_the_same_size_and_time_is_looked_into(source, out, links):
+    trees.mirror(source, out, links=links)
+    label = source / "lidar/raw/00.bin"
+    time_ns, content = label.stat().st_mtime_ns, bytes(5000)
+    if links == "hard":
+        label.unlink()
+    label.write_bytes(content)
+    os.utime(label, ns=(time_ns, time_ns))
+    assert trees.mirror(source, out, links=links).changed == 1
+    assert (out / "source/fog-000/drive/lidar/raw/00.bin").read_bytes() == content
+    label.chmod(0o600)  # a change of its facts alone
+    assert trees.mirror(source, out, links=links).changed == 0
+
+
+def test_copies_of_earlier_versions_are_taken_as_they_are(source, out, monkeypatch):
+    """They have no list of what was put there; from then on they have one."""
+    done = trees.mirror(source, out, links="copy")
+    placed = out / "source/fog-000/climategs-mirror-drive.files"
+    placed.unlink()
+    (done.folder / "README.md").write_text("edited")
+    (done.folder / "lidar/raw/00.bin").write_text("edited")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 8)
+        with pytest.raises(KeyboardInterrupt):
+            trees.mirror(source, out, links="copy")
+    assert trees.mirror(source, out, links="copy").changed > 0
+    recorded, shown = trees.contents(source), trees.contents(done.folder)
+    assert all(shown[name] == recorded[name] for name in recorded.keys() - places())
+    (done.folder / "README.md").write_text("edited")
+    with pytest.raises(OutputError, match="not what was put in the copy"):
+        trees.mirror(source, out, links="copy")
+    placed.write_text(placed.read_text() + '["half a li')  # when the power went
+    with pytest.raises(OutputError, match="not what was put in the copy"):
+        trees.mirror(source, out, links="copy")
+    placed.write_text("[1]\n")
+    with pytest.raises(OutputError, match=r"drive\.files is damaged: .* Delete it and run again"):
+        trees.mirror(source, out, links="copy")
 
 
 def test_a_changed_source_is_noticed(source, out):

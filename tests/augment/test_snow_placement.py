@@ -18,7 +18,9 @@ from augment.effects.snow.placement import (
     WHEEL_SHARE,
     PlacementSettings,
     place_snow_support,
+    wheel_paths,
 )
+from augment.effects.snow.snow import placement_settings
 from augment.effects.snow.support import FORMAT, load_support, save_support, support_key, support_of
 from augment.effects.snow.surface import is_vehicle
 from augment.errors import OutputError, SceneError
@@ -26,6 +28,8 @@ from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, Scene, Track
 from augment.semantics import SemanticClass
+from augment.timing import PassProgress, watched
+from recipes.snow import Snow
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
 
@@ -112,11 +116,16 @@ def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
     assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
 
 
-def test_bits_do_not_depend_on_threads(flat_ground) -> None:
+def test_bits_do_not_depend_on_threads_or_on_who_watches(flat_ground) -> None:
     scene, bed = flat_ground
     limit_threads(2)
-    together = place_snow_support(scene, cameras_of(scene), COARSE)
+    told = list[PassProgress]()
+    with watched(told.append):
+        together = place_snow_support(scene, cameras_of(scene), COARSE)
     assert_equal_cells(together.ground, bed.ground)
+    total = told[0].total
+    assert [progress.done for progress in told] == [*range(total + 1)] and total > 1
+    assert {progress.name for progress in told} == {"placing snow"}
 
 
 def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
@@ -291,6 +300,27 @@ def test_the_ground_is_buried_and_walls_are_not() -> None:
     on_top = inner & (means[:, 2] > 0.5)
     assert bool(hidden[on_top].all())
     assert not bool(hidden[inner & (means[:, 2] < 0.05)].any())  # the ground below is deeper
+
+
+def test_wheel_tracks_are_those_of_a_recorded_drive() -> None:
+    recorded = drive(GROUND)
+    y_m = [float(path.points_m[:, 1].mean()) for path in wheel_paths(recorded)]
+    assert len(y_m) == 1
+    invented = dataclasses.replace(recorded, seen_frames=())
+    assert wheel_paths(invented) == ()
+    assert len(wheel_paths(invented, with_invented=True)) == 1
+    aside = torch.eye(4, dtype=torch.float64)
+    aside[1, 3] = 3.0
+    frames = tuple(
+        dataclasses.replace(frame, world_from_ego=aside @ frame.world_from_ego)
+        for frame in recorded.frames
+    )
+    on_path = dataclasses.replace(recorded, frames=frames, seen_frames=recorded.frames)
+    assert [float(path.points_m[:, 1].mean()) for path in wheel_paths(on_path)] == y_m
+    for tracks, expected in (("auto", False), ("always", True)):
+        settings = placement_settings(Snow(depth_m=0.1, tracks=tracks), invented)
+        assert settings.invented_tracks == expected
+        assert not placement_settings(Snow(depth_m=0.1, tracks=tracks), recorded).invented_tracks
 
 
 def test_wheels_leave_tracks_beside_the_path() -> None:

@@ -244,3 +244,105 @@ def test_refusals(tmp_path: Path) -> None:
 def lossy() -> bytes:
     image = np.zeros((4, 4, 3), np.uint8)
     return cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 80])[1].tobytes()
+
+
+# ---- Streamed SOG: levels of detail in chunks ----------------------------------------------------
+
+
+def streamed(folder: Path, **changes: Any) -> Path:
+    """Two levels of 6 and 2 Gaussians along x, the finer in two chunks, and an environment."""
+    chunks = {"0_0": (4, 4), "0_1": (2, 1), "1_0": (2, 1), "env": (3, 1)}  # counts, functions
+    for name, (count, bands) in chunks.items():
+        write_sog(folder / "one.sog", some_gaussians(count, bands), notes={"up": "-y"})
+        with zipfile.ZipFile(folder / "one.sog") as archive:
+            archive.extractall(folder / name)
+    (folder / "one.sog").unlink()
+
+    def leaf(**lods: tuple[int, int, int]) -> dict[str, Any]:
+        fields = ("file", "offset", "count")
+        lods_by_level = {k[1:]: dict(zip(fields, run, strict=True)) for k, run in lods.items()}
+        return {"bound": {"min": [0, 0, 0], "max": [1, 1, 1]}, "lods": lods_by_level}
+
+    meta = {
+        "version": 1,
+        "asset": {"generator": "a test"},
+        "count": 8,
+        "counts": [6, 2],
+        "lodLevels": 2,
+        "environment": "env/meta.json",
+        "filenames": ["0_0/meta.json", "0_1/meta.json", "1_0/meta.json"],
+        "tree": {
+            "bound": {"min": [0, 0, 0], "max": [1, 1, 1]},
+            "children": [
+                leaf(_0=(0, 3, 1), _1=(2, 0, 2)),
+                {"children": [leaf(_0=(1, 0, 2)), leaf(_0=(0, 0, 3))]},
+            ],
+        },
+    }
+    (folder / "lod-meta.json").write_text(json.dumps(meta | changes))
+    return folder / "lod-meta.json"
+
+
+def test_a_streamed_scene_is_one_level_of_all_chunks(tmp_path: Path) -> None:
+    path = streamed(tmp_path)
+    assert recognised(tmp_path) == recognised(path) == "gaussians"
+    fine = open_scene(f"{tmp_path}?path=orbit")
+    assert fine.name == tmp_path.name and len(fine.background) == 6
+    assert any("the finest, level 0 of 2 is taken; lod=N" in text for text in fine.problems)
+    assert any("environment, env/meta.json, " in text for text in fine.problems)
+    stored = read_splats(path)
+    chunks = [read_splats(tmp_path / name / "meta.json").gaussians for name in ("0_0", "0_1")]
+    assert torch.equal(stored.gaussians.means, torch.cat([chunk.means for chunk in chunks]))
+    assert torch.equal(stored.gaussians.sh[:4], chunks[0].sh)
+    assert not stored.gaussians.sh[4:, 1:].any() and stored.notes == {"up": "-y"}
+    coarse = open_scene(f"gaussians:{path}?lod=1&path=orbit")
+    assert len(coarse.background) == 2
+    around = open_scene(f"gaussians:{tmp_path}/env/meta.json?path=orbit")
+    assert len(around.background) == 3
+    one = streamed(tmp_path, tree={"lods": {"0": {"file": 0, "offset": 1, "count": 2}}})
+    assert torch.equal(read_splats(one).gaussians.means, chunks[0].means[1:3])
+
+
+def test_streamed_scenes_that_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "f").mkdir()
+    one = {"file": 0, "offset": 0, "count": 4}
+    tree = {"lods": {"0": one}}
+    (tmp_path / "outside.sog").write_bytes(b"")
+    cases = {
+        "version": ({"version": 2}, "version 1 of streamed SOG is read; got 2"),
+        "levels": ({"lodLevels": 0}, "lodLevels"),
+        "no tree": ({"tree": None}, "a node of its tree must be an object; got None"),
+        "neither": ({"tree": {"bound": 1}}, "either children, a list, or lods"),
+        "both": ({"tree": {"children": [tree], "lods": tree["lods"]}}, "either children"),
+        "empty": ({"tree": {"children": []}}, "names no Gaussians of level 0"),
+        "negative": ({"tree": {"lods": {"0": one | {"offset": -1}}}}, "offset"),
+        "no chunk": ({"tree": {"lods": {"0": one | {"file": 9}}}}, "chunk 9 of 3 filenames"),
+        "beyond": ({"tree": {"lods": {"0": one | {"count": 5}}}}, "up to 5 of .*which holds 4"),
+        "a bomb": ({"tree": {"lods": {"0": one | {"count": 10**9}}}}, "announces 1000000000"),
+        "shared": ({"tree": {"children": [tree, tree]}}, "two leaves share Gaussians of"),
+        "twice": (
+            {
+                "filenames": ["0_0/meta.json", "./0_0/meta.json"],
+                "tree": {"children": [tree, {"lods": {"0": one | {"file": 1}}}]},
+            },
+            "names a chunk twice",
+        ),
+        "outside": ({"filenames": ["../outside.sog"], "tree": tree}, "in the same folder or below"),
+        "a URL": ({"filenames": ["http://a/meta.json"], "tree": tree}, "in the same folder"),
+        "another file": ({"filenames": ["lod-meta.json"], "tree": tree}, "in the same folder"),
+        "a link": ({"filenames": ["link.sog"], "tree": tree}, "a link out of its folder"),
+        "absent": ({"filenames": ["2_0/meta.json"], "tree": tree}, "2_0/meta.json, which is not"),
+        "names": ({"filenames": [1] * 1000, "tree": tree}, r"filenames.0: .*; got 1$"),
+    }
+    (tmp_path / "f" / "link.sog").symlink_to(tmp_path / "outside.sog")
+    for name, (changes, message) in cases.items():
+        path = streamed(tmp_path / "f")
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+        with pytest.raises(SceneError, match=message):
+            read_splats(path)
+            pytest.fail(name)
+    path.write_text('{"version": 1, "tree": ' + '{"children": [' * 50_000)
+    with pytest.raises(SceneError, match="nested too deeply"):
+        read_splats(path)
+    with pytest.raises(SceneError, match="no level 2; it has 0, the finest, to 1"):
+        read_splats(streamed(tmp_path / "f"), level=2)

@@ -135,7 +135,7 @@ def test_reads_what_an_independent_writer_wrote(tmp_path: Path, order: str) -> N
 def test_rgb_columns_serve_as_colour(tmp_path: Path) -> None:
     names = [n for n in BASIC if not n.startswith("f_dc")]
     types = [(n, "f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")]
-    table = np.ones(2, dtype=types)
+    table = np.full(2, -1, dtype=types)
     table["red"], table["green"], table["blue"] = 255, 51, 0
     element = plyfile.PlyElement.describe(table, "vertex")
     plyfile.PlyData([element]).write(str(tmp_path / "a.ply"))
@@ -146,7 +146,7 @@ def test_rgb_columns_serve_as_colour(tmp_path: Path) -> None:
 
 def test_double_coordinates_are_recentred_before_float32(tmp_path: Path) -> None:
     """UTM-sized doubles keep their millimetres; float32 alone would keep 0.5 m."""
-    table = np.ones(3, dtype=[(n, "f8" if n in "xyz" else "f4") for n in BASIC])
+    table = np.full(3, -1, dtype=[(n, "f8" if n in "xyz" else "f4") for n in BASIC])
     table["x"] = [500_000.001, 500_000.002, 500_001.003]
     table["y"] = [5_300_000.004, 5_300_002.005, 5_300_003.006]
     table["z"] = [400.0, 400.5, 401.0]
@@ -167,7 +167,7 @@ def test_recentring_origin_ignores_floaters_and_keeps_near_scenes() -> None:
 
 
 def test_unusable_gaussians_are_left_out_and_counted(tmp_path: Path) -> None:
-    rows = np.ones((6, len(BASIC)), np.float32)
+    rows = np.full((6, len(BASIC)), -1, np.float32)
     rows[1, 0] = np.nan
     rows[2, BASIC.index("scale_0")] = 500  # exp overflows
     rows[3, BASIC.index("rot_0") :] = 0
@@ -177,6 +177,24 @@ def test_unusable_gaussians_are_left_out_and_counted(tmp_path: Path) -> None:
         "left out 2 of 6 Gaussians with NaN or infinite values",
         "left out 1 of 6 Gaussians with a zero quaternion",
     ]
+
+
+def test_values_that_look_activated_are_asked_about(tmp_path: Path) -> None:
+    """A Gaussian of opacity 0.25 and scales 0.5, 1 and 2, stored as such."""
+    row = [1, 2, 3, 0, 0, 0, 0.25, 0.5, 1, 2, 1, 0, 0, 0]
+    path = write_rows(tmp_path / "a.ply", BASIC, np.array([row, row]))
+    with pytest.raises(SceneError, match=r"0\.25 to 0\.25 .*\?activated=true .*\?activated=false"):
+        read_splats(path)
+    taken = read_splats(path, activated=True).gaussians
+    assert taken.opacities.tolist() == [0.25] * 2 and taken.scales[0].tolist() == [0.5, 1, 2]
+    decoded = read_splats(path, activated=False).gaussians
+    torch.testing.assert_close(decoded.opacities, torch.tensor([0.25] * 2).sigmoid())
+    torch.testing.assert_close(decoded.scales, taken.scales.exp())
+    write_ply(path, taken)  # logits and logarithms, as trainers store them
+    torch.testing.assert_close(read_splats(path).gaussians.scales, taken.scales)
+    write_splat(tmp_path / "a.splat", taken)
+    with pytest.raises(SceneError, match=r"only a .ply"):
+        read_splats(tmp_path / "a.splat", activated=True)
 
 
 @pytest.mark.parametrize(
@@ -234,14 +252,14 @@ def test_a_lying_count_allocates_nothing(tmp_path: Path, encoding: str) -> None:
 def test_zero_rows_and_surplus_bytes(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="has 0 rows"):
         read_ply(write_rows(tmp_path / "a.ply", BASIC, np.zeros((0, 14))))
-    path = write_rows(tmp_path / "b.ply", BASIC, np.ones((5, 14)), count=3)
+    path = write_rows(tmp_path / "b.ply", BASIC, -np.ones((5, 14)), count=3)
     read = read_ply(path)
     assert len(read.gaussians) == 3
     assert f"{2 * 14 * 4} bytes follow" in read.problems[0]
 
 
 def test_lists_are_refused_only_where_they_matter(tmp_path: Path) -> None:
-    table = np.ones(2, dtype=[(n, "f4") for n in BASIC])
+    table = np.full(2, -1, dtype=[(n, "f4") for n in BASIC])
     faces = np.empty(1, dtype=[("idx", "O")])
     faces["idx"][0] = np.array([0, 1, 1], dtype="i4")
     vertex = plyfile.PlyElement.describe(table, "vertex")
@@ -368,6 +386,11 @@ def test_bad_splat_files(tmp_path: Path) -> None:
     (tmp_path / "a.ksplat").write_bytes(b"\0\1\0\0")
     with pytest.raises(SceneError, match="convert other splat formats"):
         read_splats(tmp_path / "a.ksplat")
+    # .spz files whose first bytes are not gzip's: of version 4, and not packed.
+    for version, message in ((4, "a .spz of version 4; .* version 3"), (2, "not packed by gzip")):
+        (tmp_path / "a.spz").write_bytes(b"NGSP" + version.to_bytes(4, "little") + bytes(100))
+        with pytest.raises(SceneError, match=message):
+            read_splats(tmp_path / "a.spz")
     for read in (read_splats, read_ply):
         with pytest.raises(SceneError, match="no such file"):
             read(tmp_path / "absent.ply")

@@ -119,6 +119,7 @@ def test_refusals(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     write_spz(path, some_gaussians(bands=1))
     whole = path.read_bytes()
+    noise = np.random.default_rng(0).bytes(200_000)
     cases = {
         "cut": (whole[:-200], "not a whole .spz"),
         "no stream": (b"\x1f\x8bnothing", "not a whole .spz"),
@@ -129,6 +130,7 @@ def test_refusals(tmp_path: Path) -> None:
         "extended": (packed(3, bytes(99), flags=2), "vendors' extensions"),
         "none": (packed(3, b"", count=0), "announces 0 Gaussians"),
         "a bomb": (packed(3, bytes(99), count=1 << 31), "announces 2147483648 Gaussians"),
+        "deflated": (packed(3, noise, count=10**7), "10000000 Gaussians of 56 bytes"),
         "short": (packed(3, bytes(99), count=40), "columns end early"),
     }
     for name, (data, message) in cases.items():

@@ -94,6 +94,9 @@ def test_refusals(tmp_path: Path) -> None:
         f'def "c{n}" (instanceable = true; references = </p>) {{}}\n' for n in range(40)
     )
     rows = ", ".join(["(0, 0, 0)"] * 900)
+    prims = "\n".join(
+        f'{SPLATS} "g{n}" {{ point3f[] positions = [(0, 0, 0)]\n}}' for n in range(10_001)
+    )
     many = f'def "p" {{ {SPLATS} "a" {{ point3f[] positions = [{rows}]\n}}\n}}\n'
     cases = (
         ("no splats", 'def Xform "a" {}', "no visible ParticleField3DGaussianSplat"),
@@ -101,13 +104,29 @@ def test_refusals(tmp_path: Path) -> None:
         ("a payload", f'def "a" (payload = @./{other.name}@) {{}}', "refers to"),
         ("a mirror", f'{SPLATS} "a" {{ {ONE} {scale} }}', "mirrors"),
         ("degree", f'{SPLATS} "a" {{ {ONE.replace("Degree = 0", "Degree = 99")} }}', "degree 99"),
+        ("no degree", "uniform int radiance:sphericalHarmonicsDegree = None", "of degree None"),
+        ("text", "string radiance:sphericalHarmonicsDegree = 'x'", "of degree 'x'"),
+        ("pairs", "float2[] scales = [(1, 1)]", "scales must be .* it holds Vec2fArray"),
+        ("words", "string[] opacities = ['a']", "opacities must be .* it holds StringArray"),
+        ("one", "float opacities = 0.5", "opacities must be .* it holds float"),
         ("not USD", "def {", "not a whole OpenUSD file"),
         ("copies", many + copies, "more than 16 times"),
+        ("prims", prims, "more than 10000 prims of Gaussians"),
     )
-    for name, body, message in cases:
+    for name, text, message in cases:
+        is_whole = "def" in text
+        place = "point3f[] positions = [(0, 0, 0)]"
+        body = text if is_whole else f'{SPLATS} "a" {{ {place}\n{text}\n}}'
         with pytest.raises(SceneError, match=message):
             read_splats(saved(tmp_path, body))
             pytest.fail(name)
+    nested = [f'def "a{n}" {{' for n in range(20_000)]
+    point = 'def ParticleField3DGaussianSplat "G" { point3f[] positions = [(0, 0, 0)]\n}'
+    with pytest.raises(SceneError, match="OpenUSD's reader ended with SIGSEGV"):
+        read_usd(saved(tmp_path, "\n".join([*nested, point, "}\n" * len(nested)])))
+    other.write_bytes(other.read_bytes().replace(b"float[]", b"fl\xfft[]"))
+    with pytest.raises(SceneError, match="not UTF-8"):
+        read_usd(other)
     path = tmp_path / "a.usdc"
     write_usd(path, some_gaussians(), is_upright=True, is_metric=True)
     path.write_bytes(path.read_bytes()[:-5000])

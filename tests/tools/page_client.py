@@ -22,8 +22,8 @@ Found = TypeVar("Found")
 
 class PageClient:
     """widgets: as the server made and changed them, by FOLDER/LABEL, in order. pictures: the time
-    of each, and its message. nodes: what lies over the picture. pose: of the window, which goes
-    where the server puts it.
+    of each, and its message. said: all that the page's lines have said, in order. nodes: what lies
+    over the picture. theme: of the page. pose: of the window, which goes where the server puts it.
     """
 
     def __init__(
@@ -35,6 +35,8 @@ class PageClient:
         self._socket = connect(address, origin=origin, subprotocols=[protocol], **own)
         self.size, self.widgets, self.pictures = size, dict[str, list[dict[str, Any]]](), []
         self.nodes: set[str] = set()
+        self.theme: dict[str, Any] = {}
+        self.said: list[str] = []
         self.pose: dict[str, Any] = {
             "position": [0.0, -5.0, 2.0], "look_at": [0.0, 0.0, 0.0],
             "up_direction": [0.0, 0.0, 1.0], "fov": 1.0,
@@ -72,9 +74,7 @@ class PageClient:
         """Moves one of the widgets of that label: the last, or 0 for the first."""
         widget = self.wait_for(lambda: self.widgets.get(path), path)[number]
         widget["value"] = value
-        self._send(
-            {"type": "GuiUpdateMessage", "uuid": widget["uuid"], "updates": {"value": value}}
-        )
+        self.send({"type": "GuiUpdateMessage", "uuid": widget["uuid"], "updates": {"value": value}})
 
     def press(self, path: str) -> None:
         self.set(path, True)
@@ -83,8 +83,8 @@ class PageClient:
         widget = self.wait_for(lambda: self.widgets.get(path), path)[-1]
         own = {"source_component_uuid": widget["uuid"], "transfer_uuid": name}
         said = {"filename": name, "mime_type": "", "part_count": 1, "size_bytes": len(content)}
-        self._send({"type": "FileTransferStartUpload", **own, **said})
-        self._send({"type": "FileTransferPart", **own, "part_index": 0, "content": content})
+        self.send({"type": "FileTransferStartUpload", **own, **said})
+        self.send({"type": "FileTransferPart", **own, "part_index": 0, "content": content})
 
     def move(self, **pose: Any) -> None:
         self.pose |= pose
@@ -101,7 +101,7 @@ class PageClient:
         width, height = self.size
         sizes = {"image_width": width, "image_height": height, "near": 0.01, "far": 1000.0}
         own = {name: np.asarray(value).tolist() for name, value in self.pose.items()}
-        self._send({"type": "ViewerCameraMessage", "wxyz": wxyz.tolist(), **own, **sizes})
+        self.send({"type": "ViewerCameraMessage", "wxyz": wxyz.tolist(), **own, **sizes})
 
     # ---- What the person sees
 
@@ -142,7 +142,7 @@ class PageClient:
 
     # ---- The protocol
 
-    def _send(self, message: dict[str, Any]) -> None:
+    def send(self, message: dict[str, Any]) -> None:
         self._socket.send(msgspec.msgpack.encode(message))
 
     def _listen(self) -> None:
@@ -172,6 +172,7 @@ class PageClient:
             own |= message["updates"]
             if "content" in message["updates"]:
                 self._html[message["uuid"]] = message["updates"]["content"]
+                self.said.append(message["updates"]["content"])
         elif kind.startswith("Gui") and "props" in message:
             own = {**message["props"], "uuid": message["uuid"], "value": message.get("value")}
             self._by_uuid[message["uuid"]] = own
@@ -180,6 +181,8 @@ class PageClient:
             self.widgets.setdefault(path, []).append(own)
             if kind == "GuiFolderMessage":
                 self._folders[message["uuid"]] = f"{path}/" if own["label"] else above
+        elif kind == "ThemeConfigurationMessage":
+            self.theme = message
         elif kind == "RemoveSceneNodeMessage":
             self.nodes.discard(message["name"])
         elif kind in ("LineSegmentsMessage", "PointCloudMessage", "CameraFrustumMessage"):

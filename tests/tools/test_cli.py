@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 import pytest
 import torch
@@ -32,7 +31,6 @@ from tests.snow_scenes import box_car, drive, sheet
 from tools import explain
 from tools.cli import ExportOptions, GenerateOptions, main
 from tools.explain import explain_recipe, explanation_text, measure_passes
-from tools.output import compiling_noted
 from tools.render import ended_by_sigterm, generate_dataset
 
 FOG = """
@@ -222,6 +220,12 @@ def test_mistakes_exit_with_2_and_one_message(scene_uri, tmp_path, capsys):
         (["export", scene_uri, *out, "--frame", "4"], "--frame is for ply, splat"),
         (["export", scene_uri, *out, "--kind", "ply", "--half"], "--half is for a single scene"),
         (["sheet", out[1]], "manifest.parquet does not exist"),
+        ([*here, "--set", "\udcff=1"], "argument 8 is not UTF-8 text: '\\udcff=1'"),
+        (["render", "\udcff.yaml", "--scene", scene_uri, *out], "argument 2 is not UTF-8"),
+        (["render", "clear", "--scene", "scene:\udcff", *out], "argument 4 is not UTF-8"),
+        ([*here[:-1], "\udcff"], "argument 6 is not UTF-8 text"),
+        ([*here, "--set", "output.depth=false"], "one of median, expected, mode, none; write none"),
+        ([*here, "--set", "weather.smog=false"], "write null to leave it out"),
         (["inspect", scene_uri, "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts"),
         (["style", "presets", "dawn-mits"], "dawn-mist"),
         (["style", "train", *out], "there is nothing to learn from"),
@@ -327,19 +331,35 @@ def test_labels_for_trainers_are_explained(scene, monkeypatch, tmp_path):
     assert facts["labels"] is None and "for trainers" not in page
 
 
-def test_compiling_is_said_before_it_is_done(capsys):
-    @numba.njit
-    def doubled(x):
-        return 2 * x
+def test_compiling_is_said_before_it_is_done_wherever_it_is():
+    """In a process of its own: what is said depends on what was compiled before."""
+    code = """
+import numba, sys
+from tools.cli import main
+import tools.cli
+import augment.render.cpu.jit
+from tools.output import compiling_noted
 
-    for said in (
-        ["compiling kernels (once; kept for the next run) ...", "kernels compiled after"],
-        [],
-    ):
-        with compiling_noted():
-            doubled(2)
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == len(said) and all(map(str.startswith, lines, said))
+@numba.njit
+def doubled(x):
+    return 2 * x
+
+def command():
+    doubled(2)
+    with compiling_noted():
+        doubled(2.0)
+    with compiling_noted():
+        doubled(2.0)
+
+tools.cli.COMMANDS["presets"] = command
+sys.exit(main(["presets"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    lines = done.stderr.splitlines()
+    assert done.returncode == 0, done.stderr
+    assert lines[0].startswith("compiling kernels (once; kept in ")
+    assert lines[0].endswith("climategs/kernels) ...")
+    assert len(lines) == 2 and lines[1].startswith("kernels compiled after")
 
 
 def test_settings_are_those_of_the_quality(monkeypatch, tmp_path, scene):

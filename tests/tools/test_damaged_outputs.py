@@ -18,6 +18,7 @@ import pytest
 from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError
 from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.store import open_store
 from augment.jobs.tables import METADATA_KEY
 from recipes.flood import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
@@ -25,6 +26,7 @@ from tools.cli import EvaluateOptions
 from tools.drawing import draw_sheet
 from tools.evaluate import evaluate_output
 from tools.report import write_report
+from tools.view.outputs import OutputViewer
 
 TYPES = [pa.int32(), pa.float64(), pa.string(), pa.binary(), pa.bool_(), pa.null(),
          pa.list_(pa.int64()), pa.struct([("a", pa.int64())]), pa.timestamp("ns"),
@@ -56,11 +58,18 @@ def evaluated(out: Path) -> None:
     evaluate_output(EvaluateOptions(out=str(out), long=2, pairs=1), progress=False)
 
 
+def looked_through(out: Path) -> None:
+    viewer = OutputViewer(open_store(str(out)))
+    for row in viewer.rows:
+        viewer.picture(row, "image")
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "sheet": draw_sheet,
     "report": lambda out: write_report(out, images=2),
     "evaluate": evaluated,
     "dataset": samples,
+    "viewer": looked_through,
 }
 
 

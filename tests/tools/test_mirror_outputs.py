@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,8 +14,10 @@ import pytest
 
 from adapters import detect_format as source_trees
 from augment.effects.lidar import drop_lost
+from augment.effects.lidar.sweep import weathered_sweep
 from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.jobs.manifest import read_manifest
+from augment.jobs.mirror_sweeps import frames_of_span
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import read_lidar
 from augment.labels import LidarSweep
@@ -23,7 +27,7 @@ from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recip
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
 from tools.cli import RenderOptions
-from tools.export import mirror_again, mirror_outputs, recipes_for_source
+from tools.export import clear_notes, mirror_again, mirror_outputs, recipes_for_source
 
 CAMERAS = {"front": "front", "rear/left": "left"}
 FRAMES = 4
@@ -209,6 +213,37 @@ def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
     assert not changed(root, copy) & LIDAR_FILES and contents(root) == before
 
 
+class Relabelled(Sweeps):
+    """Sweeps in files whose further contents are the source's."""
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return file.read_bytes() + super().lidar_content(frame_index, file, sweep)
+
+
+def test_new_labels_of_the_source_come_into_weathered_sweeps(root, tmp_path, bin_sweeps):
+    """Of the same size and time too; other changes of the file's facts are none of its labels."""
+    one, two = with_sweeps(root, "one", (0, 1)), with_sweeps(root, "two", (2,))
+    one, two = (dataclasses.replace(each, labels=Relabelled(root=root)) for each in (one, two))
+    out, copy = tmp_path / "out", tmp_path / "out/source/wet-000/002"
+    for scene in (one, two):
+        render(scene, out, make_recipe("wet", **WET))
+        mirror_outputs(scene, out, progress=False)
+    label = root / "lidar/00.bin"
+    time_ns = label.stat().st_mtime_ns
+    label.chmod(0o600)
+    assert "(up to date)" in mirror_outputs(two, out, progress=False)[0]
+    label.write_bytes(b"reviewed")
+    os.utime(label, ns=(time_ns, time_ns))
+    said = mirror_outputs(two, out, progress=False)  # knows nothing of the other's labels
+    assert "1 files of LiDAR of other scenes are out of date" in "\n".join(said)
+    assert "(1 files put in place)" in mirror_outputs(one, out, progress=False)[0]
+    assert (copy / "lidar/00.bin").read_bytes().startswith(b"reviewed")
+    assert (copy / "lidar/01.bin").read_bytes().startswith(b"recorded")
+    with pytest.raises(OutputError, match=r"1 file is not what was put .*lidar/01\.bin"):
+        (copy / "lidar/01.bin").write_bytes(b"edited")
+        mirror_outputs(one, out, progress=False)
+
+
 def test_scenes_of_one_dataset_keep_each_others_sweeps(root, tmp_path, bin_sweeps):
     one, two = with_sweeps(root, "one", (0, 1)), with_sweeps(root, "two", (2,))
     out, copy = tmp_path / "out", tmp_path / "out/source/wet-000/002"
@@ -224,6 +259,105 @@ def test_scenes_of_one_dataset_keep_each_others_sweeps(root, tmp_path, bin_sweep
     assert "4 files of LiDAR of other scenes are out of date" in "\n".join(said)
     said = mirror_outputs(one, out, progress=False)
     assert lidar_line(said).startswith("3 of 3") and "out of date" not in "\n".join(said)
+
+
+def with_gap(scene: Scene, number: int) -> Scene:
+    """The scene without images of one frame."""
+    frames = [
+        dataclasses.replace(frame, cameras={}, image_paths={}) if frame.index == number else frame
+        for frame in scene.frames
+    ]
+    return dataclasses.replace(scene, frames=tuple(frames))
+
+
+def test_sweeps_between_images_have_the_weather_too(root, tmp_path, bin_sweeps):
+    """A LiDAR turns more often than cameras look; clouds of several sweeps show one weather."""
+    one = with_gap(with_sweeps(root, "one", (0, 1)), 1)
+    two = with_sweeps(root, "two", (2,))
+    out, copy = tmp_path / "out", tmp_path / "out/source/wet-000/002"
+    wet = make_recipe("wet", **WET)
+    render(one, out, wet)
+    assert lidar_line(mirror_outputs(one, out, progress=False)).startswith("2 of 3 LiDAR sweeps")
+    expected = drop_lost(weathered_sweep(one, wet, 1, one.lidar(1)))
+    assert (copy / "lidar/01.bin").read_bytes() == expected.points_m.tobytes()
+    before = contents(copy)
+    assert "(up to date)" in mirror_outputs(one, out, progress=False)[0]
+    # Another scene's run keeps it, though the manifest has no image with that sweep.
+    render(two, out, wet)
+    said = mirror_outputs(two, out, progress=False)
+    assert lidar_line(said) == "3 of 3 LiDAR sweeps are weathered, lost returns left out"
+    assert (copy / "lidar/01.bin").read_bytes() == before["lidar/01.bin"]
+    damaged = out / "one/wet-000/lidar/000001.parquet"
+    damaged.write_bytes(b"half")
+    mirror_outputs(one, out, progress=False)
+    assert (copy / "lidar/01.bin").read_bytes() == before["lidar/01.bin"]
+
+
+@pytest.mark.parametrize(
+    ("rendered", "span"),
+    [
+        ((1, 3, 5), (0, 1, 2, 3, 4, 5, 6)),
+        ((1, 3), (0, 1, 2, 3)),
+        ((3,), (3,)),
+        ((1, 5), (0, 1, 5, 6)),
+        ((), ()),
+    ],
+)
+def test_the_span_has_the_frames_between_rendered_ones(rendered, span):
+    scene = open_fake("fake:street")
+    pictured, empty = scene.frames[0], dataclasses.replace(scene.frames[0], cameras={})
+    frames = [dataclasses.replace(pictured if n % 2 else empty, index=n) for n in range(7)]
+    assert tuple(frames_of_span(frames, rendered, pictured.cameras)) == span
+
+
+def test_what_will_stay_clear_is_said_before(root, bin_sweeps):
+    scene = with_gap(with_sweeps(root, "one", (0, 1, 2)), 1)
+    assert clear_notes(scene, of_sweeps=True) == [
+        "4 of 8 camera images will stay clear in the dataset's copy: 4 that no frame of scene "
+        "'one' has (taken outside its frames, or of other scenes)"
+    ]
+    assert clear_notes(scene, {0, 1}, ["front"], of_sweeps=True) == [
+        "7 of 8 camera images will stay clear in the dataset's copy: 3 of frames or cameras that "
+        "are not rendered, 4 that no frame of scene 'one' has (taken outside its frames, or of "
+        "other scenes)",
+        "2 of 3 LiDAR sweeps will stay clear in the dataset's copy: 2 of frames or cameras that "
+        "are not rendered",
+    ]
+    unlike = dataclasses.replace(scene, labels=FakeLabels())
+    assert clear_notes(unlike, of_sweeps=True)[1].startswith("no LiDAR sweep has a file of its own")
+    whole = with_sweeps(root, frames=(0, 1, 2, 3))
+    assert clear_notes(whole, of_sweeps=True) == []
+
+
+def test_a_deleted_variant_does_not_stop_the_others(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    for name in ("fog", "haze"):
+        render(scene, out, recipe_of(name, image="jpg"), frames=[0])
+    mirror_outputs(scene, out, progress=False)
+    shutil.rmtree(out / "street/fog-000")
+    said = mirror_outputs(scene, out, progress=False)
+    assert f"{out / 'street/fog-000'} was deleted" in said[0] and "render it again" in said[0]
+    assert "haze-000/002 (up to date)" in said[1]
+    for variants in (None, ["fog-000", "haze-000"]):
+        if variants is None:
+            shutil.rmtree(out / "street/haze-000")
+        with pytest.raises(OutputError, match=r"fog-000.* was deleted, .*; render it again"):
+            mirror_outputs(scene, out, variants=variants or ["fog-000"], progress=False)
+    with pytest.raises(OutputError, match=r"recipe\.yaml was deleted"):
+        mirror_outputs(scene, out, progress=False)
+
+
+def test_images_of_a_deleted_scene_give_way_to_recorded_ones(root, tmp_path):
+    one, two = scene_of(root, "one", (0,)), scene_of(root, "two", (1,))
+    out = tmp_path / "out"
+    for scene in (one, two):
+        render(scene, out)
+        mirror_outputs(scene, out, progress=False)
+    shutil.rmtree(out / "one")
+    said = mirror_outputs(two, out, progress=False)
+    assert "2 images of other scenes, such as camera/front/00.jpg, are no longer in" in said[-1]
+    place = "source/fog-000/002/camera/front/00.jpg"
+    assert (out / place).samefile(root / "camera/front/00.jpg")
 
 
 def test_sweeps_that_the_dataset_has_no_files_for_are_told(root, tmp_path):

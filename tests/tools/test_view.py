@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import shlex
+import struct
 import subprocess
 import sys
 import threading
@@ -14,31 +16,46 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from page_client import PageClient
+from report_outputs import make_row, write_output
 from streets import LABELLED_STREET, SMALL_STREET, open_street
+from websockets.exceptions import InvalidStatus
 
 from augment import effects
 from augment.cameras import Camera
-from augment.errors import ClimateGSError
+from augment.errors import ClimateGSError, OutputError
 from augment.geometry import invert_rigid
+from augment.jobs.manifest import rows_to_table, write_manifest
+from augment.jobs.store import open_store
+from augment.timing import PassProgress, counted
 from augment.views import render_view
 from recipes.errors import RecipeError
 from recipes.fields import found
-from recipes.load import load_recipe
+from recipes.load import load_recipe, preset_names
 from recipes.recipe_file import recipe_file
 from recipes.schema import SECTIONS
 from tests.augment.dust import DustEffect
 from tools.cli import main
-from tools.view.controls import effect_groups, group_of
+from tools.view.controls import (
+    MAX_HINT,
+    USEFUL_ENDS,
+    Control,
+    effect_groups,
+    group_of,
+    split_by_rank,
+)
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
 from tools.view.outputs import OutputViewer, find_output
-from tools.view.pictures import free_camera, place_in_window
+from tools.view.page import Wish
+from tools.view.pictures import away_sentence, free_camera, place_in_window
 from tools.view.server import Viewer, import_viser, serve
+from tools.view.status import Activity, ShownPicture, page_status
 
 SCALE = 0.2
 
@@ -84,8 +101,8 @@ def test_every_field_of_every_effect_has_a_control_whose_ends_its_model_takes(du
     half = paths["weather.dust.half_m"]
     assert (half.way, half.high, half.hint.split()[-1]) == ("log", 1e6, "[metres]")
     assert paths["weather.dust.distance"].words == ("depth", "ray")
-    assert paths["weather.flood.level_m"].value_at(0.5) == 0
-    assert paths["weather.smog.scatter"].step == 0.01
+    assert paths["weather.flood.level_m"].value_at(0.5) == 1
+    assert paths["weather.smog.overcast"].step == 0.005
 
 
 def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
@@ -93,6 +110,110 @@ def test_an_effect_that_is_switched_on_starts_from_values_its_model_takes(dust):
         edits = Edits("clear").with_section(section)
         assert found(edits.recipe(), section).changes, start_of_section(section)
         assert found(edits.without_section(section).recipe(), section) is None
+
+
+def sliders() -> list[Control]:
+    groups = (*effect_groups(), group_of("camera"), group_of("render"))
+    return [c for group in groups for c in group.walk() if c.kind == "slider"]
+
+
+def test_sliders_reach_what_presets_draw_and_boxes_all_that_a_recipe_takes():
+    recipes = [load_recipe(name).resolve(variant) for name in preset_names() for variant in (0, 1)]
+    leaves = {leaf.path: leaf for s in recipe_file().walk() for leaf in s.LEAVES.values()}
+    for control in sliders():
+        section = control.path.rpartition(".")[0]
+        for recipe in recipes:
+            value = found(recipe, control.path) if found(recipe, section) is not None else None
+            if value is not None and value != control.default:
+                assert control.low <= value <= control.high, control.path
+        least, most = control.valid
+        assert least <= control.low < control.high <= most
+        for value in control.valid:  # the ends of the box
+            assert leaves[control.path].accepts(int(value) if control.whole else value)
+        if control.way == "both sides":
+            assert control.high - control.low <= 200, control.path
+        elif control.way == "log" and control.path in USEFUL_ENDS:
+            assert control.high <= 1e4 * control.least, control.path  # four decades
+    ends = {control.path: (control.low, control.high) for control in sliders()}
+    assert ends["weather.smog.base_height_m"] == (-50, 50)  # of -10,000 to 10,000
+    assert ends["weather.flood.level_m"] == (-1, 3)
+    assert ends["weather.rain.wind_from_deg"] == (0, 360)
+    assert ends["weather.snow.depth_m"] == (0, 1)
+    boxes = {control.path: control.valid for control in sliders()}
+    assert boxes["weather.flood.level_m"] == (-10_000, 10_000)
+
+
+def test_ten_fields_come_first_and_tooltips_are_short():
+    main, others = split_by_rank(effect_groups())
+    first = [control.path for group in main for control in group.main]
+    assert len(first) == 10 and "weather.smog.visibility_m" in first
+    for group in main:
+        paths = {control.path for control in (*group.main, *group.rest.walk())}
+        assert paths == {control.path for control in group.walk()}  # none is lost
+    assert {group.path for group in (*main, *others)} == set(SECTIONS)
+    for group in (*main, *others):
+        tooltips = [group.tooltip, *(control.tooltip for control in group.walk())]
+        assert max(map(len, tooltips)) <= MAX_HINT + len(" [nephelometric turbidity units]")
+
+
+# ---- What a page says ----------------------------------------------------------------------------
+
+
+def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
+    wish = Wish(Edits("clear"), 0, "front")
+    at_rest = ShownPicture(wish, 320, 180, 0.03, at=1.0, is_rest=True)
+    placing = Activity(PassProgress("placing snow", 12, 21))
+
+    def said(shown: ShownPicture | None, wish: Wish, activity: Activity | None, **own: Any) -> str:
+        return page_status(shown, wish, activity, **{"waited_s": 0.0, "now": 1.1, **own}).text
+
+    assert said(at_rest, wish, Activity()) == "320 x 180 at rest, 30 ms"
+    snowy = dataclasses.replace(wish, edits=Edits("fresh-snow"))
+    assert said(at_rest, snowy, Activity()) == "Picture not of this recipe yet: drawing"
+    assert said(at_rest, snowy, placing, waited_s=4.2) == (
+        "Picture not of this recipe yet: placing snow, step 12 of 21, 4 s"
+    )
+    assert said(at_rest, snowy, Activity(compiling=1, compiled=3)) == (
+        "Picture not of this recipe yet: compiling kernels (only the first time, 3 done)"
+    )
+    assert "waiting for the picture of another page" in said(at_rest, snowy, None)
+    assert "not of this view yet" in said(at_rest, dataclasses.replace(wish, frame=1), Activity())
+    assert "not up to date yet" in said(at_rest, dataclasses.replace(wish, boxes=True), Activity())
+    assert said(None, wish, Activity()) == "First picture: drawing"
+    rough = dataclasses.replace(at_rest, is_rest=False)
+    assert said(rough, wish, Activity()) == "320 x 180 while moving, 30 ms"
+    assert said(rough, wish, Activity(PassProgress("sky")), now=2.0) == (
+        "Rough picture, the whole one follows: drawing (sky)"
+    )
+    bare = dataclasses.replace(at_rest, is_complete=False)
+    assert said(bare, wish, Activity(PassProgress("LiDAR returns"))) == (
+        "Picture, what lies over it follows: drawing (LiDAR returns)"
+    )
+    refused = dataclasses.replace(at_rest, is_valid=False)
+    assert "of the last recipe that was valid" in said(refused, wish, Activity())
+    assert said(at_rest, wish, Activity(), has_failed=True) == "Not drawn"
+    status = page_status(at_rest, snowy, placing, waited_s=4.2, now=9.0)
+    assert status.share == pytest.approx(12 / 21) and status.is_long and not status.is_current
+
+
+def test_a_camera_away_from_all_recorded_images_is_told():
+    scene = open_street()
+    own = scene.frames[0].cameras["front"]
+    assert away_sentence(scene, own) is None
+    pose = own.world_from_camera
+    for forward_m, up_m, turn_rad, said in (
+        (1.0, 0.0, 0.0, None), (0.0, 1.9, 0.0, None), (0.0, 0.0, 0.2, None),
+        (0.0, 6.0, 0.0, "6.0 m and 0 degrees"), (0.0, 0.0, 0.5, "0.0 m and 29 degrees"),
+    ):  # fmt: skip
+        tilt = torch.eye(4, dtype=torch.float64)
+        tilt[1:3, 1:3] = torch.tensor(
+            [[math.cos(turn_rad), -math.sin(turn_rad)], [math.sin(turn_rad), math.cos(turn_rad)]]
+        )
+        tilt[1, 3], tilt[2, 3] = -up_m, forward_m
+        camera = dataclasses.replace(own, camera_from_world=invert_rigid(pose @ tilt))
+        sentence = away_sentence(scene, camera)
+        assert (sentence is None) == (said is None), (forward_m, up_m, turn_rad, sentence)
+        assert said is None or f"Outside of what was recorded: {said}" in str(sentence)
 
 
 # ---- Edits ---------------------------------------------------------------------------------------
@@ -203,7 +324,7 @@ def test_the_picture_at_rest_is_the_one_that_render_writes(tmp_path):
         page.rest(after=0)
         count = len(page.pictures)
         page.set("preset", "dense-fog")
-        page.set("smog/visibility_m", 40.0, 1)
+        page.set("visibility_m", 40.0)
         shown = page.rest(after=count)
         recipe = dataclasses.replace(edits, source="dense-fog").with_values(
             {"weather.smog.visibility_m": "40.0"}
@@ -244,13 +365,13 @@ def test_pages_are_apart_errors_stay_on_their_page_and_closed_ones_are_forgotten
         with PageClient(url, (320, 180)) as two:
             clear, count = two.rest(after=0), len(one.pictures)
             one.rest(after=0)
-            one.set("dust/on", True)
-            one.set("dust/half_m", 5.0, 0)
+            one.set("more effects/dust/on", True)
+            one.set("more effects/dust/half_m", 5.0)
             dusty = one.rest(after=count)
             assert np.abs(dusty.astype(int) - clear).mean() > 10
-            assert two.widgets["dust/on"][0]["value"] is False
-            one.set("flood/on", True)
-            one.set("flood/waves/components", "[{")
+            assert two.widgets["more effects/dust/on"][0]["value"] is False
+            one.set("flood", True)
+            one.set("more of flood/waves/components", "[{")
             one.wait_for(lambda: "flood.waves.components" in one.status(), "the refusal")
             one.set("render/base", "recorded")  # the street has no photos
             one.press("Undo all changes")
@@ -300,6 +421,73 @@ def test_a_picture_at_rest_is_given_up_once_something_else_is_asked_for(tmp_path
     assert kinds.count("png") == 1 and kinds[-1] == "png"  # the dusty one is not among them
 
 
+class SettlingDust(DustEffect):
+    """Dust that takes steps to settle, in each of which it waits to be told to go on."""
+
+    def __init__(self) -> None:
+        self.steps, self.begun, self.ended = threading.Semaphore(0), 0, 0
+
+    def edit_scene(self, own, layers, camera):
+        self.begun += 1
+        with counted("settling dust", 2) as advance:
+            for _ in range(2):
+                assert self.steps.acquire(timeout=60)
+                advance()
+        self.ended += 1
+        return super().edit_scene(own, layers, camera)
+
+
+@pytest.mark.long
+def test_a_preparation_is_told_step_by_step_and_given_up_once_nobody_wants_its_effect(tmp_path):
+    edits = Edits("clear", SCALE, folder=tmp_path)
+    with served(edits) as (viewer, url), PageClient(url, (320, 180)) as page:
+        clear = page.rest(after=0)
+        dust = SettlingDust()
+        effects.add_effect(dust)
+        try:
+            (open_page,) = viewer.pages
+            said, pictures = len(page.said), len(page.pictures)
+
+            def wait_for_words(words: str) -> None:
+                page.wait_for(lambda: any(words in text for text in page.said[said:]), words)
+
+            open_page.edit(edits.with_section("weather.dust"))
+            wait_for_words("Picture not of this recipe yet")
+            wait_for_words("settling dust, step 0 of 2")
+            dust.steps.release()
+            wait_for_words("settling dust, step 1 of 2")
+            assert "at rest" not in "".join(page.said[said:])
+            assert len(page.pictures) == pictures
+            # Another amount of dust has to settle, too; without dust nobody needs it.
+            thick = edits.with_section("weather.dust").with_values({"weather.dust.half_m": "5"})
+            open_page.edit(thick)
+            dust.steps.release(5)
+            page.rest(after=pictures)
+            wait_for_words("at rest")
+            assert dust.begun == dust.ended == 3  # the first, and both pictures of the second
+            open_page.edit(edits.with_section("weather.dust"))
+            page.wait_for(lambda: dust.begun == 4, "the dust to settle again")
+            said, pictures = len(page.said), len(page.pictures)
+            open_page.edit(edits)
+            dust.steps.release()
+            assert np.array_equal(page.rest(after=pictures), clear)
+            assert dust.ended == 3
+        finally:
+            dust.steps.release(100)
+            effects.remove_effect("dust")
+
+
+@pytest.mark.long
+def test_a_flight_out_of_what_was_recorded_is_told_until_it_ends(tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (_, url), PageClient(url) as page:
+        page.rest(after=0)
+        assert "Outside of what was recorded" not in page.status()
+        page.move(position=[2.0, 0.5, 9.0], look_at=[12.0, 0.0, 1.0])
+        page.wait_for(lambda: "Outside of what was recorded" in page.status(), "the warning")
+        page.press("Back to the camera")
+        page.wait_for(lambda: "Outside of what was recorded" not in page.status(), "its end")
+
+
 @pytest.mark.long
 def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
     edits = Edits("fresh-snow", folder=tmp_path)
@@ -333,7 +521,7 @@ def test_what_lies_over_the_picture_and_in_place_of_it(tmp_path):
         page.wait_for(lambda: page.widgets["frame"][0]["value"] == 1, "the next frame")
         page.press("Measure the tiers on this view")
         page.wait_for(
-            lambda: any("| reference |" in str(w) for ws in page.widgets.values() for w in ws),
+            lambda: any("<td>reference</td>" in str(w) for ws in page.widgets.values() for w in ws),
             "the tiers",
         )
 
@@ -345,8 +533,8 @@ def test_a_photo_and_a_recipe_are_uploaded_and_saved(tmp_path):
     edits = Edits("clear", SCALE, folder=tmp_path / "views")
     with served(edits) as (_, url), PageClient(url) as page:
         clear, count = page.rest(after=0), len(page.pictures)
-        page.set("style/on", True)
-        page.upload("style/upload image", "../../warm photo.png", photo)
+        page.set("style (light)", True)
+        page.upload("more of style/upload image", "../../warm photo.png", photo)
         warm = page.rest(after=count)
         assert np.abs(warm.astype(int) - clear).mean() > 2
         assert "save the recipe first" in page.status()
@@ -368,9 +556,8 @@ def test_a_photo_and_a_recipe_are_uploaded_and_saved(tmp_path):
 def test_a_page_that_takes_nothing_holds_up_no_other_and_other_sites_get_none(tmp_path):
     with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url), PageClient(url) as page:
         page.rest(after=0)
-        with PageClient(url, origin="http://elsewhere.example") as other:
-            other.wait_for(lambda: not other.is_listening, "the server to hang up")
-            assert not other.widgets
+        with pytest.raises(InvalidStatus, match="403"):
+            PageClient(url, origin="http://elsewhere.example")
         assert len(viewer.pages) == 1
         deaf = PageClient(url)
         deaf.wait_for(lambda: len(deaf.pictures), "a picture")
@@ -415,6 +602,63 @@ def test_an_output_is_looked_through_by_its_numbers(tmp_path):
         count = len(page.pictures)
         page.set("shows", "depth")
         assert page.rest(after=count).std() > 10
+
+
+HOSTILE = "{(globalThis.PWNED = 1)} <img src=x onerror=globalThis.PWNED=1> | ` &lt; \u202e \x00"
+
+
+def hostile_output(out: Path) -> Path:
+    """An output whose manifest has code in every text that it may have, and numbers without end."""
+    texts = ("source", "base", "surface", "lidar_note", "style", "quality", "settings", "recipe",
+             "trajectory", "version", "backend", "message")  # fmt: skip
+    own = dict.fromkeys(texts, HOSTILE)
+    rows = [make_row(frame=0), make_row(frame=1, smog_extinction_per_m=0.5)]
+    write_output(out, rows)
+    numbers = {"flood_level_m": 1e308, "snow_depth_m": 5e-324}
+    rows[1] |= {name: -value for name, value in numbers.items()}
+    rows = [row | own | {"scene": HOSTILE, "variant": name, "camera": ""} | numbers
+            for row, name in zip(rows, ("(none)", HOSTILE), strict=True)]  # fmt: skip
+    write_manifest(out, rows_to_table(rows))
+    return out
+
+
+def test_what_a_manifest_says_is_shown_letter_for_letter(tmp_path):
+    output = find_output(str(hostile_output(tmp_path / "out")))
+    assert output is not None
+    viewer = OutputViewer(output)
+    assert viewer.numbers == ["smog_extinction_per_m"]
+    with serve(import_viser(), viewer, "127.0.0.1", 0) as url, PageClient(url) as page:
+        page.wait_for(lambda: page.pictures, "a picture")
+        page.set("left of the line", page.widgets["left of the line"][0]["options"][1])
+        page.set("variant", page.widgets["variant"][0]["options"][1])
+        page.set("frame", 1)
+        page.wait_for(lambda: "2 images" in page.status(), "the picture")
+        widgets = [widget for same in page.widgets.values() for widget in same]
+        assert not any("_markdown" in widget for widget in widgets)
+        shown = page.status() + "".join(widget.get("content") or "" for widget in widgets)
+    assert "<img" not in shown and "&lt;img src=x onerror" in shown
+    assert "\u202e" not in shown and "\\u202e" in shown
+
+
+def test_files_of_an_output_that_are_none_are_said_and_not_waited_for(tmp_path):
+    rows = [make_row(frame=number) for number in range(4)]
+    write_output(tmp_path, rows)
+    pipe, loop, large, wrong = (tmp_path / row["image_path"] for row in rows)
+    for path in (pipe, loop):
+        path.unlink()
+    os.mkfifo(pipe)
+    loop.symlink_to(loop.name)
+    data = bytearray(large.read_bytes())
+    data[16:24] = struct.pack(">II", 2**20, 2**20)
+    large.write_bytes(data)
+    wrong.write_bytes(b"no image")
+    viewer = OutputViewer(open_store(str(tmp_path)))
+    said = []
+    for row in viewer.rows:
+        with pytest.raises(OutputError, match="cannot read") as raised:
+            viewer.picture(row, "image")
+        said.append(str(raised.value))
+    assert "a pipe" in said[0] and "1048576 x 1048576 pixels" in said[2]
 
 
 # ---- The command ---------------------------------------------------------------------------------

@@ -13,15 +13,19 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 import pytest
 from streets import SMALL_STREET
-from test_view import SCALE, rendered, served
+from test_view import SCALE, hostile_output, rendered, served
 
+from augment.jobs.store import open_store
 from augment.views import render_view
 from tools.view.edits import Edits
+from tools.view.outputs import OutputViewer
+from tools.view.server import import_viser, serve
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
@@ -83,11 +87,11 @@ def test_a_browser_shows_render_views_bytes_and_saves_what_render_repeats(browse
         page = opened(browser, url)
         camera = viewer.scene.frames[0].cameras["front"]
         assert within(image_of(page), render_view(viewer.scene, camera, edits.recipe()).rgb)
-        page.get_by_text("smog", exact=True).click()
-        number = page.get_by_label("visibility_m").nth(1)
+        number = page.get_by_role("textbox", name="visibility_m", exact=True)
         number.fill("30")
         number.press("Enter")
-        page.get_by_role("slider").nth(2).press("ArrowRight")  # scatter, at the folder's end
+        page.get_by_text("more of smog").click()
+        page.get_by_role("slider").nth(1).press("ArrowRight")  # overcast
         at_rest(page)
         page.get_by_role("tab", name="Save").click()
         page.get_by_role("button", name="Save picture").click()
@@ -99,6 +103,48 @@ def test_a_browser_shows_render_views_bytes_and_saves_what_render_repeats(browse
     text = (tmp_path / "views" / "my-weather.yaml").read_text()
     assert "visibility_m: 30" in text
     assert np.array_equal(rendered(tmp_path / "out", command), saved)
+
+
+def test_arrow_keys_move_the_slider_that_has_the_focus_and_else_the_camera(browser, tmp_path):
+    with served(Edits("dense-fog", SCALE, folder=tmp_path)) as (viewer, url):
+        page = opened(browser, url)
+        (own,) = viewer.pages
+        number = page.get_by_role("textbox", name="visibility_m", exact=True)
+        before = float(number.input_value())
+        # The slider is logarithmic; no box tells its place beside the value's.
+        boxes = [box.input_value() for box in page.locator("input:visible").all()]
+        assert boxes.count("on") == len(boxes) - 2  # ticks, the preset and the visibility
+        slider = page.get_by_role("slider").first
+        for _ in range(5):
+            slider.press("ArrowRight", delay=200)
+        at_rest(page)
+        assert before * 1.05 < float(number.input_value()) < before * 1.2
+        smog = own.recipe(own.wish.edits).weather.smog
+        assert smog is not None and smog.visibility_m == float(number.input_value())
+        page.get_by_role("tab", name="Weather").press("ArrowRight", delay=500)
+        page.wait_for_timeout(2000)
+        assert own.wish.pose is None  # neither has flown
+        page.mouse.click(300, 250)
+        page.keyboard.down("ArrowRight")
+        page.wait_for_function("() => document.body.innerText.includes('not of this view yet')")
+        page.keyboard.up("ArrowRight")
+        at_rest(page)
+        assert own.wish.pose is not None
+        page.close()
+
+
+def test_a_new_preset_is_not_at_rest_before_its_own_picture_is_there(browser, tmp_path):
+    with served(Edits("clear", SCALE, folder=tmp_path)) as (viewer, url):
+        page = opened(browser, url)
+        page.get_by_label("preset").first.click()
+        page.get_by_role("option", name="fresh-snow", exact=True).click()
+        page.wait_for_function("() => document.body.innerText.includes('placing snow, step')")
+        assert "at rest" not in page.locator("body").inner_text()
+        at_rest(page)
+        camera = viewer.scene.frames[0].cameras["front"]
+        recipe = Edits("fresh-snow", SCALE).recipe()
+        assert within(image_of(page), render_view(viewer.scene, camera, recipe).rgb)
+        page.close()
 
 
 def test_two_tabs_fly_apart_and_a_killed_one_leaves_the_other(browser, tmp_path):
@@ -125,6 +171,68 @@ def test_two_tabs_fly_apart_and_a_killed_one_leaves_the_other(browser, tmp_path)
         at_rest(two)
         assert not np.array_equal(image_of(two), before)
         two.close()
+
+
+# How a page's attempt to connect ends.
+CONNECT = """address => new Promise(done => {
+  const socket = new WebSocket(address, ["viser-v1.1.0"]);
+  socket.onopen = () => done("open");
+  socket.onerror = () => done("refused");
+})"""
+
+
+def test_pages_of_other_sites_connect_to_nothing_while_the_page_is_open(browser, tmp_path):
+    output = OutputViewer(open_store(str(hostile_output(tmp_path / "out"))))
+    with serve(import_viser(), output, "127.0.0.1", 0) as url:
+        host = urlsplit(url).netloc
+        port = host.rpartition(":")[2]
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(url)
+        page.get_by_text("2 images").wait_for(timeout=WAIT_MS)
+        assert page.evaluate(CONNECT, f"ws://{host}") == "open"  # by its cookie
+        context.route("http://*/elsewhere", lambda route: route.fulfill(body="<p>elsewhere</p>"))
+        local = tmp_path / "page.html"
+        local.write_text("<p>a file</p>")
+        sites = ["http://evil.example/elsewhere", "http://localhost:45999/elsewhere",
+                 "http://127.0.0.1:45999/elsewhere", local.as_uri(), "about:blank"]  # fmt: skip
+        for site in sites:
+            other = context.new_page()
+            other.goto(site)
+            for address in (host, f"127.0.0.1:{port}", f"[::1]:{port}"):
+                assert other.evaluate(CONNECT, f"ws://{address}") == "refused", site
+            other.close()
+        # A page whose address names another server, or that is in a frame, is not sent.
+        other = context.new_page()
+        answer = other.goto(f"http://{host}/?websocket=ws://evil.example")
+        assert answer is not None and answer.status == 403
+        other.goto(sites[1])
+        other.set_content(f'<iframe src="{url}"></iframe>')
+        other.wait_for_timeout(1500)
+        assert not any(frame.url.startswith("http") and "2 images" in frame.content()
+                       for frame in other.frames)  # fmt: skip
+        context.close()
+
+
+def test_texts_of_a_manifest_run_nothing_in_a_browser(browser, tmp_path):
+    output = OutputViewer(open_store(str(hostile_output(tmp_path / "out"))))
+    with serve(import_viser(), output, "127.0.0.1", 0) as url:
+        page = browser.new_page()
+        requests = []
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(url)
+        page.get_by_text("onerror=globalThis.PWNED=1").first.wait_for(timeout=WAIT_MS)
+        page.get_by_label("variant").first.click()
+        page.get_by_role("option").last.click()
+        page.get_by_role("slider").first.press("ArrowRight")
+        page.wait_for_timeout(1000)
+        text = page.inner_text("body")
+        assert page.evaluate("globalThis.PWNED") is None and "Error Parsing" not in text
+        # Nor does anything go to another server; and nothing offers to share the page.
+        own = ("data:", "blob:", url.partition("?")[0])
+        assert not [address for address in requests if not address.startswith(own)]
+        assert page.locator(".tabler-icon-share").count() == 0
+        page.close()
 
 
 def test_the_command_serves_until_it_is_interrupted(browser, tmp_path):

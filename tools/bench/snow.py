@@ -97,7 +97,7 @@ def tables(case: EffectCase, repeats: int) -> list[Table]:
 
 def placement(scene: Scene, cell_m: float, backend: str = "auto") -> Callable[[], SnowSupport]:
     """Finds where snow can lie, for all cameras."""
-    settings = placement_settings(snow_recipe(cell_m=cell_m).weather.snow)
+    settings = placement_settings(snow_recipe(cell_m=cell_m).weather.snow, scene)
     cameras = all_cameras(scene)
     return functools.partial(place_snow_support, scene, cameras, settings, backend=backend)
 
@@ -128,7 +128,7 @@ def placement_table(uri: str, case: EffectCase, repeats: int) -> Table:
 
 def _warm_placement(uri: str, cell_m: float) -> Action:
     scene = open_scene(uri)
-    settings = placement_settings(snow_recipe(cell_m=10 * cell_m).weather.snow)
+    settings = placement_settings(snow_recipe(cell_m=10 * cell_m).weather.snow, scene)
     place_snow_support(scene, all_cameras(scene)[:1], settings)  # loads the kernels
     return placement(scene, cell_m)
 

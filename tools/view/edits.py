@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
+import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from augment.jobs.atomic import write_atomic
+from pydantic import ValidationError
+
+from augment.errors import OutputError
+from augment.jobs.atomic import make_folder, output_error, refusals_of, temporary_beside
 from augment.jobs.render_job import copy_files, portable_recipe
-from recipes.errors import RecipeError
+from recipes.errors import RecipeError, short
 from recipes.fields import found, replaced
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
 from tools.view.controls import start_of_model
+
+# A file system that has no hard links.
+_NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 
 
 def as_yaml(value: Any) -> str:
@@ -133,10 +141,26 @@ def without_weather(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update={"camera": Sensor()})
 
 
-def save_recipe(recipe: Recipe, path: Path) -> None:
-    """Writes a recipe in numbers, and its files in a folder of the recipe's name beside it.
+def renamed(recipe: Recipe, name: str) -> Recipe:
+    """Return the recipe under another name.
 
     Raises:
+        RecipeError: a recipe cannot have the name.
+    """
+    try:
+        return Recipe.model_validate({**recipe.model_dump(), "name": name})
+    except ValidationError as error:
+        raise RecipeError(
+            f"name: {short(name)!r} is no name of a recipe: it begins with a letter from A to Z or "
+            f"a digit, and has 1 to 64 letters, digits, dots, hyphens and underscores"
+        ) from error
+
+
+def save_recipe(recipe: Recipe, path: Path) -> None:
+    """Write a recipe in numbers, and its files in a folder of the recipe's name beside it.
+
+    Raises:
+        FileExistsError: there is something at the path.
         RecipeError: a file of the recipe cannot be read, or is not that of its digest.
         OutputError: the folder cannot be written.
     """
@@ -145,14 +169,86 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
     for section, own in portable.sections().items():
         for name, file in own.files.items():
             portable = replaced(portable, f"{section}.{name}", f"{beside.name}/{file}")
-    copy_files(recipe, beside)
-    write_atomic(path, dump_recipe(portable).encode())
+    write_new(path, dump_recipe(portable).encode())
+    try:
+        copy_files(recipe, beside)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def free_path(folder: Path, name: str, *endings: str) -> Path:
-    """FOLDER/NAME, or NAME-2, NAME-3, ... where there is already a file with one of the endings."""
+    """Return FOLDER/NAME, or NAME-2, NAME-3, ... where no ending of it is taken."""
     for number in itertools.count(1):
         path = folder / (name if number == 1 else f"{name}-{number}")
-        if not any(path.with_name(path.name + ending).exists() for ending in ("", *endings)):
+        if not any(os.path.lexists(f"{path}{ending}") for ending in ("", *endings)):
             return path
     raise AssertionError
+
+
+def create_file(folder: Path, name: str, ending: str, data: bytes) -> Path:
+    """Write a file at NAME + ENDING, or at NAME-2 + ENDING, ... where there is one already.
+
+    Args:
+        folder: Where; it is made if it is missing.
+        name: The file's name without its ending; dots in it are kept.
+        ending: The rest of the name.
+        data: The file's bytes.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        OutputError: the folder is a link, or cannot be written.
+    """
+    if folder.is_symlink():
+        raise OutputError(
+            f"{folder} is a link to {os.readlink(folder)}: files of pages are written below the "
+            f"folder of --out only; remove the link, or choose another --out"
+        )
+    for number in itertools.count(1):
+        path = folder / f"{name if number == 1 else f'{name}-{number}'}{ending}"
+        try:
+            write_new(path, data)
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Write a file where nothing is, in one step; nothing is replaced, and no link is followed.
+
+    Raises:
+        FileExistsError: there is something at the path, be it a link to nothing.
+        OutputError: the system refuses.
+    """
+    with refusals_of(path):
+        make_folder(path.parent)
+    temporary = temporary_beside(path)
+    try:
+        try:
+            _create(temporary, data)
+            os.link(temporary, path, follow_symlinks=False)  # where a rename would replace
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+            _create(path, data)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def _create(path: Path, data: bytes) -> None:
+    """Write a file that must be new; it goes again where it cannot be written whole."""
+    with path.open("xb") as file:
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise

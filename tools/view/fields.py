@@ -6,14 +6,14 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from tools.view.controls import Control
+from tools.view.controls import STEPS, Control
 from tools.view.edits import as_yaml
 
 if TYPE_CHECKING:
     from viser import GuiApi
 
 MAX_EXACT = 2**53 - 1  # the largest whole number that a browser tells from its neighbours
-WAY = 100.0  # of a slider that does not stand for its values themselves
+WAY = 100.0  # the length of a slider that has places along its way, not values
 NONE = "(none)"
 
 When = Callable[..., None]
@@ -22,23 +22,36 @@ Uploaded = Callable[[Control, str, bytes], None]
 
 
 class Field:
-    """One control on a page. when: has a function told what people do to a widget. changed: hears
-    the field's new value as YAML; uploaded: a file's name and content.
+    """One control on a page.
+
+    Args:
+        label: What the page calls the field; None for its name.
+        when: Has a function told what people do to a widget.
+        changed: Hears the field's new value as YAML.
+        uploaded: Hears a file's name and content.
     """
 
     def __init__(
-        self, gui: GuiApi, control: Control, when: When, changed: Changed, uploaded: Uploaded
+        self,
+        gui: GuiApi,
+        control: Control,
+        when: When,
+        changed: Changed,
+        uploaded: Uploaded,
+        label: str | None = None,
     ) -> None:
         self.control, self._when, self._changed = control, when, changed
+        self.label = label or control.label
+        self.place_slider: Any = None  # it has places along its way, not values
         self._given: Any = None
         self._parts: list[Any] = []
         make = getattr(self, f"_make_{control.kind}")
         if control.nullable and control.kind in ("slider", "number", "rates", "flag", "colour"):
-            self._given = gui.add_checkbox(control.label, False, hint=control.hint)
+            self._given = gui.add_checkbox(f"set {self.label}", False, hint=control.tooltip)
             self._hear(self._given, lambda there: control.start if there else None)
         make(gui, control)
         if control.kind == "file":
-            button = gui.add_upload_button(f"upload {control.label}")
+            button = gui.add_upload_button(f"upload {self.label}")
             when(button, lambda file: uploaded(control, file.name, file.content), "on_upload")
 
     def show(self, value: Any) -> None:
@@ -55,11 +68,12 @@ class Field:
     def _shown(self, value: Any) -> tuple[Any, ...]:
         """The value as each of the widgets says it."""
         control = self.control
-        if control.kind == "slider" and control.way != "linear":
-            return (float(value), WAY * control.way_of(value))
         if control.kind in ("slider", "number"):
+            kind = int if control.whole else float
+            if control.kind == "slider" and control.has_box:
+                return (kind(value), WAY * control.way_of(value))
             value = min(max(value, control.low), min(control.high, MAX_EXACT))
-            return (int(value) if control.whole else float(value),)
+            return (kind(value),)
         if control.kind == "colour":
             return (tuple(round(255 * channel) for channel in value),)
         if control.kind == "rates":
@@ -78,7 +92,7 @@ class Field:
     def _hear(self, part: Any, value_of: Callable[[Any], Any]) -> None:
         def heard(shown: Any) -> None:
             value = value_of(shown)
-            if part is self._given or self.control.way != "linear":
+            if part is self._given or self.place_slider is not None:
                 self.show(value)
             text = value if self.control.kind == "list" and value else as_yaml(value)
             self._changed(self.control, text)
@@ -88,53 +102,59 @@ class Field:
     # ---- One for every kind of control
 
     def _make_slider(self, gui: GuiApi, control: Control) -> None:
-        hint, start = control.hint, control.start
-        if control.way != "linear":
-            low, high, step = control.low, control.high, control.step
-            number = gui.add_number(
-                control.label, float(start), min=low, max=high, step=step, hint=hint
-            )
-            self._add(number)
-            marks = tuple((WAY * control.way_of(value), word) for value, word in control.marks)
-            way = WAY * control.way_of(start)
-            slider = gui.add_slider(" ", 0.0, WAY, 0.5, way, marks=marks, hint=hint)
-            self._add(slider, lambda way: control.value_at(way / WAY))
-            return
         kind = int if control.whole else float
-        low, high, step = map(kind, (control.low, control.high, control.step))
-        self._add(gui.add_slider(control.label, low, high, step, kind(start), hint=hint))
+        start = kind(min(max(control.start, control.low), control.high))
+        if not control.has_box:
+            low, high, step = map(kind, (control.low, control.high, control.step))
+            slider = gui.add_slider(self.label, low, high, step, start, hint=control.tooltip)
+            self._add(slider)
+            return
+        least, most = map(kind, control.valid)
+        number = gui.add_number(
+            self.label, start, min=least, max=most, step=control.box_step, hint=control.tooltip
+        )
+        number.precision = control.box_digits
+        self._add(number)
+        marks = tuple((WAY * control.way_of(value), word) for value, word in control.marks)
+        place = WAY * control.way_of(start)
+        is_linear = control.way == "linear"
+        steps = (control.high - control.low) / control.step if is_linear else STEPS
+        self.place_slider = gui.add_slider(
+            control.unit or " ", 0.0, WAY, WAY / steps, place, marks=marks, hint=control.tooltip
+        )
+        self._add(self.place_slider, lambda place: kind(control.value_at(place / WAY)))
 
     def _make_number(self, gui: GuiApi, control: Control) -> None:
         kind = int if control.whole else float
         low, high = kind(max(control.low, -MAX_EXACT)), kind(min(control.high, MAX_EXACT))
         number = gui.add_number(
-            control.label, kind(control.start), min=low, max=high, hint=control.hint
+            self.label, kind(control.start), min=low, max=high, hint=control.tooltip
         )
         self._add(number)
 
     def _make_flag(self, gui: GuiApi, control: Control) -> None:
-        self._add(gui.add_checkbox(control.label, bool(control.default), hint=control.hint))
+        self._add(gui.add_checkbox(self.label, bool(control.default), hint=control.tooltip))
 
     def _make_words(self, gui: GuiApi, control: Control) -> None:
         words = (NONE, *control.words) if control.nullable else control.words
-        box = gui.add_dropdown(control.label, words, hint=control.hint)
+        box = gui.add_dropdown(self.label, words, hint=control.tooltip)
         plain = {NONE: None, "true": True, "false": False}
         self._add(box, lambda word: plain.get(word, word))
 
     def _make_colour(self, gui: GuiApi, control: Control) -> None:
         rgb = tuple(round(255 * channel) for channel in control.start)
-        part = gui.add_rgb(control.label, rgb, hint=control.hint)
+        part = gui.add_rgb(self.label, rgb, hint=control.tooltip)
         self._add(part, lambda rgb: [round(channel / 255, 4) for channel in rgb])
 
     def _make_rates(self, gui: GuiApi, control: Control) -> None:
         red, green, blue = map(float, control.start)
         least = (0.0, 0.0, 0.0)
         part = gui.add_vector3(
-            control.label, (red, green, blue), min=least, step=0.01, hint=control.hint
+            self.label, (red, green, blue), min=least, step=0.01, hint=control.tooltip
         )
         self._add(part, list)
 
     def _make_text(self, gui: GuiApi, control: Control) -> None:
-        self._add(gui.add_text(control.label, "", hint=control.hint), lambda text: text or None)
+        self._add(gui.add_text(self.label, "", hint=control.tooltip), lambda text: text or None)
 
     _make_file = _make_list = _make_text

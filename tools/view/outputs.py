@@ -11,18 +11,26 @@ import cv2
 import numpy as np
 
 from augment.errors import OutputError
+from augment.files.image_size import image_header
 from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.jobs.layout import mask_names, resolve_inside
 from augment.jobs.manifest import MANIFEST, OK, Row, read_finished, weather_columns
 from augment.jobs.store import Store, open_store
+from recipes.files import open_file
 from recipes.schema import columns_of_effects
 from tools.view.fields import NONE
 from tools.view.pictures import BAR, color_classes, color_depth, color_numbers, split
+from tools.view.text import paragraph, printable, table
+from tools.view.widgets import options_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle
 
 STEPS = 200  # of a slider of numbers
+MAX_PIXELS = 2**27  # of an image that is shown
+MAX_BYTES = 2**29  # of its file
+MIN_RANGE = 1e-30  # between the ends of a slider of numbers
+MAX_ASPECT = 8.0  # of a window, width by height or height by width
 
 
 def find_output(text: str) -> Store | None:
@@ -51,13 +59,20 @@ class OutputViewer:
         self.rows: list[Row] = [row for row in table.to_pylist() if row["status"] == OK]
         if not self.rows:
             raise OutputError(f"{store.uri} holds no finished image; run `climategs render` first")
-        self.numbers = [name for name in weather_columns(table) if len(self.values(name)) > 1]
+        self.numbers = [name for name in weather_columns(table) if self._is_range(name)]
         self.pages: dict[int, OutputPage] = {}
 
     def values(self, column: str) -> list[Any]:
-        """Those that a column has, sorted; NaN left out."""
+        """Return the values that a column has, sorted; NaN left out."""
         found = {row[column] for row in self.rows}
         return sorted(value for value in found if value is not None and value == value)
+
+    def _is_range(self, column: str) -> bool:
+        """Whether a slider can stand for a column: two numbers and more, between finite ends."""
+        values = self.values(column)
+        if len(values) < 2 or not all(isinstance(value, int | float) for value in values):
+            return False
+        return math.isfinite(width := float(values[-1]) - float(values[0])) and width > MIN_RANGE
 
     def picture(self, row: Row, shows: str) -> np.ndarray:
         """uint8 [H, W, 3]: a row's image, or what stands for another file of the row.
@@ -68,11 +83,14 @@ class OutputViewer:
         relative = row[f"{shows}_path"]
         if not relative:
             raise OutputError(f"{row['variant']} has no {shows} images")
-        here = self.store.local_dir
         try:
-            data = (
-                resolve_inside(here, relative).read_bytes() if here else self.store.read(relative)
-            )
+            data = self._read(relative)
+            header = image_header(data)
+            if header is not None and header.width * header.height > MAX_PIXELS:
+                raise ValueError(
+                    f"it says that it has {header.width} x {header.height} pixels; at most "
+                    f"{MAX_PIXELS / 1e6:.0f} million are shown"
+                )
             if shows == "image":
                 return decode_image(data)
             if shows == "depth":
@@ -84,14 +102,26 @@ class OutputViewer:
             raise OutputError(f"cannot read {self.store.uri}/{relative}: {error}") from error
         return color_classes(numbers) if shows == "semantic" else np.stack([numbers] * 3, -1)
 
+    def _read(self, relative: str) -> bytes:
+        """The bytes of a file that the manifest names."""
+        here = self.store.local_dir
+        if here is None:
+            return self.store.read(relative)
+        with open_file(resolve_inside(here, relative)) as file:  # not of a pipe, which may wait
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES // 2**20} MiB")
+        return data
+
     def start(self) -> None:
         """Pages draw for themselves."""
 
     def stop(self) -> None:
         """As `start`."""
 
-    def open_page(self, client: ClientHandle) -> None:
-        self.pages[client.client_id] = OutputPage(self, client)
+    def open_page(self, client: ClientHandle) -> Callable[[str], None]:
+        self.pages[client.client_id] = page = OutputPage(self, client)
+        return page.show_status
 
     def close_page(self, client: ClientHandle) -> None:
         self.pages.pop(client.client_id, None)
@@ -105,8 +135,9 @@ class OutputPage:
         rows, gui = viewer.rows, client.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}")
-        self._status = gui.add_markdown("")
+        gui.set_panel_label(printable(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}"))
+        self._status = gui.add_html("")
+        self._options: dict[str, dict[str, Any]] = {}  # by the dropdown's label
         self._scene = self._dropdown("scene", viewer.values("scene"))
         self._camera = self._dropdown("camera", viewer.values("camera"))
         frames = viewer.values("frame")
@@ -121,17 +152,22 @@ class OutputPage:
         with gui.add_folder("only images with", visible=bool(viewer.numbers)):
             for name in viewer.numbers:
                 self._ranges[name] = self._range(name)
-        self._facts = gui.add_markdown("")
+        self._facts = gui.add_html("")
         self._frames = frames
         for part in (self._frame, self._line):
             self._when(part, self._show)
         self._show()
         client.camera.on_update(self._on_camera)
 
-    def _dropdown(self, label: str, options: list[Any]) -> Any:
-        part = self.client.gui.add_dropdown(label, tuple(map(str, options)))
+    def _dropdown(self, label: str, values: list[Any]) -> Any:
+        self._options[label] = options_of(values)
+        part = self.client.gui.add_dropdown(label, tuple(self._options[label]))
         self._when(part, self._show)
         return part
+
+    def _chosen(self, part: Any) -> Any:
+        """The value that the option of a dropdown stands for."""
+        return self._options[part.label][part.value]
 
     def _range(self, name: str) -> Any:
         values = self.viewer.values(name)
@@ -150,6 +186,9 @@ class OutputPage:
         async def _(event: Any) -> None:
             if event.client is not None:
                 act()
+
+    def show_status(self, text: str) -> None:
+        self._status.content = paragraph(text)
 
     async def _on_camera(self, _: Any) -> None:
         self._show()
@@ -170,32 +209,35 @@ class OutputPage:
         rows = [row for row in self.viewer.rows if self._matches(row)]
         variants = sorted({row["variant"] for row in rows})
         if variants:
-            self._variant.options = tuple(variants)
+            self._options["variant"] = options_of(variants)
+            self._variant.options = tuple(self._options["variant"])
         self._show()
 
     def _show(self) -> None:
         matching = [row for row in self.viewer.rows if self._matches(row)]
         frame = self._frames[min(self._frame.value, len(self._frames) - 1)]
-        wanted = {"scene": self._scene.value, "camera": self._camera.value, "frame": frame}
-        own = self._find(matching, wanted | {"variant": self._variant.value})
+        scene, camera, shows = map(self._chosen, (self._scene, self._camera, self._shows))
+        wanted = {"scene": scene, "camera": camera, "frame": frame}
+        own = self._find(matching, wanted | {"variant": self._chosen(self._variant)})
         count = f"{len(matching)} of {len(self.viewer.rows)} images"
         if own is None:
-            self._status.content = f"{count}; none of this scene, camera, frame and variant"
+            self.show_status(f"{count}; none of this scene, camera, frame and variant")
             return
         try:
-            picture = self.viewer.picture(own, self._shows.value)
-            before = self._find(self.viewer.rows, wanted | {"variant": self._other.value})
+            picture = self.viewer.picture(own, shows)
+            before = self._find(self.viewer.rows, wanted | {"variant": self._chosen(self._other)})
             if before is not None:
-                left = self.viewer.picture(before, self._shows.value)
+                left = self.viewer.picture(before, shows)
                 if left.shape == picture.shape:
                     picture = split(left, picture, self._line.value)
         except OutputError as error:
-            self._status.content = f"{count}; {error}"
+            self.show_status(f"{count}; {error}")
             return
-        camera = self.client.camera
-        shape = with_aspect(picture, camera.image_width / max(camera.image_height, 1))
+        window = self.client.camera
+        aspect = window.image_width / max(window.image_height, 1)
+        shape = with_aspect(picture, min(max(aspect, 1 / MAX_ASPECT), MAX_ASPECT))
         self.client.scene.set_background_image(shape, "png")
-        self._status.content = f"**{picture.shape[1]} x {picture.shape[0]}**; {count}"
+        self.show_status(f"{picture.shape[1]} x {picture.shape[0]}; {count}")
         self._facts.content = _facts_of(own)
 
     def _find(self, rows: list[Row], wanted: Row) -> Row | None:
@@ -212,8 +254,7 @@ def with_aspect(picture: np.ndarray, aspect: float) -> np.ndarray:
 
 
 def _facts_of(row: Row) -> str:
-    """A table of all that the manifest says of an image."""
+    """HTML of a table of all that the manifest says of an image."""
     there = {n: v for n, v in row.items() if v not in (None, "") and v == v}
     words = (f"{v:g}" if isinstance(v, float) else str(v) for v in there.values())
-    lines = (f"| {n} | {w.replace('|', ' ')} |" for n, w in zip(there, words, strict=True))
-    return "\n".join(["| column | value |", "|---|---|", *lines])
+    return table(("column", "value"), zip(there, words, strict=True))

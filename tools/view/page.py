@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import html
 import re
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from augment.cameras import Camera, Frame
+from augment.errors import ClimateGSError
 from augment.geometry import quat_from_rotmat
 from augment.scene import Scene
 from augment.trust import unfitted_cameras
@@ -22,8 +24,9 @@ from recipes.errors import RecipeError
 from recipes.fields import found
 from recipes.load import describe_preset, preset_names
 from recipes.schema import TIERS, Recipe
-from tools.view.controls import Control, Group, effect_groups, group_of
-from tools.view.edits import Edits, as_yaml, free_path
+from tools.view.browser import page_style
+from tools.view.controls import MAIN_FIELDS, Control, Group, effect_groups, group_of, split_by_rank
+from tools.view.edits import Edits, as_yaml, create_file
 from tools.view.fields import NONE, Field
 from tools.view.pictures import (
     PICTURE,
@@ -33,6 +36,9 @@ from tools.view.pictures import (
     place_in_window,
     what_can_be_shown,
 )
+from tools.view.status import ShownPicture, Status, page_status
+from tools.view.text import STYLE, paragraph, printable
+from tools.view.widgets import options_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -48,8 +54,18 @@ LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera aro
 FRAME_S = 0.09  # what a picture may take while something moves
 FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
 MAX_NAME = 64
-_TEXT = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
-_ERROR = f"color:#c92a2a;{_TEXT}"
+MAX_TASKS = 8  # of a page that wait to be done
+MAX_ASPECT = 8.0  # of a window, width by height or height by width
+_MAIN_NAMES = [name for names in MAIN_FIELDS.values() for name in names]
+# Names of several fields that come first, and of the preset of the whole recipe: not without their
+# section.
+SHARED_NAMES = {"preset", *(name for name in _MAIN_NAMES if _MAIN_NAMES.count(name) > 1)}
+BAR_FULL = 100.0  # of a progress bar
+_ERROR = "color:#c92a2a"
+# Two lines and a bar are always there: nothing below may move away from under the mouse.
+_STATUS = "font-weight:bold;line-height:1.3;min-height:2.6em"
+_WAITS = "color:#a35200"  # of a status line whose picture is not what the page asks for
+_WARNING = "background:#fff3bf;color:#5c3c00;padding:0.3em 0.7em;margin-bottom:0.5em"
 
 
 @dataclass(frozen=True)
@@ -88,14 +104,15 @@ class Wish:
 
 @dataclass
 class Progress:
-    """What has been drawn of a page's wishes, which count up. last: when the last one came. due:
-    when a drive that is played goes on.
+    """What has been drawn of a page's wishes, which count up. last: when the last one came, or was
+    given up. asked: when it came. due: when a drive that is played goes on.
     """
 
     wished: int = 1
     drawn: int = 0
     rested: int = 0
     last: float = 0.0
+    asked: float = field(default_factory=time.monotonic)
     due: float = 0.0
     factor: float = FACTORS[1]
     tasks: deque[Callable[[], None]] = field(default_factory=deque)
@@ -111,6 +128,9 @@ class Page:
         self.progress, self.is_closed = Progress(), False
         self.wish = Wish(viewer.edits, 0, first_camera(viewer.scene, viewer.frames[0]))
         self.before: tuple[Any, np.ndarray] | None = None  # the picture without weather, by view
+        self._picture: ShownPicture | None = None
+        self._failed: Wish | None = None  # could not be drawn
+        self._telling = threading.Lock()  # three threads say what is being done
         self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
         self._poses: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=30)
         self._window = (0, 0)
@@ -126,6 +146,7 @@ class Page:
         self._show_values()
         self._resize(client.camera.image_width, client.camera.image_height)
         self._to_camera()
+        self.update_status()
         # Not before the next message: viser tells of this one too, and would say that the window is
         # where it was only just told to go.
         asyncio.get_running_loop().call_soon(client.camera.on_update, self._on_camera)
@@ -168,7 +189,8 @@ class Page:
     @property
     def aspect(self) -> float:
         width, height = self._window
-        return width / height if width and height else 16 / 9
+        aspect = width / height if width and height else 16 / 9
+        return min(max(aspect, 1 / MAX_ASPECT), MAX_ASPECT)
 
     @property
     def window_height(self) -> int:
@@ -181,11 +203,14 @@ class Page:
         with self.viewer.changed:
             self.wish = replace(self.wish, **changes)
             self.progress.wished += 1
-            self.progress.last = time.monotonic()
+            self.progress.last = self.progress.asked = time.monotonic()
             self.viewer.changed.notify()
+        self.update_status()
 
     def do(self, task: Callable[[], None]) -> None:
         """Have the viewer's thread do something between two pictures."""
+        if len(self.progress.tasks) >= MAX_TASKS:
+            raise ClimateGSError(f"{MAX_TASKS} tasks wait to be done: press it again after them")
         with self.viewer.changed:
             self.progress.tasks.append(task)
             self.viewer.changed.notify()
@@ -210,9 +235,7 @@ class Page:
 
     def _on_upload(self, control: Control, name: str, content: bytes) -> None:
         safe = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).name)[-MAX_NAME:].lstrip(".") or "file"
-        path = free_path(self.viewer.out / "uploads", safe)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        path = create_file(self.viewer.out / "uploads", Path(safe).stem, Path(safe).suffix, content)
         relative = str(path.relative_to(self.viewer.out))
         edits = self.wish.edits.with_values({control.path: as_yaml(relative)})
         others = tuple(c.path for g in self.groups for c in g.walk() if c.nullable and c != control)
@@ -221,11 +244,8 @@ class Page:
         self.edit(edits.giving_way(control.path, others), show=True)
 
     def _on_open(self, name: str, content: bytes) -> None:
-        stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME] or "recipe"
-        path = free_path(self.viewer.out / "opened", stem, ".yaml").with_suffix(".yaml")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-        self._take(str(path))
+        stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME].lstrip(".") or "recipe"
+        self._take(str(create_file(self.viewer.out / "opened", stem, ".yaml", content)))
 
     def _take(self, source: str) -> None:
         """Another recipe, without changes."""
@@ -300,14 +320,21 @@ class Page:
         gui = self.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()  # beside the picture
-        gui.set_panel_label(f"ClimateGS: {self.viewer.scene.name}")
+        gui.set_panel_label(printable(f"ClimateGS: {self.viewer.scene.name}"))
         self._status = gui.add_html("")
+        self._bar = gui.add_progress_bar(0.0)
+        self._warning = gui.add_html("", visible=False)
         self._error = gui.add_html("", visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Weather"):
             self._build_recipe()
-            for group in self.groups[:-2]:
-                self._build_group(group)
+            main, others = split_by_rank(self.groups[:-2])
+            for group in main:
+                self._build_main_effect(group)
+            with gui.add_folder("more effects", expand_by_default=False):
+                for group in others:
+                    self._build_group(group)
+            self._build_draws()
         with tabs.add_tab("View"):
             self._build_view()
         with tabs.add_tab("Quality"):
@@ -315,31 +342,53 @@ class Page:
             for group in self.groups[-2:]:
                 self._build_group(group)
         with tabs.add_tab("Plan"):
-            self._plan = gui.add_markdown("")
+            self._plan = gui.add_html("")
         with tabs.add_tab("Save"):
             self._build_save()
+        sliders = [own.place_slider for own in self._fields.values() if own.place_slider]
+        gui.add_html(page_style(sliders, [self._effects[group.path][0] for group in main]))
 
     def _build_recipe(self) -> None:
         gui, names = self.gui, preset_names()
-        hint = "; ".join(f"{name}: {describe_preset(name)}" for name in names)
         source = self.wish.edits.source
-        options = names if source in names else (source, *names)
-        preset = gui.add_dropdown("preset", options, initial_value=source, hint=hint)
+        sources = options_of(names if source in names else (source, *names))
+        word = next(word for word, name in sources.items() if name == source)
+        hint = "A weather that comes with the package. All changes below are undone."
+        preset = gui.add_dropdown("preset", tuple(sources), initial_value=word, hint=hint)
+        self._about = gui.add_html("")
         opened = gui.add_upload_button("Open a recipe", mime_type=".yaml,.yml")
         undo = gui.add_button("Undo all changes")
-        self._seed = gui.add_number("seed", 0, min=0, max=2**53 - 1, step=1)
-        hint = "Which draw from the recipe's ranges."
-        self._variant = gui.add_number("variant", 0, min=0, max=2**31 - 1, step=1, hint=hint)
 
-        self._when(preset, self._take)
+        self._when(preset, lambda word: self._take(sources[word]))
         self._when(undo, lambda _: self._take(self.wish.edits.source), "on_click")
         self._when(opened, lambda file: self._on_open(file.name, file.content), "on_upload")
+
+    def _build_draws(self) -> None:
+        """What chooses among the draws from a recipe's ranges."""
+        gui = self.gui
+        with gui.add_folder("seed and variant", expand_by_default=False):
+            hint = "What all random numbers follow from: drops, flakes, drifts, waves."
+            self._seed = gui.add_number("seed", 0, min=0, max=2**53 - 1, step=1, hint=hint)
+            hint = "Which draw from the recipe's ranges."
+            self._variant = gui.add_number("variant", 0, min=0, max=2**31 - 1, step=1, hint=hint)
+
         self._when(self._seed, lambda number: self._set("seed", int(number)))
         self._when(self._variant, lambda number: self._set("variant", int(number)))
 
     def _set(self, path: str, value: Any) -> None:
         """A field that others may follow."""
         self.edit(self.wish.edits.with_values({path: as_yaml(value)}), show=True)
+
+    def _build_main_effect(self, group: Group) -> None:
+        """A switch; below it, while it is on, its main fields, and a folder of all others."""
+        gui = self.gui
+        switch = gui.add_checkbox(group.title, False, hint=group.tooltip)
+        self._when(switch, lambda there: self._switch(group.path, there))
+        with gui.add_folder(None, visible=False) as below:
+            self._build_controls(group.main, section=group.label)
+            with gui.add_folder(f"more of {group.label}", expand_by_default=False):
+                self._build_fields(group.rest)
+        self._effects[group.path] = (switch, below)
 
     def _build_group(self, group: Group) -> None:
         """A folder; of an effect with a switch, below which its fields are while it is on."""
@@ -348,18 +397,25 @@ class Page:
             if not group.optional:
                 self._build_fields(group)
                 return
-            switch = gui.add_checkbox("on", False, hint=group.hint)
+            switch = gui.add_checkbox("on", False, hint=group.tooltip)
             self._when(switch, lambda there: self._switch(group.path, there))
             with gui.add_folder(None, visible=False) as below:
                 self._build_fields(group)
             self._effects[group.path] = (switch, below)
 
     def _build_fields(self, group: Group) -> None:
-        for control in group.controls:
-            own = Field(self.gui, control, self._when, self._on_change, self._on_upload)
-            self._fields[control.path] = own
+        self._build_controls(group.controls)
         for inner in group.groups:
             self._build_group(inner)
+
+    def _build_controls(self, controls: Iterable[Control], section: str = "") -> None:
+        """Fields by their names; section: stands before a name that several fields have."""
+        for control in controls:
+            label = (
+                f"{section}.{control.label}" if section and control.label in SHARED_NAMES else None
+            )
+            heard = (self._when, self._on_change, self._on_upload)
+            self._fields[control.path] = Field(self.gui, control, *heard, label=label)
 
     def _switch(self, section: str, there: bool) -> None:
         edits = self.wish.edits
@@ -372,17 +428,20 @@ class Page:
         hint = "Which frame of the drive, counted from 0."
         self._time = gui.add_slider("frame", 0, last, 1, 0, hint=hint, disabled=len(frames) == 1)
         play = gui.add_checkbox("play", False)
-        camera = gui.add_dropdown("camera", self.viewer.scene.camera_names)
-        camera.value = self.wish.camera
+        cameras = options_of(self.viewer.scene.camera_names)
+        word = next(word for word, name in cameras.items() if name == self.wish.camera)
+        camera = gui.add_dropdown("camera", tuple(cameras), initial_value=word)
         back = gui.add_button("Back to the camera")
         shows = gui.add_dropdown("shows", what_can_be_shown())
-        gui.add_markdown(
-            "Fly: drag to turn, right drag to move, wheel to go ahead; **W A S D**, **Q E** and "
-            "the arrow keys."
+        gui.add_html(
+            paragraph(
+                "Fly: drag to turn, right drag to move, wheel to go ahead; W A S D, Q E and the "
+                "arrow keys."
+            )
         )
 
         self._when(self._time, self.go_to_frame)
-        self._when(camera, self._land)
+        self._when(camera, lambda word: self._land(cameras[word]))
         self._when(back, lambda _: self._land(self.wish.camera), "on_click")
         with gui.add_folder("before and after"):
             self._toggle("split", "is_split", "Left of the line the scene without its weather.")
@@ -424,7 +483,7 @@ class Page:
         hint = "Settings of all that trades speed for accuracy and that the recipe does not give."
         self._tier = gui.add_dropdown("tier", (NONE, *TIERS, "reference"), hint=hint)
         measure = gui.add_button("Measure the tiers on this view")
-        self._tiers = gui.add_markdown("")
+        self._tiers = gui.add_html("")
 
         self._when(self._tier, self._choose_tier)
         self._when(measure, lambda _: self._measure(), "on_click")
@@ -433,15 +492,14 @@ class Page:
         self.edit(self.wish.edits.with_tier(None if word == NONE else word), show=True)
 
     def _measure(self) -> None:
-        self._tiers.content = "measuring"
-        self.do(lambda: self.viewer.measure_tiers(self))
+        self._do_said(self._tiers, "measuring", lambda: self.viewer.measure_tiers(self))
 
     def _build_save(self) -> None:
         gui = self.gui
         self._name = gui.add_text("name", "my-weather", hint="Of the recipe and of its files.")
         recipe = gui.add_button("Save recipe")
         picture = gui.add_button("Save picture")
-        gui.add_markdown(f"Into the folder `{self.viewer.out}`. Nothing is replaced.")
+        gui.add_html(paragraph(f"Into the folder {self.viewer.out}. Nothing is replaced."))
         self._saved = gui.add_html("")
         self._command = gui.add_html("")
 
@@ -449,10 +507,26 @@ class Page:
         self._when(picture, lambda _: self._save(with_picture=True), "on_click")
 
     def _save(self, *, with_picture: bool) -> None:
-        self.do(lambda: self.viewer.save(self, self._name.value, with_picture=with_picture))
+        name = self._name.value
+        self._do_said(
+            self._saved, "saving", lambda: self.viewer.save(self, name, with_picture=with_picture)
+        )
+
+    def _do_said(self, part: Any, word: str, task: Callable[[], None]) -> None:
+        """Have the viewer's thread do something, which a part of the page says until it is done."""
+
+        def act() -> None:
+            try:
+                task()
+            except Exception:
+                part.content = ""
+                raise
+
+        part.content = paragraph(word)
+        self.do(act)
 
     def go_to_frame(self, number: int) -> None:
-        self.ask(frame=number)
+        self.ask(frame=min(number, len(self.viewer.frames) - 1))
         if self.wish.pose is None:
             self._to_camera()
 
@@ -468,39 +542,88 @@ class Page:
         for path, own in self._fields.items():
             if found(recipe, path.rpartition(".")[0]) is not None:
                 own.show(found(recipe, path))
+        source = self.wish.edits.source
+        about = describe_preset(source) if source in preset_names() else "Your recipe."
+        self._about.content = paragraph(about, style="padding-bottom:0.6em")
         self._seed.value = min(recipe.seed, 2**53 - 1)
         self._variant.value = recipe.variant
         self._tier.value = recipe.quality.tier or NONE
 
     # ---- Shown by the viewer's thread ------------------------------------------------------------
 
-    def show_status(self, text: str) -> None:
-        self._status.content = f'<b style="padding:0 0.7em">{html.escape(text)}</b>'
+    def show_progress(self, picture: ShownPicture) -> None:
+        """A picture has been sent."""
+        self._picture, self._failed = picture, None
+        self.update_status()
+
+    def show_failure(self, wish: Wish) -> None:
+        """A wish could not be drawn."""
+        self._failed = wish
+        self.update_status()
+
+    def update_status(self) -> None:
+        """Say what the picture is of, and what is being done for one that is not there yet. Any
+        thread may call it.
+        """
+        if self.is_closed:
+            return
+        with self._telling:
+            now, wish = time.monotonic(), self.wish
+            status = page_status(
+                self._picture,
+                wish,
+                self.viewer.activity_for(self),
+                waited_s=now - self.progress.asked,
+                now=now,
+                has_failed=self._failed is wish,
+            )
+            color = "" if status.is_current else _WAITS
+            content = paragraph(status.text, style=f"{_STATUS};{color}")
+            if self._status.content != content:
+                self._status.content = content
+            self._show_bar(status)
+
+    def _show_bar(self, status: Status) -> None:
+        """The share that is done; a bar that only moves where that is not known."""
+        is_known = status.share is not None or not status.is_long
+        value = round(BAR_FULL * (status.share or 0.0), 1) if is_known else BAR_FULL
+        if self._bar.value != value:
+            self._bar.value = value
+        if self._bar.animated == is_known:
+            self._bar.animated = not is_known
+
+    def show_warning(self, text: str | None) -> None:
+        """What to know of the view; None where there is nothing."""
+        content = "" if text is None else paragraph(text, style=_WARNING)
+        if self._warning.content != content:
+            self._warning.content = content
+            self._warning.visible = text is not None
 
     def show_error(self, text: str | None) -> None:
         """None: there is none any more."""
         if text is None and not self._error.visible:
             return
-        lines = "<br>".join(map(html.escape, (text or "").splitlines()))
-        self._error.content = f'<div style="{_ERROR}">{lines}</div>'
+        self._error.content = paragraph(text or "", style=_ERROR)
         self._error.visible = text is not None
 
-    def show_plan(self, text: str) -> None:
-        if self._plan.content != text:
-            self._plan.content = text
+    def show_plan(self, content: str) -> None:
+        """Show HTML of a table."""
+        if self._plan.content != content:
+            self._plan.content = content
 
-    def show_tiers(self, text: str) -> None:
-        self._tiers.content = text
+    def show_tiers(self, content: str) -> None:
+        """Show HTML of a table."""
+        self._tiers.content = content
 
     def show_saved(self, text: str, command: str) -> None:
-        self._saved.content = f'<p style="{_TEXT}">{html.escape(text)}</p>'
+        self._saved.content = paragraph(text)
         self.show_command(command)
 
     def show_command(self, command: str) -> None:
         content = (
-            f'<div style="{_TEXT}">'
+            f'<div style="{STYLE}">'
             '<textarea readonly rows="6" style="width:100%;font:11px monospace">'
-            f"{html.escape(command)}</textarea>"
+            f"{html.escape(printable(command))}</textarea>"
             '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.value)">'
             "Copy command</button></div>"
         )
@@ -533,7 +656,7 @@ class Page:
                 continue  # the window looks out of it
             pose = camera.world_from_camera
             self._overlays[name] = api.add_camera_frustum(
-                f"/cameras/{name}",
+                f"/cameras/{printable(name)}",
                 fov=2 * float(np.arctan(camera.height / 2 / camera.fy)),
                 aspect=camera.width / camera.height,
                 scale=0.5,

@@ -23,6 +23,7 @@ from augment.plan import make_plan
 from augment.render.buffers import AUTO, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
+from augment.trust import MAX_ANGLE_RAD, MAX_DISTANCE_M, nearest_view, seen_views
 from augment.views import render_buffers, render_view
 from recipes.fields import replaced
 from recipes.schema import Recipe
@@ -92,6 +93,26 @@ def free_camera(
         cx=width / 2,
         cy=height / 2,
         camera_from_world=invert_rigid(pose),
+    )
+
+
+def away_sentence(scene: Scene, camera: Camera) -> str | None:
+    """What to know of a picture from where no recorded image was taken.
+
+    Returns:
+        None where some image that the scene was made from is near enough, and where distances or
+        those images are not known.
+    """
+    nearest = nearest_view(seen_views(scene), camera)
+    if nearest is None or not scene.has_metric_scale:
+        return None
+    if nearest.distance_m <= MAX_DISTANCE_M and nearest.angle_rad <= MAX_ANGLE_RAD:
+        return None
+    return (
+        f"Outside of what was recorded: {nearest.distance_m:.1f} m and "
+        f"{math.degrees(nearest.angle_rad):.0f} degrees from the nearest image that the scene was "
+        f"made from. Beyond {MAX_DISTANCE_M:g} m or {math.degrees(MAX_ANGLE_RAD):.0f} degrees "
+        f"surfaces may be missing, blurred or invented."
     )
 
 

@@ -7,6 +7,7 @@ waits in its own connection, and a closed one is forgotten.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
@@ -18,7 +19,8 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -30,22 +32,24 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
-from augment.jobs.atomic import write_atomic
 from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
 from augment.scene import Scene
-from augment.timing import stopwatch
+from augment.timing import PassProgress, stopwatch, watched
 from augment.views import render_view
-from recipes.errors import RecipeError
+from recipes.errors import RecipeError, short
 from recipes.schema import TIERS, Recipe
 from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
-from tools.view.edits import Edits, free_path, save_recipe, without_weather
+from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
+from tools.view.browser import ARROWS_STAY_WITH_WIDGETS
+from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather, write_new
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
     Shown,
+    away_sentence,
     coarse,
     draw,
     in_window,
@@ -54,6 +58,8 @@ from tools.view.pictures import (
     recipe_to_show,
     split,
 )
+from tools.view.status import Activity, ShownPicture
+from tools.view.text import table
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -61,8 +67,10 @@ if TYPE_CHECKING:
     from tools.cli import ViewOptions
 
 _LOG = logging.getLogger(__name__)
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+EVERY_ADDRESS = ("0.0.0.0", "::", "")  # that a server may be told to listen at
+MAX_PIXELS = 2**25  # of a picture that is drawn for a page: as many as 8K video has
 JOIN_S = 10.0  # that the picture being drawn gets when the server ends
+TICK_S = 0.25  # from one look at what is being done to the next, for the lines that tell it
 
 
 def view_scene(options: ViewOptions) -> int:
@@ -84,10 +92,12 @@ def view_scene(options: ViewOptions) -> int:
 def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) -> int:
     with serve(viser, viewer, options.host, options.port) as url:
         print(f"{options.scene}: {url}   (Ctrl-C ends it)", flush=True)
-        if options.host not in LOOPBACK:
+        if not is_loopback(options.host):
             print_note(
-                f"note: whoever reaches {options.host} sees what is shown here, and can have files "
-                f"written to {options.out}: there is no password"
+                f"note: whoever has this address, with its token, sees what is shown here and can "
+                f"have files written to {options.out}. It goes over the network unencrypted: where "
+                f"others can listen, serve at 127.0.0.1 and use `ssh -L {urlsplit(url).port}:"
+                f"localhost:{urlsplit(url).port}`"
             )
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
@@ -101,7 +111,9 @@ class Pages(Protocol):
 
     def stop(self) -> None: ...
 
-    def open_page(self, client: ClientHandle) -> None: ...
+    def open_page(self, client: ClientHandle) -> Callable[[str], None]:
+        """Return what says on the page what the server has refused."""
+        ...
 
     def close_page(self, client: ClientHandle) -> None: ...
 
@@ -126,11 +138,19 @@ def import_viser() -> Any:
 
 @contextlib.contextmanager
 def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
-    """Pages at an address, as long as it lasts; its URL. The next free port, where one is taken.
+    """Serve pages at an address within the block, which gets their URL with its token.
+
+    Args:
+        viser: The module.
+        viewer: What is served.
+        host: An address of this machine.
+        port: Or the next that is free.
 
     Raises:
         ClimateGSError: the address is none of this machine's.
     """
+    from tools.view.messages import MAX_MESSAGE_BYTES, PageConnection  # has viser's libraries
+
     try:
         family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -142,39 +162,51 @@ def serve(viser: Any, viewer: Pages, host: str, port: int) -> Iterator[str]:
         ) from error
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    access = Access(is_local=is_loopback(str(address[0])))
+    options = {"create_connection": PageConnection, "max_size": MAX_MESSAGE_BYTES}
+    script = ARROWS_STAY_WITH_WIDGETS
     with contextlib.redirect_stdout(io.StringIO()):  # it says what we say
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+        server = start_server(viser, access, host, port, script=script, **options)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)  # before a page is there
+    loop = server.get_event_loop()
+    loop.call_soon_threadsafe(loop.set_exception_handler, _note_exception)
     viewer.start()
 
     @server.on_client_connect
     async def _(client: ClientHandle) -> None:
         connection = server._websock_server._live_connections[client.client_id]
-        if _is_ours(connection.request.headers, host):
-            viewer.open_page(client)
-        else:
-            await connection.close(1008, "pages of other sites have no business here")
+        try:
+            connection.report = viewer.open_page(client)
+            connection.widget_of = client.gui._gui_input_handle_from_uuid.get
+        except Exception as error:
+            _LOG.error("%s", "".join(traceback.format_exception(error)))
+            await connection.close(1011, "the page cannot be made; the server's log says why")
 
     @server.on_client_disconnect
     async def _(client: ClientHandle) -> None:
         viewer.close_page(client)
 
-    shown = "localhost" if host in LOOPBACK else host
+    name = "localhost" if is_loopback(host) or host in EVERY_ADDRESS else host
+    name = f"[{name}]" if ":" in name else name
     try:
-        yield f"http://{shown}:{server.get_port()}"
+        yield f"http://{name}:{server.get_port()}/?{TOKEN_FIELD}={access.token}"
     finally:
         viewer.stop()
         _stop(server)
 
 
-def _is_ours(headers: Any, host: str) -> bool:
-    """Whether a connection comes from our own page, or from no browser. Any site that someone
-    visits can have the browser connect to this machine, also by a name that it points here.
+def _note_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Say in one line that a message of a page ended in an exception: viser casts the values of
+    widgets before anything checks them.
     """
-    origin, asked = headers.get("Origin"), headers.get("Host", "")
-    if origin is None:
-        return True
-    name = urlsplit(f"//{asked}").hostname
-    return urlsplit(origin).netloc == asked and (host not in LOOPBACK or name in LOOPBACK)
+    error = context.get("exception")
+    if error is None:
+        loop.default_exception_handler(context)
+        return
+    _LOG.warning(
+        "a message of a page is passed over: %s: %s", type(error).__name__, short(str(error))
+    )
+    _LOG.debug("it came from here", exc_info=error)
 
 
 def _stop(server: ViserServer) -> None:
@@ -193,22 +225,47 @@ class Viewer:
         self.pages: list[Page] = []
         self._is_ending = False
         self._known: set[tuple[str, ...]] = set()  # kernels that have run
+        self._activity: tuple[Page, Activity] | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+        self._end = threading.Event()
+        self._ticker = threading.Thread(target=self._tell, name="status", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
+        self._ticker.start()
 
     def stop(self) -> None:
+        self._end.set()
         with self.changed:
             self._is_ending = True
             self.changed.notify()
         self._thread.join(JOIN_S)
+        self._ticker.join(JOIN_S)
 
-    def open_page(self, client: ClientHandle) -> None:
+    def activity_for(self, page: Page) -> Activity | None:
+        """What the thread does for a page, or is about to; None while it draws for another."""
+        current = self._activity
+        if current is None:
+            return Activity()
+        return current[1] if current[0] is page else None
+
+    def _note(self, progress: PassProgress) -> None:
+        """The thread has got to a pass, or to a step of one."""
+        if self._activity is not None:
+            self._activity[1].progress = progress
+
+    def _tell(self) -> None:
+        """Has pages that wait for a picture say what is being done."""
+        while not self._end.wait(TICK_S):
+            for page in tuple(self.pages):
+                page.update_status()
+
+    def open_page(self, client: ClientHandle) -> Callable[[str], None]:
         page = Page(self, client)
         with self.changed:
             self.pages.append(page)
             self.changed.notify()
+        return page.show_error
 
     def close_page(self, client: ClientHandle) -> None:
         with self.changed:
@@ -227,6 +284,17 @@ class Viewer:
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        with _compiling_told(self._count_compiling):
+            self._serve_pages()
+
+    def _count_compiling(self, change: int) -> None:
+        """A kernel begins to be compiled (1), or is compiled (-1)."""
+        if self._activity is not None:
+            activity = self._activity[1]
+            activity.compiling = max(0, activity.compiling + change)
+            activity.compiled += change < 0
+
+    def _serve_pages(self) -> None:
         while True:
             with self.changed:
                 page, work = self._next()
@@ -238,10 +306,13 @@ class Viewer:
                 # The others come first next time.
                 self.pages.sort(key=lambda other: other is page)
             assert page is not None
+            self._activity = (page, Activity())
             try:
                 self._work(page, work)
             except Exception as error:
                 self.report(page, error)
+            finally:
+                self._activity = None
 
     def _next(self) -> tuple[Page | None, Any]:
         """The page that waits for longest and what to do for it; or None, and how long there is
@@ -285,7 +356,7 @@ class Viewer:
         except _Outdated:
             own.last = time.monotonic()  # a small picture comes first, however long the pass took
         except Exception:
-            page.show_status("not drawn")
+            page.show_failure(wish)
             raise
         finally:  # what failed is not tried again before something changes
             own.drawn = wished
@@ -306,25 +377,35 @@ class Viewer:
         factor = self._factor(page, wish, recipe, camera)
         if moving:
             factor *= page.progress.factor
-        elif page.progress.rested == 0 or self._is_new(recipe):
-            page.show_status("preparing")
         started = time.perf_counter()
         with self._kernels(recipe):
             shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
-        height, width = shown.rgb.shape[:2]
-        if wish.pose is None:
-            shown = in_window(shown, place_in_window(camera.resized(width, height), page.aspect))
-        took = time.perf_counter() - started
-        if page.is_closed:
-            return
-        page.show_picture(shown.rgb, shown.depth_m, moving=moving)
-        if moving:
-            page.progress.factor = _paced(page.progress.factor, took)
-        what = "while moving" if moving else "at rest"
-        page.show_status(f"{width} x {height} {what}, {1000 * took:.0f} ms")
-        page.show_error(refusal)
-        if not moving:
-            self._finish(page, wish, recipe, camera, seconds)
+            height, width = shown.rgb.shape[:2]
+            if wish.pose is None:
+                place = place_in_window(camera.resized(width, height), page.aspect)
+                shown = in_window(shown, place)
+            took = time.perf_counter() - started
+            if page.is_closed:
+                return
+            page.show_picture(shown.rgb, shown.depth_m, moving=moving)
+            if moving:
+                page.progress.factor = _paced(page.progress.factor, took)
+            picture = ShownPicture(
+                wish=wish,
+                width=width,
+                height=height,
+                seconds=took,
+                at=time.monotonic(),
+                is_rest=not moving,
+                is_complete=not wish.lidar,
+                is_valid=refusal is None,
+            )
+            page.show_progress(picture)
+            page.show_warning(away_sentence(self.scene, camera))
+            page.show_error(refusal)
+            if not moving:
+                self._finish(page, wish, recipe, camera, seconds)
+                page.show_progress(replace(picture, is_complete=True))
 
     def _picture(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
@@ -333,10 +414,19 @@ class Viewer:
 
         Raises:
             _Outdated: at rest, before a pass: the page is closed or wishes for something else.
+                Within a preparation: the page is closed, or an effect has been taken out.
         """
 
-        def check() -> None:
-            if page.is_closed or page.wish is not wish:
+        def tell(progress: PassProgress) -> None:
+            self._note(progress)
+            if page.is_closed:
+                raise _Outdated
+            if page.wish is wish:
+                return
+            if progress.total:  # most of what follows needs it, too: a depth that is dragged
+                if _lacks_effect_of(page, recipe):
+                    raise _Outdated
+            elif not moving:
                 raise _Outdated
 
         def drawn(recipe: Recipe) -> Shown:
@@ -344,29 +434,33 @@ class Viewer:
             asked = coarse(asked) if moving else asked
             return draw(self.scene, camera, asked, wish.shows, backend=self.backend)
 
-        if moving:
-            shown, seconds = drawn(recipe), {}
-        else:
-            with stopwatch(check) as seconds:
-                shown = drawn(recipe)
+        with watched(tell), contextlib.nullcontext({}) if moving else stopwatch() as seconds:
+            shown = drawn(recipe)
         if wish.is_split:
             clear = without_weather(recipe)
             size = shown.rgb.shape
             key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
             if page.before is None or page.before[0] != key:
-                with contextlib.nullcontext() if moving else stopwatch(check):
+                with watched(tell):
                     page.before = (key, drawn(clear).rgb)
             shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
         return shown, seconds
 
     def _factor(self, page: Page, wish: Wish, recipe: Recipe, camera: Camera) -> float:
-        """How much smaller than the recipe's picture the window is."""
-        if wish.every_pixel:
-            return 1.0
-        height = camera.height * recipe.render.scale
+        """How much smaller than the recipe's picture the window is.
+
+        Raises:
+            ClimateGSError: every pixel is asked for, and there are too many.
+        """
+        scale = recipe.render.scale
+        width, height = camera.width, camera.height
         if wish.pose is None:
-            height *= place_in_window(camera, page.aspect).size[1] / camera.height
-        return min(1.0, page.window_height / height)
+            width, height = place_in_window(camera, page.aspect).size
+        if wish.every_pixel:
+            check_size(width * scale, height * scale)
+            return 1.0
+        fitting = math.sqrt(MAX_PIXELS / (width * height)) / scale
+        return min(1.0, page.window_height / (height * scale), fitting)
 
     def _finish(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, seconds: dict[str, float]
@@ -374,6 +468,7 @@ class Viewer:
         """What follows the picture at rest."""
         points = None
         if wish.lidar:
+            self._note(PassProgress("LiDAR returns"))
             points = lidar_points(self.scene, page.frame_of(wish), recipe)
         own = wish.frustums and (wish.camera if wish.pose is None else "flight")
         key = (wish.frame, wish.boxes, own, wish.lidar and recipe)
@@ -381,22 +476,20 @@ class Viewer:
             page.show_overlays(wish, points)
             page.overlaid = key
         steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
-        lines = [
-            f"| {'**' if step.runs else ''}{step.name}{'**' if step.runs else ''} | "
-            f"{_milliseconds(seconds.get(step.name))} | {step.why} |".replace("\n", " ")
-            for step in steps
-        ]
-        page.show_plan("\n".join(["| pass | ms | why, or why not |", "|---|---|---|", *lines]))
+        rows = [(step.name, _milliseconds(seconds.get(step.name)), step.why) for step in steps]
+        page.show_plan(table(("pass", "ms", "why, or why not"), rows, [s.runs for s in steps]))
         page.show_command(self._command(page, wish))
 
     @contextlib.contextmanager
     def _kernels(self, recipe: Recipe) -> Iterator[None]:
-        """Has the kernels of effects that are new compiled on all cores."""
+        """Has the kernels of effects that are new compiled on all cores, to the end of the list."""
         if not self._is_new(recipe):
             yield
             return
         with compiling_noted(kernel_modules([recipe], self.backend)):
             yield
+            self._count_compiling(1)  # processes beside this one may compile on
+        self._count_compiling(-1)
         self._known.add(tuple(recipe.sections()))
 
     def _is_new(self, recipe: Recipe) -> bool:
@@ -408,6 +501,8 @@ class Viewer:
         """The time of the view at rest in each tier, and how far it is from reference."""
         wish = page.wish
         camera = page.camera_of(wish)
+        scale = page.recipe(wish.edits).render.scale
+        check_size(camera.width * scale, camera.height * scale)
         pictures: dict[str, tuple[float, np.ndarray]] = {}
         for tier in (*TIERS, "reference"):
             recipe = wish.edits.with_tier(tier).recipe()
@@ -420,21 +515,29 @@ class Viewer:
                 times.append(time.perf_counter() - started)
             pictures[tier] = (min(times), rgb)
         best = pictures["reference"][1].astype(float)
-        lines = ["| tier | size | ms | mean difference, of 255 |", "|---|---|---|---|"]
+        rows = []
         for tier, (seconds, rgb) in pictures.items():
             height, width = rgb.shape[:2]
             enlarged = cv2.resize(rgb, best.shape[1::-1], interpolation=cv2.INTER_CUBIC)
             off = f"{np.abs(enlarged - best).mean():.2f}"
-            lines.append(f"| {tier} | {width} x {height} | {1000 * seconds:.0f} | {off} |")
-        page.show_tiers("\n".join(lines))
+            rows.append((tier, f"{width} x {height}", f"{1000 * seconds:.0f}", off))
+        page.show_tiers(table(("tier", "size", "ms", "mean difference, of 255"), rows))
 
     def save(self, page: Page, name: str, *, with_picture: bool) -> None:
         """The recipe, with a picture where asked for; and, of a flight, its camera."""
         wish = page.wish
-        named = Recipe.model_validate({**page.recipe(wish.edits).model_dump(), "name": name})
+        named = renamed(page.recipe(wish.edits), name)
+        if with_picture:
+            camera, scale = page.camera_of(wish), named.render.scale
+            check_size(camera.width * scale, camera.height * scale)
         endings = (".yaml", ".camera.json", f".{named.output.image}")
-        path = free_path(self.out, name, *endings)
-        save_recipe(named, path.with_name(path.name + ".yaml"))
+        path = None
+        while path is None:
+            path = free_path(self.out, name, *endings)
+            try:
+                save_recipe(named, path.with_name(path.name + ".yaml"))
+            except FileExistsError:  # since we looked
+                path = None
         written = [path.name + ".yaml"]
         camera, where = page.recorded_camera(wish), self._where(wish, camera_path=None)
         if wish.pose is not None:
@@ -448,7 +551,7 @@ class Viewer:
         if with_picture:
             view = render_view(self.scene, camera, named, backend=self.backend)
             picture = path.with_name(f"{path.name}.{named.output.image}")
-            write_atomic(picture, encode_image(view.rgb, named.output))
+            write_new(picture, encode_image(view.rgb, named.output))
             written.append(picture.name)
         source = shlex.quote(str(path.with_name(path.name + ".yaml")))
         out = shlex.quote(str(path.with_name(path.name + "-images")))
@@ -469,7 +572,7 @@ class Viewer:
             "camera": camera.name,
             "world_from_camera": pose.tolist(),
         }
-        write_atomic(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
+        write_new(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
     def _where(self, wish: Wish, camera_path: Path | None) -> str:
         """The scene and the view in words of the command line."""
@@ -489,8 +592,49 @@ class Viewer:
         return wish.edits.command(f"{self._where(wish, None)} --out out/view")
 
 
+def check_size(width: float, height: float) -> None:
+    """Check that a picture is not too large to be drawn for a page.
+
+    Raises:
+        ClimateGSError: it has more than MAX_PIXELS.
+    """
+    if width * height > MAX_PIXELS:
+        raise ClimateGSError(
+            f"the picture has {width:.0f} x {height:.0f} pixels; a page has at most "
+            f"{MAX_PIXELS / 1e6:.0f} million drawn: lower render.scale, look through a smaller "
+            f"angle, or save the recipe and use `climategs render`"
+        )
+
+
+@contextlib.contextmanager
+def _compiling_told(tell: Callable[[int], None]) -> Iterator[None]:
+    """Has a function told when numba begins (1) and ends (-1) to compile a kernel; not of those
+    that lie in its cache.
+    """
+    from numba.core.event import Event, Listener, install_listener
+
+    class Counter(Listener):
+        def on_start(self, event: Event) -> None:
+            tell(1)
+
+        def on_end(self, event: Event) -> None:
+            tell(-1)
+
+    with install_listener("numba:compile", Counter()):
+        yield
+
+
 class _Outdated(Exception):
     """Nobody waits for the picture any more."""
+
+
+def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
+    """Whether the page asks for a recipe without an effect that another one has."""
+    try:
+        asked = page.recipe(page.wish.edits)
+    except RecipeError:
+        return False
+    return not recipe.sections().keys() <= asked.sections().keys()
 
 
 def _paced(factor: float, seconds: float) -> float:

@@ -8,6 +8,16 @@ from augment.effects.lidar.codes import (
     SCATTERED,
     UNCHANGED,
     drop_lost,
+    is_in_air,
 )
 
-__all__ = ["ATTENUATED", "LOST", "MOVED", "PRECIPITATION", "SCATTERED", "UNCHANGED", "drop_lost"]
+__all__ = [
+    "ATTENUATED",
+    "LOST",
+    "MOVED",
+    "PRECIPITATION",
+    "SCATTERED",
+    "UNCHANGED",
+    "drop_lost",
+    "is_in_air",
+]

@@ -96,6 +96,15 @@ def white_level(intensity: np.ndarray) -> float:
     return 100.0
 
 
+def highest_intensity(intensity: np.ndarray) -> float:
+    """The highest intensity that the sensor reports: 1 of fractions, else 255, as of 8 bits, or
+    what the sweep itself holds where that is more.
+    """
+    values = np.asarray(intensity)
+    top = 1.0 if white_level(values) == 1 else 255.0
+    return max(top, float(np.max(values, initial=top, where=np.isfinite(values))))
+
+
 def reflectances(sweep: LidarSweep) -> np.ndarray:
     """Reflectance of each return's surface, float64 [N], FAINTEST at least; incidence included, as
     sensors do not take it out.
@@ -271,6 +280,7 @@ class Echoes:
         own = white_level(column) * self.reflectance[rows]
         values = np.where(self.is_new[rows], own, old) * self.gain[rows]
         values[self.codes[rows] == LOST] = 0
+        values = np.minimum(values, highest_intensity(column))
         if column.dtype.kind in "iu":
             limits = np.iinfo(column.dtype)
             values = np.clip(np.rint(values), limits.min, limits.max)

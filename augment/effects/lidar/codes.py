@@ -19,6 +19,13 @@ MOVED = 4  # a surface elsewhere on the beam: that of the snow, or a bed as seen
 PRECIPITATION = 5  # a drop of rain or a flake: no surface is there
 
 
+def is_in_air(sweep: LidarSweep) -> np.ndarray:
+    """Mask of the returns that drops, flakes, fog, spray or muddy water made, bool [N]: no surface
+    is there, so the class of the source's return is not theirs.
+    """
+    return np.isin(sweep.columns[CODE_COLUMN], (SCATTERED, PRECIPITATION))
+
+
 def drop_lost(sweep: LidarSweep) -> LidarSweep:
     """The sweep without lost returns: what the sensor would have sent. `source_index` still says
     which return of the source each row was. A sweep without codes is returned as it is.

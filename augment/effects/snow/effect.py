@@ -114,8 +114,11 @@ class SnowEffect(Effect):
 
     def share(self, job: Sharing) -> None:
         """Where snow can lie."""
-        found = (self.of(recipe) for recipe in job.recipes)
-        for settings in dict.fromkeys(placement_settings(s) for s in found if s and s.changes):
+        sections = (self.of(recipe) for recipe in job.recipes)
+        distinct = dict.fromkeys(
+            placement_settings(snow, job.scene) for snow in sections if snow and snow.changes
+        )
+        for settings in distinct:
             share_shadows(job.scene)
             share_support(job, settings)
 
@@ -213,7 +216,7 @@ def snow_layers_of(
     Raises:
         SceneError: snow cannot be placed in this scene, or not with cells this small.
     """
-    support = support_of(scene, placement_settings(placed.snow), backend=backend)
+    support = support_of(scene, placement_settings(placed.snow, scene), backend=backend)
     light = None if light is scene else light
 
     def lay() -> SnowLayers:

@@ -105,7 +105,7 @@ def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
     Raises:
         SceneError: snow cannot be placed in this scene.
     """
-    support = support_of(scene, placement_settings(placed.snow))
+    support = support_of(scene, placement_settings(placed.snow, scene))
     key = ("lidar snow", scene.name, placed)
     return memo_of(support).get(key, lambda: _lay(support, scene, placed))
 

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from augment.cameras import Camera
 from augment.cast_shadows import CastShadows, shadows_of
@@ -55,9 +54,11 @@ from augment.effects.snow.surface_kernels import LINK, RISES
 from augment.errors import SceneError
 from augment.ground import check_metric_and_level
 from augment.labels import EGO_VEHICLE
+from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
+from augment.timing import counted
 
 # ---- Which squares of the world a support covers, how fine each is, and where its cells are kept -
 
@@ -67,6 +68,7 @@ RINGS_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 COARSEST_M = 1.0  # cells double up to about this size; a coarser cell_m does not double at all
 BYTES_PER_CELL = 70  # of a support
 MAX_BYTES = 4 << 30
+PLACING = "placing snow"  # what bars and watchers are told
 _SIDE_M = 3.2  # of a tile, about
 _PATH_STEP_M = 1.0  # camera centres closer than this are one place of the path
 _PATH_GAP_M = 25.0  # those farther apart are not joined
@@ -565,11 +567,22 @@ class WheelPath:
     width_m: float
 
 
-def wheel_paths(scene: Scene) -> tuple[WheelPath, ...]:
-    """Paths of the ego and of the vehicles that move, each longer than what was recorded."""
+def has_invented_drive(scene: Scene) -> bool:
+    """Return whether nobody drove where the scene's cameras are: a splat file without cameras."""
+    return scene.seen_frames is not None and not scene.seen_frames
+
+
+def wheel_paths(scene: Scene, *, with_invented: bool = False) -> tuple[WheelPath, ...]:
+    """Paths of the ego and of the vehicles that move, each longer than what was recorded.
+
+    Args:
+        scene: its recorded frames say where the ego drove, also where a camera path replaces them.
+        with_invented: if True, the ego of an invented drive has a path, too.
+    """
     paths = []
-    if scene.frames:
-        poses = np.stack([frame.world_from_ego.numpy() for frame in scene.frames])
+    frames = scene.seen_frames or scene.frames
+    if frames and (with_invented or not has_invented_drive(scene)):
+        poses = np.stack([frame.world_from_ego.numpy() for frame in frames])
         ego = _path(poses, EGO_BEYOND_M)
         ego[:, 2] += _ground_below(scene.background, poses[:, :3, 3])
         paths.append(WheelPath(ego, EGO_WIDTH_M))
@@ -741,12 +754,14 @@ _SURELY_BELOW_M = 0.5  # the cameras: there is ground behind what lies there, no
 class PlacementSettings:
     """How a support is found. cell_m: side of the cells near the path, metres; they double with the
     distance from it. max_slope_deg: nothing steeper carries snow. estimator: the depth buffer that
-    heights from above are taken from.
+    heights from above are taken from. invented_tracks: if True, the ego leaves wheel tracks on an
+    invented drive, too.
     """
 
     cell_m: float = 0.05
     max_slope_deg: float = 50.0
     estimator: Estimator = "mode"
+    invented_tracks: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell_m) and self.cell_m > 0):
@@ -793,17 +808,31 @@ def place_snow_support(
         return SnowSupport(_no_cells(), {})
     parked = tuple(_parked(scene))
     steps = len(views) + len(squares) + len(vehicles)
-    with tqdm(total=steps, desc="placing snow", disable=not progress, unit="step") as bar:
+    with (
+        ProgressBar(total=steps, desc=PLACING, disable=not progress, unit="step") as bar,
+        counted(PLACING, steps) as advance,
+    ):
+
+        def after_each() -> None:
+            bar.update()
+            advance()
+
         parts = [PosedGaussians(background), *parked]
-        seen_from = draw_views(views, parts, backend=backend, after_each=bar.update)
-        paths = wheel_paths(scene)
+        seen_from = draw_views(views, parts, backend=backend, after_each=after_each)
+        paths = wheel_paths(scene, with_invented=settings.invented_tracks)
         work = _Ground(
             *(background, parked, plan, views, seen_from, paths, settings),
             *(shadows_of(scene), backend),
         )
-        in_turn = functools.partial(in_order, after_each=bar.update, backend=backend)
+        in_turn = functools.partial(in_order, after_each=after_each, backend=backend)
         found = in_turn(work.find, squares)
-        find = functools.partial(find_actor_cells, **vars(settings), backend=backend)
+        find = functools.partial(
+            find_actor_cells,
+            cell_m=settings.cell_m,
+            max_slope_deg=settings.max_slope_deg,
+            estimator=settings.estimator,
+            backend=backend,
+        )
         on_vehicles = zip(vehicles, in_turn(find, vehicles), strict=True)
         actors = {actor.track_id: cells for actor, cells in on_vehicles if cells is not None}
     return SnowSupport(work.joined(found), actors)

@@ -10,7 +10,8 @@ from jaxtyping import Float32, UInt8
 
 from augment.boxes import SIDES_M, BoxPixels, PlacedBoxes, count_pixels
 from augment.cameras import Camera
-from augment.effects.snow.placement import PlacementSettings
+from augment.effects.snow.placement import PlacementSettings, has_invented_drive
+from augment.scene import Scene
 from recipes.snow import Snow
 
 
@@ -25,9 +26,13 @@ class PlacedSnow:
     water_level_z_m: float | None = None
 
 
-def placement_settings(snow: Snow) -> PlacementSettings:
-    """What of a recipe's snow decides where it can lie."""
-    return PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
+def placement_settings(snow: Snow, scene: Scene) -> PlacementSettings:
+    """Return the settings of a recipe's snow that decide where it can lie in a scene."""
+    return PlacementSettings(
+        cell_m=snow.cell_m,
+        max_slope_deg=snow.max_slope_deg,
+        invented_tracks=snow.tracks == "always" and has_invented_drive(scene),
+    )
 
 
 # ---- How much of what an image shows of labelled boxes is snow -----------------------------------

@@ -62,6 +62,9 @@ def support_key(
         digest.update(repr(about).encode())
         _add(digest, camera.camera_from_world)
     _add(digest, *(frame.world_from_ego for frame in scene.frames))
+    if scene.seen_frames is not None:  # wheel tracks are those of the recorded drive
+        digest.update(repr(settings.invented_tracks).encode())
+        _add(digest, *(frame.world_from_ego for frame in scene.seen_frames))
     return digest.hexdigest()
 
 
@@ -186,7 +189,7 @@ def support_of(
         every = every_camera(scene) if cameras is None else cameras
         key = "" if folder is None else support_key(scene, every, settings, backend=backend)
         path = None if folder is None else support_path(folder, key)
-        if path is not None and path.exists():
+        if path is not None and path.is_file():
             try:
                 return load_support(path, key)
             except SceneError as error:

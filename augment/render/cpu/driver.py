@@ -540,7 +540,7 @@ def _splats_in(rects: np.ndarray, limit: int) -> int:
 def warm_up() -> float:
     """Compile every kernel that colour, alpha and median depth need; seconds it took.
 
-    Later processes read the compiled kernels from numba's cache beside the sources.
+    Later processes read the compiled kernels from the cache folder (see kernel_cache.py).
     """
     start = time.perf_counter()
     gaussians = Gaussians(

@@ -10,15 +10,24 @@ import contextlib
 import fcntl
 import functools
 import hashlib
+import logging
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CellType, FunctionType
 from typing import Any
 
 import numba
+from numba.core import event
 from numba.core.compiler_lock import global_compiler_lock
 
+from augment.render.cpu.kernel_cache import cache_of_kernel, kernel_cache_folder, user_cache_folder
+
+logger = logging.getLogger(__name__)
+
+# Seconds without compiling after which the next compiling is logged again.
+MIN_PAUSE_S = 10.0
 _COMMON = {"nogil": True, "error_model": "numpy"}
 
 KERNELS: dict[str, Any] = {}  # all that were imported, by "module:function"
@@ -28,8 +37,15 @@ inner = functools.partial(numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=
 
 
 def _hash_sources() -> str:
+    """Digest of the files that hold functions which kernels of other files call."""
     folder = Path(__file__).parent
-    sources = [*sorted(folder.glob("*.py")), folder.parent / "layout.py"]
+    render = folder.parent
+    sources = [
+        *sorted(folder.glob("*.py")),
+        *sorted(render.glob("*_kernels.py")),
+        render / "layout.py",
+        render.parent / "kernels.py",
+    ]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
@@ -57,7 +73,9 @@ def _compiled(function: FunctionType, *, parallel: bool) -> Any:
     closed = FunctionType(code, function.__globals__, function.__name__, None, (CellType(SOURCES),))
     functools.update_wrapper(closed, function)
     del closed.__wrapped__
-    compiled = numba.njit(parallel=parallel, cache=True, **_COMMON)(closed)
+    compiled = numba.njit(parallel=parallel, **_COMMON)(closed)
+    if (cache := cache_of_kernel(closed, SOURCES)) is not None:
+        compiled._cache = cache
     name = f"{function.__module__}:{function.__name__}"
     compiled.compile = functools.partial(_compile_alone, compiled.compile, name)
     KERNELS[name] = compiled
@@ -66,8 +84,58 @@ def _compiled(function: FunctionType, *, parallel: bool) -> Any:
 
 def _compile_alone(compile_kernel: Callable[[Any], Any], name: str, sig: Any) -> Any:
     # In this order: a kernel's compilation compiles those that it calls, under numba's lock.
-    with global_compiler_lock, compiling(name, sig):
+    with global_compiler_lock, compiling(name, sig), _CLOCK.running():
         return compile_kernel(sig)
+
+
+class _Clock:
+    """The seconds that this process has spent on compiling kernels, and on reading them from the
+    cache. It runs under numba's lock, so for one thread at a time.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth = 0
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        started = time.perf_counter()
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0:  # else a kernel's compilation has compiled another one
+                self.seconds += time.perf_counter() - started
+
+
+_CLOCK = _Clock()
+
+
+class _CompileLog(event.Listener):
+    """Logs that kernels are compiled, before the first of several is. Reading them from the cache
+    is no such event.
+    """
+
+    def __init__(self) -> None:
+        self._end_s = -MIN_PAUSE_S
+
+    def on_start(self, event: event.Event) -> None:
+        if time.monotonic() - self._end_s >= MIN_PAUSE_S:
+            logger.info(COMPILE_NOTE, os.environ.get("NUMBA_CACHE_DIR") or kernel_cache_folder())
+        self._end_s = time.monotonic()  # of inner functions' events, which lie within it
+
+    def on_end(self, event: event.Event) -> None:
+        self._end_s = time.monotonic()
+
+
+COMPILE_NOTE = "compiling kernels (once; kept in %s) ..."
+event.register("numba:compile", _CompileLog())
+
+
+def seconds_compiling() -> float:
+    """Return how many seconds this process has spent on having its kernels compiled so far."""
+    return _CLOCK.seconds
 
 
 @contextlib.contextmanager
@@ -83,7 +151,7 @@ def compiling(name: str, sig: Any, *, wait: bool = True) -> Iterator[bool]:
         fcntl.lockf(file, way, 1, place)
     except BlockingIOError:
         yield False
-    except OSError:  # there is no such folder: processes may do the same work twice
+    except (OSError, RuntimeError):  # there is no such folder: processes may do the same work twice
         yield True
     else:
         try:
@@ -95,6 +163,7 @@ def compiling(name: str, sig: Any, *, wait: bool = True) -> Iterator[bool]:
 @functools.cache
 def _lock_file(_process: int) -> int:
     """A file of which each kernel's lock is a byte. It stays open: closing it ends all locks."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "climategs"
+    cache = user_cache_folder()
     cache.mkdir(parents=True, exist_ok=True)
-    return os.open(cache / "kernels.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    return os.open(cache / "kernels.lock", flags, 0o600)

@@ -1,0 +1,154 @@
+"""Whether the tables of a COLMAP model are whole, before pycolmap reads them.
+
+pycolmap does not look at the end of a file: behind it, numbers are whatever was in memory. The
+layouts are COLMAP's (src/colmap/scene/reconstruction_io_*.cc): a binary table begins with the
+number of its entries; a text that COLMAP wrote says it in a comment.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+from augment.errors import AdapterError
+from recipes.files import open_file
+
+# Numbers of parameters of COLMAP's camera models, by the models' numbers.
+_CAMERA_PARAMETERS = {
+    **{0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5},
+    **{10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4, 16: 6, 17: 2},
+}
+_MAX_BYTES = 1 << 33  # of a table; the largest models have some gigabytes
+_POSE_BYTES = 7 * 8
+_MAX_NAME_BYTES = 4096
+_ADVICE = "copy the model again, or save it again from COLMAP"
+
+
+class _CutShort(Exception):
+    """A table ends within an entry."""
+
+
+def check_colmap_tables(model: Path) -> None:
+    """Raise where a table of the model in this folder is not whole.
+
+    Raises:
+        AdapterError: a table ends before its last entry, or says what no table can.
+    """
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    for name, (entry_end, word) in _TABLES.items():
+        path = model / f"{name}{suffix}"
+        if not path.exists():  # rigs and frames came with COLMAP 3.12
+            continue
+        try:
+            with open_file(path) as file:
+                size = os.fstat(file.fileno()).st_size
+                if size > _MAX_BYTES:
+                    raise AdapterError(f"{path} is larger than {_MAX_BYTES} bytes; no model is")
+                data = file.read()
+        except OSError as error:
+            raise AdapterError(f"{path} cannot be read ({error.strerror or error})") from None
+        if suffix == ".bin":
+            _check_binary(data, path, entry_end, word)
+        else:
+            _check_text(data, path, word)
+
+
+def _check_binary(
+    data: bytes, path: Path, entry_end: Callable[[bytes, int, str], int], word: str
+) -> None:
+    if len(data) < 8:
+        raise AdapterError(f"{path} is cut short: it has {len(data)} bytes; {_ADVICE}")
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for number in range(1, count + 1):
+        try:
+            at = entry_end(data, at, f"{path}: {word} {number} of {count}")
+        except (struct.error, _CutShort):
+            at = len(data) + 1
+        if at > len(data):
+            raise AdapterError(
+                f"{path.name} is cut short at {word} {number} of {count}: {path} has {len(data)} "
+                f"bytes; {_ADVICE}"
+            )
+
+
+def _check_text(data: bytes, path: Path, word: str) -> None:
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise AdapterError(f"{path} is no UTF-8 text ({error}); {_ADVICE}") from None
+    stated = next(
+        (int(m[1]) for line in lines if (m := re.match(r"# Number of \w+: (\d{1,18})\b", line))),
+        None,
+    )
+    entries = [line for line in lines if not line.startswith("#")]
+    if word == "image":  # its second line, of points, may be empty
+        entries = [line for line in entries[::2] if line.strip()]
+    count = sum(bool(line.strip()) for line in entries)
+    if count == 0 and word in _NEEDED:
+        raise AdapterError(f"{path} holds no {word}; {_ADVICE}")
+    # COLMAP ends the last line, too.
+    is_cut = stated is not None and (count < stated or not data.endswith(b"\n"))
+    if is_cut:
+        number = count + (count < stated)
+        raise AdapterError(
+            f"{path.name} is cut short at {word} {number} of {stated}: {path} has {len(lines)} "
+            f"lines; {_ADVICE}"
+        )
+
+
+# ---- Where an entry of a binary table ends -------------------------------------------------------
+
+
+def _camera_end(data: bytes, at: int, where: str) -> int:
+    (model,) = struct.unpack_from("<i", data, at + 4)
+    if model not in _CAMERA_PARAMETERS:
+        raise AdapterError(
+            f"{where} is of the model number {model}, which is not known; {_ADVICE} in a version "
+            f"that is"
+        )
+    return at + 24 + 8 * _CAMERA_PARAMETERS[model]
+
+
+def _image_end(data: bytes, at: int, where: str) -> int:
+    start = at + 4 + _POSE_BYTES + 4
+    end = data.find(b"\0", start, start + _MAX_NAME_BYTES)
+    if end < 0:
+        if start + _MAX_NAME_BYTES < len(data):
+            raise AdapterError(f"{where} has a name without an end; {_ADVICE}")
+        raise _CutShort
+    (points,) = struct.unpack_from("<Q", data, end + 1)
+    return end + 9 + 24 * points
+
+
+def _point_end(data: bytes, at: int, where: str) -> int:
+    (length,) = struct.unpack_from("<Q", data, at + 43)
+    return at + 51 + 8 * length
+
+
+def _rig_end(data: bytes, at: int, where: str) -> int:
+    (sensors,) = struct.unpack_from("<I", data, at + 4)
+    at += 8 + 8 * (sensors > 0)
+    for _ in range(sensors - 1):
+        (has_pose,) = struct.unpack_from("<B", data, at + 8)
+        at += 9 + _POSE_BYTES * (has_pose > 0)
+    return at
+
+
+def _frame_end(data: bytes, at: int, where: str) -> int:
+    (images,) = struct.unpack_from("<I", data, at + 8 + _POSE_BYTES)
+    return at + 12 + _POSE_BYTES + 16 * images
+
+
+_NEEDED = ("camera", "rig", "frame")  # of which a model has at least one
+# The word for an entry stands in messages.
+_TABLES = {
+    "cameras": (_camera_end, "camera"),
+    "rigs": (_rig_end, "rig"),
+    "frames": (_frame_end, "frame"),
+    "images": (_image_end, "image"),
+    "points3D": (_point_end, "point"),
+}

@@ -1,0 +1,48 @@
+"""What a stopwatch and a watcher are told of passes."""
+
+from __future__ import annotations
+
+import pytest
+
+from augment.timing import PassProgress, counted, stopwatch, timed, watched
+
+
+def work() -> None:
+    with timed("view plan"):
+        with counted("placing snow", 2) as advance:
+            advance()
+            advance()
+        with timed("sky"):
+            pass
+
+
+def test_a_watcher_hears_which_pass_runs_and_how_far_it_has_got():
+    told = list[PassProgress]()
+    with watched(told.append), stopwatch() as seconds:
+        work()
+    assert told == [
+        PassProgress("view plan"),
+        PassProgress("placing snow", 0, 2),
+        PassProgress("placing snow", 1, 2),
+        PassProgress("placing snow", 2, 2),
+        PassProgress("view plan"),
+        PassProgress("sky"),
+        PassProgress("view plan"),
+    ]
+    assert set(seconds) == {"view plan", "sky"}
+    work()
+    assert len(told) == 7  # nobody listens any more
+
+
+@pytest.mark.parametrize("last", [("sky", 0), ("placing snow", 0), ("placing snow", 1)])
+def test_what_a_watcher_raises_gives_up_what_runs(last):
+    told = list[PassProgress]()
+
+    def tell(progress: PassProgress) -> None:
+        told.append(progress)
+        if (progress.name, progress.done) == last:
+            raise KeyError("nobody waits")
+
+    with pytest.raises(KeyError, match="nobody waits"), watched(tell):
+        work()
+    assert (told[-1].name, told[-1].done) == last

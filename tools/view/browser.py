@@ -1,0 +1,41 @@
+"""What a page needs of the browser beside viser's widgets: which keys fly, and one style."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+# viser's camera hears keys on the document, and lets only those pass that are typed into a text or
+# a number. Sliders, tabs and lists move by the arrow keys themselves: what has the focus gets them,
+# and below the document nothing else hears them. A click on the picture gives it the keys again.
+ARROWS_STAY_WITH_WIDGETS = """
+const moves = "[role=slider], [role=tab], [role=option], [role=listbox], [role=menuitem]";
+document.body.addEventListener("keydown", (event) => {
+  const widget = event.target instanceof Element && event.target.closest(moves);
+  if (widget && event.key.startsWith("Arrow")) event.stopPropagation();
+});
+document.body.addEventListener("pointerdown", (event) => {
+  const focused = document.activeElement;
+  if (event.target instanceof HTMLCanvasElement && focused instanceof HTMLElement) focused.blur();
+}, true);
+"""
+
+
+def page_style(place_sliders: Iterable[Any], headings: Iterable[Any]) -> str:
+    """The page's style as HTML.
+
+    Args:
+        place_sliders: Handles of sliders whose numbers are places along their way, which tell
+            nobody anything: viser's box beside them is hidden, as the value has a box of its own,
+            and their marks get room.
+        headings: Handles of ticks that begin a part of the page; their labels are bold.
+    """
+    sliders = [f"[id='{handle._impl.uuid}']" for handle in place_sliders]
+    labels = [f"label[for='{handle._impl.uuid}']" for handle in headings]
+    rules = {
+        ", ".join(f"{slider} + *" for slider in sliders): "display: none",
+        ", ".join(sliders): "margin-bottom: 1em",
+        ", ".join(labels): "font-weight: bold; color: black",
+    }
+    text = " ".join(f"{where} {{ {what} }}" for where, what in rules.items() if where)
+    return f"<style>{text}</style>"

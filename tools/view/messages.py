@@ -1,0 +1,279 @@
+"""Messages that a page may send: anything else goes no further than this file.
+
+viser handles whatever a connection sends, takes any number, sets any attribute of a widget that a
+message names, and keeps parts of uploads for as long as the connection lasts. So each message is
+read here first, by a schema, and written anew for viser. Uploads are put together here, within
+limits of size, number and time, and passed on whole.
+
+This module needs the libraries of viser's protocol, which are installed with viser.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import msgspec
+import viser
+import zstandard
+from msgspec import Meta
+from websockets.asyncio.server import ServerConnection
+
+from augment.errors import ClimateGSError
+from tools.view.widgets import value_of
+
+MAX_MESSAGE_BYTES = 2**20  # of one message; a browser cuts files into parts of half as much
+MAX_UPLOAD_BYTES = 64 * 2**20  # of the files that a page has begun to upload
+MAX_UPLOADS = 4  # that a page has begun and not ended
+UPLOAD_S = 60.0  # without a part, after which an upload is given up
+MAX_TEXT = 65_536  # characters that a person may write into a widget
+_LOG = logging.getLogger(__name__)
+
+Name = Annotated[str, Meta(max_length=128)]
+Coordinate = Annotated[float, Meta(ge=-1e7, le=1e7)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Pixels = Annotated[int, Meta(ge=0, le=2**15)]
+Number = Annotated[float, Meta(ge=-1e300, le=1e300)]
+Whole = Annotated[int, Meta(ge=-(2**53), le=2**53)]
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
+
+
+class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
+    """Where the window's camera is: world_from_camera, and the size of the window in pixels."""
+
+    wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    position: Vector
+    fov: Annotated[float, Meta(gt=1e-3, lt=2.8)]
+    near: Number
+    far: Number
+    image_height: Pixels
+    image_width: Pixels
+    look_at: Vector
+    up_direction: Vector
+
+    def __post_init__(self) -> None:
+        if sum(number * number for number in self.wxyz) < 1e-6:
+            raise ValueError("wxyz is no rotation")
+
+
+class Updates(msgspec.Struct, forbid_unknown_fields=True):
+    """The new value of a widget, and nothing else of it."""
+
+    value: bool | Whole | Number | Text | Annotated[tuple[Whole | Number, ...], Meta(max_length=8)]
+
+
+class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
+    """A person has changed a widget, or pressed a button."""
+
+    uuid: Name
+    updates: Updates
+
+
+class FileTransferStartUpload(
+    msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True
+):
+    """A person has chosen a file; its parts follow."""
+
+    source_component_uuid: Name
+    transfer_uuid: Name
+    filename: Annotated[str, Meta(max_length=1024)]
+    mime_type: Annotated[str, Meta(max_length=1024)]
+    part_count: Annotated[int, Meta(ge=0, le=1024)]
+    size_bytes: Annotated[int, Meta(ge=0, le=2**53)]
+
+
+class FileTransferPart(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
+    """A part of a file."""
+
+    source_component_uuid: Name
+    transfer_uuid: Name
+    part_index: Annotated[int, Meta(ge=0, le=1024)]
+    content: bytes
+
+
+PageMessage = ViewerCameraMessage | GuiUpdateMessage | FileTransferStartUpload | FileTransferPart
+_DECODER = msgspec.msgpack.Decoder(PageMessage)
+
+
+@dataclass
+class Upload:
+    """A file whose parts are coming in.
+
+    start: its first message. parts: content by number. size_bytes: of the parts so far. last:
+    when the latest part came, as `time.monotonic` has it.
+    """
+
+    start: FileTransferStartUpload
+    parts: dict[int, bytes] = field(default_factory=dict)
+    size_bytes: int = 0
+    last: float = field(default_factory=time.monotonic)
+
+
+class Uploads:
+    """The files that one page has begun to upload. report: says on the page what is refused."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
+        self._uploads: dict[str, Upload] = {}
+
+    def __len__(self) -> int:
+        return len(self._uploads)
+
+    def begin(self, start: FileTransferStartUpload) -> list[PageMessage]:
+        """Return what to pass on: an empty file has no parts."""
+        size = start.size_bytes
+        waiting = sum(upload.start.size_bytes for upload in self._uploads.values())
+        if start.transfer_uuid in self._uploads:
+            return []
+        if len(self) >= MAX_UPLOADS or waiting + size > MAX_UPLOAD_BYTES:
+            self._report(
+                f"{start.filename} ({size / 2**20:.1f} MiB) was not uploaded: a page takes "
+                f"{MAX_UPLOADS} files of {MAX_UPLOAD_BYTES // 2**20} MiB together at a time; copy "
+                f"it to the machine of climategs view and write its path instead"
+            )
+            return []
+        if start.part_count == 0:
+            return [msgspec.structs.replace(start, size_bytes=0)]
+        self._uploads[start.transfer_uuid] = Upload(start)
+        return []
+
+    def add(self, part: FileTransferPart) -> list[PageMessage]:
+        """Return what to pass on: the whole file with its last part."""
+        upload = self._uploads.get(part.transfer_uuid)
+        if upload is None or part.part_index in upload.parts:
+            return []
+        upload.parts[part.part_index] = part.content
+        upload.size_bytes += len(part.content)
+        upload.last = time.monotonic()
+        start, count = upload.start, len(upload.parts)
+        too_large = upload.size_bytes > start.size_bytes or part.part_index >= start.part_count
+        if count < start.part_count and not too_large:
+            return []
+        del self._uploads[part.transfer_uuid]
+        if too_large or upload.size_bytes != start.size_bytes:
+            self._report(f"{start.filename} was not uploaded: its parts are not what was announced")
+            return []
+        content = b"".join(upload.parts[index] for index in range(count))
+        whole = FileTransferPart(start.source_component_uuid, start.transfer_uuid, 0, content)
+        return [msgspec.structs.replace(start, part_count=1), whole]
+
+    def progress(self, message: FileTransferStartUpload | FileTransferPart) -> tuple[int, int]:
+        """Bytes of the message's file so far, and of all of it; of one that has ended or was
+        refused, twice the same, for the page to take the next.
+        """
+        upload = self._uploads.get(message.transfer_uuid)
+        return (1, 1) if upload is None else (upload.size_bytes, upload.start.size_bytes)
+
+    def forget_idle(self) -> None:
+        """Give up those that no part has come of for a while."""
+        for key, upload in list(self._uploads.items()):
+            if time.monotonic() - upload.last > UPLOAD_S:
+                del self._uploads[key]
+                self._report(
+                    f"{upload.start.filename} was not uploaded: no part of it has come for "
+                    f"{UPLOAD_S:g} s"
+                )
+
+
+class PageConnection(ServerConnection):
+    """A page's connection, of which viser gets only the messages that a page may send.
+
+    Once there is a page, `widget_of` gives viser's handle of a widget by its name in messages, and
+    `report` says on the page what was refused.
+    """
+
+    def __init__(self, *args: Any, **own: Any) -> None:
+        super().__init__(*args, **own)
+        self.widget_of: Callable[[str], Any] = lambda _: None
+        self.report: Callable[[str], None] = _LOG.debug
+        self._uploads = Uploads(lambda text: self.report(text))
+        self._ready: deque[bytes] = deque()
+        self._timer: asyncio.TimerHandle | None = None  # runs while there are uploads
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """Return the next message for viser."""
+        while not self._ready:
+            data = await super().recv(decode)
+            try:
+                admitted = await self._admitted(read_message(data))
+            except ValueError as error:
+                _LOG.debug("a message of a page is passed over: %s", error)
+                if isinstance(data, bytes) and GuiUpdateMessage.__name__.encode() in data[:256]:
+                    self.report(
+                        f"the page's value was not taken: numbers are finite, and a text has at "
+                        f"most {MAX_TEXT} characters"
+                    )
+            except ClimateGSError as error:
+                self.report(str(error))
+            else:
+                self._ready.extend(map(msgspec.msgpack.encode, admitted))
+        return self._ready.popleft()
+
+    async def _admitted(self, message: PageMessage) -> list[PageMessage]:
+        """Return what of a message is passed on.
+
+        Raises:
+            ClimateGSError: the widget that it names cannot have the value.
+        """
+        if isinstance(message, ViewerCameraMessage):
+            return [message]
+        if isinstance(message, GuiUpdateMessage):
+            widget = self.widget_of(message.uuid)
+            if widget is None or isinstance(widget, viser.GuiUploadButtonHandle):
+                return []
+            value = value_of(widget, message.updates.value)
+            return [GuiUpdateMessage(message.uuid, Updates(value))]
+        widget = self.widget_of(message.source_component_uuid)
+        is_upload = isinstance(widget, viser.GuiUploadButtonHandle)
+        return await self._take_upload(message) if is_upload else []
+
+    async def _take_upload(
+        self, message: FileTransferStartUpload | FileTransferPart
+    ) -> list[PageMessage]:
+        if isinstance(message, FileTransferStartUpload):
+            admitted = self._uploads.begin(message)
+            if self._timer is None and self._uploads:
+                self._forget_idle()
+        else:
+            admitted = self._uploads.add(message)
+        so_far, total = self._uploads.progress(message)
+        told = {
+            "type": "FileTransferPartAck",
+            "source_component_uuid": message.source_component_uuid,
+            "transfer_uuid": message.transfer_uuid,
+            "transferred_bytes": so_far,
+            "total_bytes": total,
+        }
+        if not admitted:  # else viser tells
+            await self.send(frame_of(told))
+        return admitted
+
+    def _forget_idle(self) -> None:
+        self._uploads.forget_idle()
+        loop = asyncio.get_running_loop()
+        self._timer = loop.call_later(UPLOAD_S / 4, self._forget_idle) if self._uploads else None
+
+
+def read_message(data: Any) -> PageMessage:
+    """Return a page's message.
+
+    Raises:
+        ValueError: it is none that a page may send, or a value in it is none that a page has.
+    """
+    try:
+        return _DECODER.decode(data)
+    except (msgspec.MsgspecError, RecursionError, TypeError, OverflowError) as error:
+        raise ValueError(str(error)) from error
+
+
+def frame_of(message: dict[str, Any]) -> bytes:
+    """Bytes of a message to a page, as viser sends them: two lengths, and packed messages."""
+    content = {"messages": [message], "timestampSec": time.perf_counter()}
+    inner = msgspec.msgpack.encode({**content, "binaryBufferLengths": ()})
+    packed = zstandard.ZstdCompressor(level=1).compress(inner)
+    return len(inner).to_bytes(8, "little") + len(packed).to_bytes(8, "little") + packed

@@ -1,0 +1,137 @@
+"""The line that says what a page shows, what is being done for it, and how far that has got.
+
+"At rest" is said of nothing but the whole picture of what the page asks for now.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from augment.timing import PassProgress
+
+if TYPE_CHECKING:
+    from tools.view.page import Wish
+
+MOVING_S = 0.4  # a picture that was drawn while something moves is news for so long
+BUSY_S = 0.5  # a wait that is longer gets a bar, and from a second on its seconds are told
+# Passes that draw nothing yet: effects find out there what they put into the scene.
+_PREPARATIONS = ("plan", "view plan", "parts", "prune")
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """The picture that a page has got last."""
+
+    wish: Wish
+    """What the page asked for."""
+    width: int
+    """Its columns, without bars."""
+    height: int
+    """Its rows, without bars."""
+    seconds: float
+    """How long it took."""
+    at: float
+    """When it was sent, on the monotonic clock."""
+    is_rest: bool
+    """Whether it is the whole picture, and not a rough one while something moves."""
+    is_complete: bool = True
+    """Whether what lies over the picture is there, too."""
+    is_valid: bool = True
+    """Whether the wish's recipe is valid; else the picture is of the last one that was."""
+
+
+@dataclass
+class Activity:
+    """What the thread that draws is doing. It writes, other threads read."""
+
+    progress: PassProgress | None = None
+    """The pass that runs; None before the first."""
+    compiling: int = 0
+    """Kernels that are being compiled."""
+    compiled: int = 0
+    """Kernels that have been compiled for this picture."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a page says."""
+
+    text: str
+    """One sentence."""
+    is_current: bool
+    """Whether the picture is of what the page asks for."""
+    share: float | None = None
+    """How much of a preparation is done, 0 to 1; None where that is not known."""
+    is_long: bool = False
+    """Whether it takes long enough for a bar."""
+
+
+def describe_activity(activity: Activity | None) -> str:
+    """What the thread is doing, in words. activity: None while it draws for another page."""
+    if activity is None:
+        return "waiting for the picture of another page"
+    progress = activity.progress
+    if progress is not None and progress.total and not activity.compiling:
+        return f"{progress.name}, step {progress.done} of {progress.total}"
+    if activity.compiling or activity.compiled:  # or another process compiles what is wanted next
+        so_far = f", {activity.compiled} done" if activity.compiled else ""
+        return f"compiling kernels (only the first time{so_far})"
+    if progress is None:
+        return "drawing"
+    return "preparing the scene" if progress.name in _PREPARATIONS else f"drawing ({progress.name})"
+
+
+def page_status(
+    picture: ShownPicture | None,
+    wish: Wish,
+    activity: Activity | None,
+    *,
+    waited_s: float,
+    now: float,
+    has_failed: bool = False,
+) -> Status:
+    """What a page says of its picture.
+
+    Args:
+        picture: The last picture; None before the first.
+        wish: What the page asks for.
+        activity: What the thread does for this page; None while it draws for another.
+        waited_s: Seconds since the wish.
+        now: On the monotonic clock.
+        has_failed: Whether the wish could not be drawn.
+    """
+    if has_failed:
+        return Status("Not drawn", False)
+    is_current = picture is not None and picture.wish is wish
+    if picture is not None:
+        size = f"{picture.width} x {picture.height}"
+        if is_current and picture.is_rest and picture.is_complete:
+            recipe = "" if picture.is_valid else "; of the last recipe that was valid"
+            return Status(f"{size} at rest, {1000 * picture.seconds:.0f} ms{recipe}", True)
+        if not picture.is_rest and now - picture.at < MOVING_S:
+            return Status(f"{size} while moving, {1000 * picture.seconds:.0f} ms", is_current)
+    doing = describe_activity(activity)
+    if waited_s >= 1:
+        doing += f", {waited_s:.0f} s"
+    share = None
+    if activity is not None and activity.progress is not None and not activity.compiling:
+        total = activity.progress.total
+        share = activity.progress.done / total if total else None
+    text = f"{_what_is_shown(picture, wish)}: {doing}"
+    return Status(text, is_current, share, waited_s >= BUSY_S)
+
+
+def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
+    """How the picture differs from the wish, in words."""
+    if picture is None:
+        return "First picture"
+    if picture.wish is wish:
+        follows = "what lies over it" if picture.is_rest else "the whole one"
+        return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
+    if picture.wish.edits != wish.edits:
+        return "Picture not of this recipe yet"
+    views = ((own.frame, own.camera, own.pose) for own in (picture.wish, wish))
+    if len(set(views)) > 1:
+        return "Picture not of this view yet"
+    return "Picture not up to date yet"
