@@ -185,9 +185,11 @@ def _chunk_size(path: str, leaf: Any, num_stated: int, pages: Sequence[_Page]) -
 
 
 def _read_pages(file: pa.NativeFile, chunk: Any, max_pages: int) -> list[_Page]:
-    start = chunk.data_page_offset
-    if chunk.has_dictionary_page and chunk.dictionary_page_offset:
-        start = min(start, chunk.dictionary_page_offset)
+    offsets = [chunk.data_page_offset]
+    if chunk.has_dictionary_page:
+        offsets.append(chunk.dictionary_page_offset)
+    # A table without rows may have a dictionary and no page of data, whose place is then 0.
+    start = min((offset for offset in offsets if offset), default=-1)
     end = min(start + chunk.total_compressed_size, file.size())
     pages: list[_Page] = []
     while 0 <= start < end:
