@@ -31,7 +31,7 @@ from adapters.uri import (
     known_schemes,
     parse_uri,
 )
-from augment.errors import AdapterError
+from augment.errors import AdapterError, SceneError
 from augment.scene import Ground, Scene
 from recipes.errors import nearest_word
 from recipes.job import JobScene
@@ -67,6 +67,10 @@ def open_scene(uri: str) -> Scene:
             scene = cached_scene(scheme, path, query, build) if entry.is_raw else build()
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
+        except AdapterError:
+            raise
+        except SceneError as error:
+            raise AdapterError(f"{uri!r}: {error}") from error
     if ground_z is not None:
         scene = _with_ground(scene, ground_z)
     if camera_path is None:

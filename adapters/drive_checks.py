@@ -61,15 +61,21 @@ def camera_problems(frames: Sequence[Frame]) -> tuple[str, ...]:
 
 # ---- The frame of LiDAR returns ------------------------------------------------------------------
 
+# Edge of a cell of the plan, and how far the plan reaches to each side.
 _CELL_M = 0.5
 _REACH_M = 40.0
 # A cell whose returns are this far apart in height has something upright in it.
 _UPRIGHT_M = 1.0
 _MIN_UPRIGHT_CELLS = 60
+# How far the car drives between the sweeps of a pair: at least, and preferably.
 _MIN_STEP_M = 1.5
 _STEP_M = 4.0
+# How far it may turn meanwhile.
 _MAX_TURN_RAD = 0.1
 _MAX_PAIRS = 3
+# Sweeps that are looked at as the first of a pair, and those after each.
+_MAX_STARTS = 60
+_MAX_LATER = 200
 # What fits best lies as far off as the car drove, give or take.
 _TOLERANCE_M = 0.75
 _TOLERANCE = 0.2
@@ -116,24 +122,23 @@ def lidar_problems(
 
 
 def _pairs(frames: Sequence[Frame], sweeps: Sequence[tuple[int, np.ndarray]]) -> list[_Pair]:
+    """Some pairs of sweeps between which the car drove about _STEP_M without a turn."""
+    if len(sweeps) < 2:
+        return []
     times = np.array([frame.timestamp_ns for frame in frames], np.int64)
-    poses = [
-        frames[int(np.abs(times - time).argmin())].world_from_ego.numpy() for time, _ in sweeps
-    ]
+    poses = np.stack(
+        [frames[int(np.abs(times - time).argmin())].world_from_ego.numpy() for time, _ in sweeps]
+    )
     pairs: list[_Pair] = []
-    for start in range(len(sweeps)):
-        best = None
-        for end in range(start + 1, len(sweeps)):
-            step_m = float(np.linalg.norm(poses[end][:2, 3] - poses[start][:2, 3]))
-            turn = float(poses[start][:3, 0] @ poses[end][:3, 0])
-            if step_m < _MIN_STEP_M or turn < np.cos(_MAX_TURN_RAD):
-                continue
-            if best is None or abs(step_m - _STEP_M) < abs(best.step_m - _STEP_M):
-                best = _Pair(sweeps[start][1], sweeps[end][1], step_m)
-            if step_m > 2 * _STEP_M:
-                break
-        if best is not None:
-            pairs.append(best)
+    for start in range(0, len(sweeps) - 1, max(1, len(sweeps) // _MAX_STARTS)):
+        later = poses[start + 1 : start + 1 + _MAX_LATER]
+        steps_m = np.linalg.norm(later[:, :2, 3] - poses[start, :2, 3], axis=1)
+        is_straight = later[:, :3, 0] @ poses[start, :3, 0] > np.cos(_MAX_TURN_RAD)
+        misfit = np.where(is_straight & (steps_m > _MIN_STEP_M), np.abs(steps_m - _STEP_M), np.inf)
+        best = int(misfit.argmin())
+        if np.isfinite(misfit[best]):
+            end = start + 1 + best
+            pairs.append(_Pair(sweeps[start][1], sweeps[end][1], float(steps_m[best])))
     return pairs[:: max(1, len(pairs) // _MAX_PAIRS)][:_MAX_PAIRS]
 
 

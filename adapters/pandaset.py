@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, read_image_size, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validated
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -47,6 +47,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
+    names_in,
     recentred,
     scene_of_drive,
     usable_images,
@@ -218,8 +219,8 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
-    seen = (read_image_size(folder / f"{n:02d}.jpg") for n in sorted(numbers))
-    size = next((found for found in seen if not isinstance(found, str)), None)
+    headers = (check_image(folder / f"{n:02d}.jpg") for n in sorted(numbers))
+    size = next((header.size for header in headers if not isinstance(header, str)), None)
     if size is None:
         raise AdapterError(f"{folder} holds no image that can be used; unpack the sequence again")
     return _CameraTrack(lens, size, poses, _read_times(folder / "timestamps.json", frames))
@@ -689,7 +690,7 @@ def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
     positions = [table[f"position.{axis}"].to_numpy(dtype=np.float64) for axis in "xyz"]
     return Boxes(
         track_ids=tuple(str(v) for v in table["uuid"]),
-        labels=tuple(str(v) for v in table["label"]),
+        labels=names_in(table["label"]),
         centers_m=np.stack(positions, axis=1),
         sizes_m=np.stack(dimensions, axis=1),
         quats=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),

@@ -16,7 +16,8 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
 from augment.errors import AdapterError
-from augment.files.image_size import image_header
+from augment.files.image_size import ImageHeader, image_header
+from augment.files.recorded_images import TWELVE_BITS, decode_pixels, has_12_bits
 from augment.files.recorded_images import ImageFault as ImageFault
 from augment.files.recorded_images import decode_image as decode_image
 from augment.files.recorded_images import is_whole_jpeg as is_whole_jpeg
@@ -152,9 +153,13 @@ _MOST_HEADER = 1 << 18  # bytes, with previews and profiles
 MISSING = "does not exist"
 
 
-def read_image_size(path: Path, *, decode: bool = True) -> tuple[int, int] | str:
-    """Width and height of a PNG or JPEG, decoded once to be sure of it (a JPEG at an eighth of its
-    size), or what is wrong with it as the end of a sentence. Without decoding its header counts."""
+def check_image(path: Path, *, decode: bool = True) -> ImageHeader | str:
+    """The header of a PNG or JPEG, or what is wrong with the image as the end of a sentence.
+
+    Args:
+        decode: decode it once to be sure of it, a JPEG at an eighth of its size. Without, its
+            header counts; images of 16 bits are decoded all the same, their values tell.
+    """
     try:
         with open_file(path) as file:
             data = file.read(-1 if decode else _MOST_HEADER)
@@ -169,22 +174,17 @@ def read_image_size(path: Path, *, decode: bool = True) -> tuple[int, int] | str
     if not any(data.startswith(start) and end in tail for start, end in _IMAGE_ENDS):
         return "is cut short, or neither PNG nor JPEG"
     header = image_header(data)
-    if not decode:
-        return "cannot be decoded" if header is None else (header.width, header.height)
-    is_jpeg = header is not None and header.format == "JPEG"
-    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if is_jpeg else cv2.IMREAD_COLOR
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # larger than OpenCV allows
-        image = None
-    if image is None or header is None:
+    if header is None:
         return "cannot be decoded"
-    rows, columns = image.shape[:2]
-    if not is_jpeg:
-        return columns, rows
-    size = header.width, header.height
-    # What differs has been turned as EXIF asks for.
-    return size if (columns, rows) == (-(-size[0] // 8), -(-size[1] // 8)) else size[::-1]
+    if header.bits == 16:
+        if not decode:
+            return check_image(path)
+        if has_12_bits(data):
+            return TWELVE_BITS
+    if not decode:
+        return header
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 if header.format == "JPEG" else cv2.IMREAD_COLOR
+    return "cannot be decoded" if decode_pixels(data, flags) is None else header
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:

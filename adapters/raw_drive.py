@@ -8,6 +8,7 @@ images, sweeps, boxes, classes, and weathered sweeps in the form of the dataset'
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,11 +24,13 @@ import torch
 from pydantic import BeforeValidator, Field
 
 from adapters.drive_checks import camera_problems, lidar_problems
-from adapters.plain_files import MISSING, read_image_size
+from adapters.plain_files import MISSING, check_image
 from adapters.uri import UriOptions
 from augment.cameras import Frame
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
+from augment.files.image_size import ImageHeader
+from augment.files.recorded_images import exif_hint
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.scene import Gaussians, Ground, Scene
@@ -188,7 +191,7 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
         AdapterError: a camera's size is known from no calibration and no image; or, for
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
-        look = partial(_size_or_fault, decode=len(pictures) <= _MAX_DECODED)
+        look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
         seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
@@ -196,7 +199,8 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
     paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
     sizes, problems = {}, []
     for camera, own in by_camera.items():
-        usual = Counter(seen[p] for p in own if not isinstance(seen[p], str)).most_common(1)
+        headers = [header for p in own if not isinstance(header := seen[p], str)]
+        usual = Counter(header.size for header in headers).most_common(1)
         size = own[0].size or (usual[0][0] if usual else None)
         faults = []
         for picture in own:
@@ -216,22 +220,48 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
             faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
         sizes[camera] = size
         problems += faults
-    return DriveImages(paths, sizes, tuple(problems))
+    used = [
+        (p, h) for p, h in seen.items() if p.camera in paths[p.frame] and not isinstance(h, str)
+    ]
+    return DriveImages(paths, sizes, (*problems, *image_notes(used)))
 
 
-def _size_or_fault(picture: Picture, *, decode: bool) -> tuple[int, int] | str:
-    return _NO_FILE if picture.path is None else read_image_size(picture.path, decode=decode)
+def _header_or_fault(picture: Picture, *, decode: bool) -> ImageHeader | str:
+    return _NO_FILE if picture.path is None else check_image(picture.path, decode=decode)
 
 
-def _fault(picture: Picture, seen: tuple[int, int] | str, expected: tuple[int, int] | None) -> str:
-    if seen == expected:
-        return ""
+def _fault(picture: Picture, seen: ImageHeader | str, expected: tuple[int, int] | None) -> str:
     if picture.path is None:
         return "its image is missing"
     if isinstance(seen, str):
         return f"image {picture.path} {seen}; left out"
+    if expected is None or seen.size == expected:
+        return ""
     size = "{0[0]}x{0[1]}".format
-    return f"image {picture.path} is {size(seen)} pixels, its camera {size(expected)}; left out"
+    return (
+        f"image {picture.path} is {size(seen.size)} pixels, its camera {size(expected)}; left out"
+        f"{exif_hint(seen, expected)}"
+    )
+
+
+def image_notes(images: Sequence[tuple[Picture, ImageHeader]]) -> list[str]:
+    """A sentence where usable images have an EXIF orientation, and where they have 16 bits."""
+    notes = []
+    turned = [(picture, header) for picture, header in images if header.orientation != 1]
+    if turned:
+        picture, header = turned[0]
+        notes.append(
+            f"{len(turned)} of {len(images)} images have an EXIF orientation, such as "
+            f"{header.orientation} in camera {picture.camera}, frame {picture.frame}; it is "
+            f"ignored: poses and intrinsics are of the pixels as they are stored"
+        )
+    deep = [picture for picture, header in images if header.bits == 16]
+    if deep:
+        notes.append(
+            f"{len(deep)} of {len(images)} images have 16 bits a channel, such as of camera "
+            f"{deep[0].camera}, frame {deep[0].frame}; they are read as their values / 256"
+        )
+    return notes
 
 
 # ---- Sweeps and classes --------------------------------------------------------------------------
@@ -392,6 +422,14 @@ class TimedBoxes:
             yield sample, bool(moves[i])
 
 
+def names_in(values: Iterable[object]) -> tuple[str, ...]:
+    """The texts of a dataset's column of names; "" of what is missing (None or NaN)."""
+    return tuple(
+        "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+        for value in values
+    )
+
+
 def _attribute(boxes: Boxes, names: Sequence[str]) -> np.ndarray | None:
     return next((boxes.attributes[name] for name in names if name in boxes.attributes), None)
 
@@ -420,8 +458,9 @@ def find_objects(
     several: an object may have several boxes in a frame; else the first one counts."""
     samples: list[BoxSample] = []
     labelled: set[str] = set()
-    bad, twice = [], []
+    bad, twice, nameless = [], [], []
     for timed in frames:
+        nameless += [timed.frame for label in timed.boxes.labels if not label]
         seen: set[str] = set()
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
@@ -438,7 +477,13 @@ def find_objects(
     if bad:
         problems.append(
             f"{len(bad)} boxes, the first in frame {bad[0]}, have a centre, size or rotation that "
-            f"is not finite or zero; objects are built without them"
+            f"is not finite or zero, or a negative size; objects are built without them, "
+            f"and labels for trainers have them as DontCare or not at all"
+        )
+    if nameless:
+        problems.append(
+            f"{len(nameless)} boxes, the first in frame {nameless[0]}, have no label; they are of "
+            f"no category, and left out of labels for trainers"
         )
     if twice:
         name, frame = twice[0]
@@ -577,23 +622,20 @@ def _checked(drive: RawDrive) -> RawDrive:
     """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
     seems to be in another frame."""
     low, high = drive.path.min(axis=0), drive.path.max(axis=0)
-    near = [
+    is_near = [
         ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
         for sweep in drive.sweeps
     ]
     sweeps = tuple(
         sweep if keep.all() else sweep.select(keep)
-        for sweep, keep in zip(drive.sweeps, near, strict=True)
-    )
-    far = sum(int((~keep).sum()) for keep in near)
-    said = (
-        (
-            f"{far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path and "
-            f"are left out; coordinates must be metres",
-        )
-        if far
-        else ()
+        for sweep, keep in zip(drive.sweeps, is_near, strict=True)
     )
     timed = [(int(np.median(s.timestamps_ns)), s.points) for s in sweeps if len(s)]
-    frames = camera_problems(drive.frames) + lidar_problems(drive.frames, timed)
-    return replace(drive, sweeps=sweeps, problems=frames + said + drive.problems)
+    problems = [*camera_problems(drive.frames), *lidar_problems(drive.frames, timed)]
+    num_far = sum(int((~keep).sum()) for keep in is_near)
+    if num_far:
+        problems.append(
+            f"{num_far} LiDAR returns lie further than {_MAX_RANGE_M:.0f} m from the car's path "
+            f"and are left out; coordinates must be metres"
+        )
+    return replace(drive, sweeps=sweeps, problems=(*problems, *drive.problems))

@@ -34,17 +34,35 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import Any
 
 from llvmlite.binding import get_host_cpu_name
 
+import augment
+from adapters.detect_format import recognised
 from adapters.scene_folder import with_images_in
-from adapters.uri import SCHEMES, format_uri
-from augment.errors import AdapterError, ClimateGSError, SceneError
+from adapters.uri import SCHEMES, format_uri, parse_uri
+from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
 from augment.files.recorded_images import has_image
-from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
-from augment.jobs.atomic import remove_temporaries
+from augment.files.scene_file import FILES as SCENE_FILES
+from augment.files.scene_file import (
+    LEVELS,
+    SCENE_SUFFIX,
+    VERSION,
+    load_scene_parts,
+    save_scene_file,
+)
+from augment.jobs.atomic import (
+    open_lock,
+    read_file,
+    remove_temporaries,
+    wait_for_lock,
+    write_atomic,
+)
+from augment.jobs.layout import STATE_FOLDER
 from augment.labels import LabelSource
 from augment.scene import Scene, is_drawable
+from recipes.files import open_file
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +71,7 @@ DEFAULT_LIMIT_GB = 10.0  # some 150 scenes
 _MAX_FILES = 1_000_000  # of a dataset's folder: some seconds to look at; or links lead in circles
 _IMAGES = "images"
 _IN_USE_S = 86_400.0
+MAX_BUILDING_S = 1800.0  # how long to wait for another process that builds the same scene
 _CODE = ("adapters", "augment", "recipes")
 _LIBRARIES = (
     "climategs", "numpy", "scipy", "numba", "torch", "opencv-contrib-python-headless",
@@ -235,6 +254,118 @@ def _builder() -> tuple[str, ...]:
     return (code.hexdigest(), *map(str, installed.items()), get_host_cpu_name())
 
 
+# ---- The digest of a scene's content, by which an output knows what it was made from ------------
+# It is of what the files hold, under their names below the scene's path: a copy on another disk has
+# the same, and so has one whose times were changed. Scene files and splat files are read whole. Of
+# recorded drives, images and files of more than 1 MiB are sampled at three places, since a drive
+# has gigabytes; of nuScenes, whose folder has hundreds of scenes, the tables alone are read. What
+# was read once is remembered by the sizes and times of the files, in the user's cache folder.
+
+_DIGEST_FORMAT = 1
+_DIGESTS = "digests"
+_WHOLE = ("scene", "gaussians")  # schemes
+_SPLAT_FILES = {".ply", ".splat", ".spz", ".sog", ".json", ".txt", ".bin", ".webp"}
+_IMAGES_OF_DRIVES = {".jpg", ".jpeg", ".png", ".webp"}
+_MAX_WHOLE_BYTES = 1 << 20
+_IMAGE_SAMPLE_BYTES = 1 << 12
+_SAMPLE_BYTES = 1 << 16
+_SETTLED_S = 2.0  # a file changed later may change again within one tick of its clock
+
+
+def scene_digest(uri: str) -> str | None:
+    """Digest of a scene's content, 32 hexadecimal digits: other content, another digest. Of a
+    procedural scene, it is of its options and the package's version. None where the scene's files
+    cannot be listed or read, of which opening it tells more.
+    """
+    try:
+        scheme, path, query = parse_uri(uri)
+        scheme = scheme or recognised(Path(path))
+        entry = SCHEMES[scheme or ""]
+        if path in entry.builtin:
+            return _sha256([_DIGEST_FORMAT, scheme, sorted(query.items()), augment.__version__])
+        files = _digest_files(str(scheme), path, query)
+        return _remembered([scheme, os.path.abspath(path), sorted(query.items())], files)
+    except (KeyError, OSError, ClimateGSError):
+        return None
+
+
+def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str, tuple[Path, bool]]:
+    """The scene's files by name: where each lies, and whether it is read whole."""
+    root = Path(path)
+    places: list[Path] = [root]
+    if scheme == "nuscenes":
+        places = [folder.parent for folder in sorted(root.glob("*/sample.json"))]
+    elif scheme == "scene" and root.is_dir():
+        places = [root / name for name in (*SCENE_FILES, LEVELS) if (root / name).is_file()]
+    elif scheme in ("waymo", "kitti", "recording"):
+        options = {key: value for key, value in query.items() if not Path(value).is_file()}
+        places = list(_files_of(scheme, path, options, lambda: None))
+    files: dict[str, tuple[Path, bool]] = {}
+    for place in places:
+        for file in _visible_files(place) if place.is_dir() else (place,):
+            if scheme == "gaussians" and root.is_dir() and file.suffix not in _SPLAT_FILES:
+                continue
+            files[os.path.relpath(file, root)] = file, scheme in _WHOLE
+    for key, value in query.items():  # of cameras, say
+        if Path(value).is_file():
+            files[f"?{key}"] = Path(value), True
+    if len(files) > _MAX_FILES:
+        raise AdapterError(f"{path} has more than {_MAX_FILES} files")
+    return files
+
+
+def _visible_files(folder: Path) -> Iterator[Path]:
+    """Files below a folder, without hidden ones and those of outputs that were written there."""
+    for place, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = [
+            name
+            for name in folders
+            if name[0] != "." and not os.path.isdir(os.path.join(place, name, STATE_FOLDER))
+        ]
+        yield from (Path(place, name) for name in names if name[0] != ".")
+
+
+def _remembered(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str:
+    """The digest of the files, from the user's cache folder where none has changed since."""
+    stats = {name: file.stat() for name, (file, _) in sorted(files.items()) if file.is_file()}
+    if not stats:
+        raise FileNotFoundError(str(names))
+    facts = _sha256([_DIGEST_FORMAT, [[n, s.st_size, s.st_mtime_ns] for n, s in stats.items()]])
+    scenes = _cache_folder()
+    memo = None
+    if scenes is not None and _limit_bytes():
+        memo = scenes.with_name(_DIGESTS) / f"{_sha256(names)}.json"
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            known = json.loads(read_file(memo))
+            if isinstance(known, dict) and known.get("facts") == facts:
+                return str(known["digest"])
+    parts = [[name, _content_digest(*files[name], stats[name].st_size)] for name in stats]
+    digest = _sha256([_DIGEST_FORMAT, parts])
+    latest_s = max((s.st_mtime for s in stats.values()), default=0.0)
+    if memo is not None and time.time() - latest_s > _SETTLED_S:
+        with contextlib.suppress(OSError, OutputError):  # it is worked out again
+            memo.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            write_atomic(memo, json.dumps({"facts": facts, "digest": digest}).encode())
+    return digest
+
+
+def _content_digest(file: Path, is_whole: bool, size: int) -> str:
+    is_image = file.suffix.lower() in _IMAGES_OF_DRIVES
+    with open_file(file) as opened:
+        if is_whole or (size <= _MAX_WHOLE_BYTES and not is_image):
+            return hashlib.file_digest(opened, "sha256").hexdigest()
+        length = _IMAGE_SAMPLE_BYTES if is_image else _SAMPLE_BYTES
+        sampled = hashlib.sha256(str(size).encode())
+        for start in sorted({0, max(0, size // 2 - length // 2), max(0, size - length)}):
+            opened.seek(start)
+            sampled.update(opened.read(length))
+        return sampled.hexdigest()
+
+
+def _sha256(facts: object) -> str:
+    return hashlib.sha256(json.dumps(facts).encode(errors="surrogateescape")).hexdigest()[:32]
+
+
 # ---- Entries -------------------------------------------------------------------------------------
 
 
@@ -294,25 +425,29 @@ def _alone(folder: Path, key: str) -> Iterator[bool]:
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            lock = stack.enter_context(path.open("wb"))
-        except OSError as error:
+            lock = open_lock(path)
+        except (OSError, OutputError) as error:
             _complain(folder, error)
             yield False
             return
-        stack.callback(path.unlink, missing_ok=True)
-        with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                logger.info("another process is building this scene; waiting for it")
-                fcntl.flock(lock, fcntl.LOCK_EX)
+        stack.callback(os.close, lock)
+        try:
+            wait_for_lock(path, lock, patience_s=MAX_BUILDING_S, doing="builds this scene")
+        except OutputError as error:
+            logger.warning("%s. The scene is built without the cache", error)
+            yield False
+            return
+        except OSError:  # a system without locks
+            pass
+        else:
             # Not left to closing the file, which a process started meanwhile may have open too.
             stack.callback(fcntl.flock, lock, fcntl.LOCK_UN)
+        stack.callback(path.unlink, missing_ok=True)
         yield True
 
 
 def _digest_of(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:32]
 
 

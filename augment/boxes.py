@@ -100,16 +100,24 @@ def shown_pixels(
             yield number, rows + top, columns + left
 
 
+def are_usable(
+    numbers: Float64[np.ndarray, "B N"], sizes_m: Float64[np.ndarray, "B 3"]
+) -> Bool[np.ndarray, " B"]:
+    """Which boxes have numbers [B, N] that are all finite, and sides longer than 0."""
+    return np.isfinite(numbers).all(axis=1) & (sizes_m > 0).all(axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedBoxes:
     """Boxes in the scene's world. rotations: world_from_box.
 
     low_m, high_m: the part of each box, along its own axes from its centre, that owns surfaces: its
     lowest centimetres left out and its other sides drawn wider (see BOTTOM_M and SIDES_M).
-    sizes_m, corners_m: of the labelled box. Boxes that are not finite hold zeros.
+    sizes_m, corners_m: of the labelled box. is_usable: its numbers are finite, its sides longer
+    than 0 and its quaternion is a rotation; other boxes hold zeros.
     """
 
-    is_finite: Bool[np.ndarray, " B"]
+    is_usable: Bool[np.ndarray, " B"]
     centres_m: Float64[np.ndarray, "B 3"]
     sizes_m: Float64[np.ndarray, "B 3"]
     rotations: Float64[np.ndarray, "B 3 3"]
@@ -118,21 +126,21 @@ class PlacedBoxes:
     corners_m: Float64[np.ndarray, "B 8 3"]
 
     def __len__(self) -> int:
-        return len(self.is_finite)
+        return len(self.is_usable)
 
     @staticmethod
     def of(boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"]) -> PlacedBoxes:
         numbers = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
         turned = np.linalg.norm(boxes.quats, axis=1) > 0
-        finite = np.isfinite(numbers).all(axis=1) & turned
-        quats = np.where(finite[:, None], boxes.quats, np.array([1.0, 0, 0, 0]))
+        usable = are_usable(numbers, boxes.sizes_m) & turned
+        quats = np.where(usable[:, None], boxes.quats, np.array([1.0, 0, 0, 0]))
         rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()
-        centres = np.where(finite[:, None], boxes.centers_m - world_origin_m, 0.0)
-        sizes = np.where(finite[:, None], boxes.sizes_m, 0.0)
+        centres = np.where(usable[:, None], boxes.centers_m - world_origin_m, 0.0)
+        sizes = np.where(usable[:, None], boxes.sizes_m, 0.0)
         low, high = -sizes / 2 - SIDES_M, sizes / 2 + SIDES_M
         low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MAX_OF_HEIGHT * sizes[:, 2])
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
-        return PlacedBoxes(finite, centres, sizes, rotations, low, high, corners)
+        return PlacedBoxes(usable, centres, sizes, rotations, low, high, corners)
 
     def without_margins(self) -> PlacedBoxes:
         """The boxes whose sides own surfaces no further out than they are labelled; their tops and
@@ -160,7 +168,7 @@ def pixel_windows(placed: PlacedBoxes, camera: Camera) -> Int64[np.ndarray, "B 4
     corners = corners @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # [B, 12, 3]
     ends = np.concatenate([cut_edges(a, b), cut_edges(b, a)], axis=1)
-    seen = (np.maximum(a[..., 2], b[..., 2]) > NEAR_M) & placed.is_finite[:, None]
+    seen = (np.maximum(a[..., 2], b[..., 2]) > NEAR_M) & placed.is_usable[:, None]
     seen = np.concatenate([seen, seen], axis=1)
     z = np.where(seen, ends[..., 2], 1.0)
     windows = np.zeros((len(corners), 4), np.int64)
@@ -224,7 +232,7 @@ class Outlines:
     """Projected boxes. xyxy: left, top, right, bottom of what lies inside the image, zeros of boxes
     out of view. in_view: whether any of the box lies in the image, hidden by others or not.
     truncated_fraction: of the projection's area, what lies outside the image; 1 of boxes out of
-    view, NaN of those whose numbers are not finite.
+    view, NaN of those that are not usable (`are_usable`).
     """
 
     xyxy: Float64[np.ndarray, "B 4"]
@@ -250,7 +258,7 @@ def outline_placed(placed: PlacedBoxes, camera: Camera) -> Outlines:
     world_from_camera = camera.world_from_camera.numpy()
     rotation = world_from_camera[:3, :3]
     centers_m = (placed.centres_m - world_from_camera[:3, 3]) @ rotation
-    rotations = np.where(placed.is_finite[:, None, None], rotation.T @ placed.rotations, np.nan)
+    rotations = np.where(placed.is_usable[:, None, None], rotation.T @ placed.rotations, np.nan)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     return outline_boxes(centers_m, placed.sizes_m, rotations, K, (camera.width, camera.height))
 
@@ -266,9 +274,9 @@ def outline_boxes(
     height.
     """
     numbers = np.concatenate([centers_m, sizes_m, rotations.reshape(-1, 9)], axis=1)
-    finite = np.logical_and.reduce(np.isfinite(numbers), axis=1)
-    centers_m, sizes_m = np.where(finite[:, None], (centers_m, sizes_m), 0.0)
-    rotations = np.where(finite[:, None, None], rotations, np.eye(3))
+    usable = are_usable(numbers, sizes_m)
+    centers_m, sizes_m = np.where(usable[:, None], (centers_m, sizes_m), 0.0)
+    rotations = np.where(usable[:, None, None], rotations, np.eye(3))
     corners_m = centers_m[:, None] + (CORNERS * sizes_m[:, None]) @ rotations.transpose(0, 2, 1)
     size = np.array(image_size, np.float64)
     ends, seen = _edges_in_image(corners_m, K, size)  # [B, E, 2]
@@ -278,9 +286,9 @@ def outline_boxes(
     shown = np.concatenate(shown, axis=1)[..., None]
     low = np.where(shown, points, np.inf).min(axis=1, initial=np.inf)
     high = np.where(shown, points, -np.inf).max(axis=1, initial=-np.inf)
-    in_view = finite & (high > low).all(axis=1)
+    in_view = usable & (high > low).all(axis=1)
     xyxy = np.where(in_view[:, None], np.concatenate([low, high], axis=1), 0.0)
-    truncated = np.where(finite, 1.0, np.nan)
+    truncated = np.where(usable, 1.0, np.nan)
     whole, before = _projected_edges(corners_m, K)
     for number in np.flatnonzero(in_view):
         area = _hull_area(whole[number][before[number]])
@@ -296,6 +304,7 @@ def find_occlusion(
     instance: UInt16[np.ndarray, "H W"] | None = None,
     actors: UInt16[np.ndarray, " B"] | None = None,
     *,
+    classes: UInt8[np.ndarray, "H W"] | None = None,
     with_owners: bool = False,
 ) -> Occlusion:
     """Which pixels show each box, and which show what stands before it.
@@ -307,12 +316,14 @@ def find_occlusion(
 
     depth_m: z of the surface, 0 = none. instance, actors: where they are known, the actors' numbers
     by pixel and by box, 0 = none. An actor's pixels are then those with its number, wherever they
-    are, and no other box's.
+    are, and no other box's. classes: of those surfaces, where they are known. A surface of a class
+    that no object is of (a bush beside a car, the road under it) shows no box that it lies in.
     """
     count = len(placed)
     numbers = np.zeros(count, np.int64) if actors is None else actors.astype(np.int64)
     if instance is None:
         instance, numbers = np.zeros((0, 0), np.uint16), np.zeros(count, np.int64)
+    scenery = np.zeros((0, 0), bool) if classes is None else np.isin(classes, _NO_OBJECT)
     world_from_camera = camera.world_from_camera.numpy()
     box_from_world = placed.rotations.transpose(0, 2, 1)
     axes = box_from_world @ world_from_camera[:3, :3]  # columns: the camera's axes in each box
@@ -323,6 +334,7 @@ def find_occlusion(
     count_occlusion(
         np.ascontiguousarray(depth_m),
         np.ascontiguousarray(instance),
+        scenery,
         numbers,
         pixel_windows(placed, camera),
         (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,  # x / z of the pixels' rays
@@ -410,12 +422,14 @@ def _hit(
 # renders them.
 
 MAX_INSTANCE = 65535  # instance images have 16 bits
-# Classes that no labelled object is of: they lie under it, before it or behind it.
+# Classes that no labelled object is of: they lie under it, beside it, before it or behind it.
 _NO_OBJECT = (
     SemanticClass.ROAD,
     SemanticClass.LANE_MARKING,
     SemanticClass.SIDEWALK,
     SemanticClass.TERRAIN,
+    SemanticClass.VEGETATION,
+    SemanticClass.BUILDING,
     SemanticClass.SKY,
     SemanticClass.WATER,
 )

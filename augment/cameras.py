@@ -13,7 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.errors import SceneError
 from augment.geometry import invert_rigid
+
+MIN_FIELD_OF_VIEW_DEG = 1.0  # over the longer side of the image; docs/stability.md
+MAX_FIELD_OF_VIEW_DEG = 170.0
+MAX_CENTRE_OFFSET = 10  # longer sides of the image: of the principal point from its centre
+_ROUNDING = 1e-6  # part of a focal length by which a camera at a limit may be beyond it
 
 
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
@@ -170,6 +176,48 @@ class Camera:
             )
 
 
+def check_lens(camera: Camera, where: str) -> None:
+    """Refuse a pinhole camera beyond the limits that effects and kernels are made for.
+
+    Windows of an image and the views that effects draw for themselves are not asked.
+
+    Args:
+        camera: as a dataset, a camera path or a caller states it.
+        where: names the camera in the message.
+
+    Raises:
+        SceneError: over the longer side of the image, fx or fy sees less than
+            MIN_FIELD_OF_VIEW_DEG or more than MAX_FIELD_OF_VIEW_DEG; or the principal point lies
+            further from the image's centre than MAX_CENTRE_OFFSET longer sides.
+    """
+    if camera.is_orthographic:
+        return
+    size, side_px = f"{camera.width}x{camera.height}", max(camera.width, camera.height)
+    hint = "Check the intrinsics, their unit (pixels), and that they are of images of this size"
+    shortest, longest = (
+        side_px / (2 * math.tan(math.radians(angle_deg) / 2))
+        for angle_deg in (MAX_FIELD_OF_VIEW_DEG, MIN_FIELD_OF_VIEW_DEG)
+    )
+    for name, focal_px in (("fx", camera.fx), ("fy", camera.fy)):
+        if not shortest * (1 - _ROUNDING) <= focal_px <= longest * (1 + _ROUNDING):
+            raise SceneError(
+                f"{where}: {name} must be from {shortest:.4g} to {longest:.4g} px in an image of "
+                f"{size} (a field of view from {MAX_FIELD_OF_VIEW_DEG:g} to "
+                f"{MIN_FIELD_OF_VIEW_DEG:g} degrees over its longer side); got {focal_px:.6g}. "
+                f"{hint}"
+            )
+    reach_px = MAX_CENTRE_OFFSET * side_px
+    for name, middle_px, length_px in (
+        ("cx", camera.cx, camera.width),
+        ("cy", camera.cy, camera.height),
+    ):
+        if not abs(middle_px - length_px / 2) <= reach_px * (1 + _ROUNDING):
+            raise SceneError(
+                f"{where}: {name} must lie within {reach_px:g} px of the centre of an image of "
+                f"{size}; got {middle_px:.6g}. {hint}"
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One step of a drive: the cameras as they stood when each took its image.
@@ -177,6 +225,9 @@ class Frame:
     index: the dataset's own frame number. timestamp_ns: the frame's reference time.
     world_from_ego: float64 [4, 4], ego x forward, y left, z up.
     image_paths: the recorded image of each camera where there is one (reference only).
+
+    Raises:
+        SceneError: of `check_lens`, for any of the cameras.
     """
 
     index: int
@@ -184,3 +235,7 @@ class Frame:
     world_from_ego: Float[Tensor, "4 4"]
     cameras: Mapping[str, Camera]
     image_paths: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, camera in self.cameras.items():
+            check_lens(camera, f"frame {self.index}, camera {name!r}")

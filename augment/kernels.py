@@ -151,6 +151,7 @@ def covered_plane(starts, opacities, places, covariances, out):
 def count_occlusion(
     depth,
     instance,
+    scenery,
     actors,
     windows,
     across,
@@ -168,13 +169,14 @@ def count_occlusion(
     the boxes that each pixel shows by its depth, 0 = none; or [0, 0] where nobody asks.
 
     depth [H, W]: z, 0 = none. instance [H, W]: actors' numbers, or [0, 0] where they are not known.
-    actors [B]: of the boxes, 0 = none. windows [B, 4]: left, top, right, bottom of where a box can
+    scenery [H, W]: of a class that no object is of, or [0, 0] where classes are not known. actors
+    [B]: of the boxes, 0 = none. windows [B, 4]: left, top, right, bottom of where a box can
     be. across [W], down [H]: x / z and y / z of the pixels' rays. axes [B, 3, 3]: columns, the
     camera's axes in the box. eyes [B, 3]: the camera's centre there. owned, labelled [B, 2, 3]:
     lowest and highest of the part that owns surfaces, and of the labelled box. near_m: what of a
     box is nearer is not seen.
     """
-    knows_actors = instance.size > 0
+    knows_actors, knows_classes = instance.size > 0, scenery.size > 0
     volumes = np.empty(len(found), np.float64)
     for box in range(len(found)):
         low, high = labelled[box, 0], labelled[box, 1]
@@ -227,6 +229,8 @@ def count_occlusion(
                     nearest, farthest = max(nearest, min(a, b)), min(farthest, max(a, b))
                 if nearest <= z and z <= farthest:
                     if own == 0 and number == 0:
+                        if knows_classes and scenery[row, column]:
+                            continue
                         _add(found[box], row, column)
                         if owners.size > 0:
                             other = np.int64(owners[row, column]) - 1

@@ -190,7 +190,7 @@ def recorded_sky(
 
 def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | None:
     path = frame.image_paths.get(camera.name)
-    rgb = None if path is None else _read_image(Path(path), camera)
+    rgb = None if path is None else read_small_image(Path(path), camera)
     if rgb is None:
         return None
     points = memo_of(scene).get(("sweep", frame.index), lambda: (_sweep(scene, frame),))[0]
@@ -205,9 +205,9 @@ def _recorded_sky(scene: Scene, frame: Frame, camera: Camera) -> RecordedSky | N
     )
 
 
-def _read_image(path: Path, camera: Camera) -> np.ndarray | None:
-    """RGB at the camera's size; None for what is no image of its proportions."""
-    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION)
+def read_small_image(path: Path, camera: Camera) -> np.ndarray | None:
+    """RGB of an image at the camera's size; None for what is no image of its proportions."""
+    image = decode_image(path, cv2.IMREAD_REDUCED_COLOR_2)
     if image is None:
         return None
     height, width = image.shape[:2]

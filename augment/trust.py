@@ -7,6 +7,7 @@ is a bright pane in it. So a view is judged by the scene itself:
     ground    pixels below the horizon without a surface (alpha < 0.5), or that let light through
     pose      how far the camera is from those that the scene was made from; never fitted ones
     detail    pixels per metre of the picture over those that the scene was made from
+    support   colours that recorded images from other places show at the same points
 
 `trust_mask` says it of every pixel, `judge_scene` of a few small views, in figures and sentences.
 """
@@ -20,19 +21,26 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from augment.cameras import Camera, Frame
 from augment.labels import EGO_VEHICLE
 from augment.memo import memo_of
-from augment.recorded_sky import WORK_WIDTH, RecordedSky, elevation_rad, recorded_sky
-from augment.render.buffers import ALPHA, AUTO, MEDIAN_DEPTH, SPLAT_IDS
+from augment.recorded_sky import (
+    WORK_WIDTH,
+    RecordedSky,
+    elevation_rad,
+    read_small_image,
+    recorded_sky,
+)
+from augment.render.buffers import ALPHA, AUTO, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
 from augment.view_images import SURFACE_ALPHA
@@ -42,8 +50,10 @@ MAX_TRANSMITTANCE = 0.02  # below the horizon: 5/255 of a white fog shine throug
 MIN_GROUND_ALPHA = 0.9  # of a pixel that can be believed: a tenth of white fog is 20/255 and shows
 # 1 % of the sky or the ground of a 480x270 picture is a patch of 25x25 pixels: a car 40 m away.
 MAX_SKY_COVERED = MAX_GROUND_OPEN = 0.01
+MIN_SKY_SHARE = 0.05  # of an image: where it shows less sky, pale walls are taken for it
 HORIZON_RAD = math.radians(1.5)  # roads slope, and poses are off by as much
 MAX_MAGNIFICATION = 1.5  # nothing finer was learnt; thin splats become needles
+NO_TRUST_MAGNIFICATION = 4.0  # from here on a pixel's detail is invented; trust falls from 1.0 on
 MAX_DISTANCE_M = 2.0  # half a lane and more: the sides of parked cars appear that nobody has seen
 MAX_ANGLE_RAD = math.radians(15)  # a quarter of a camera 60 degrees wide looks past what it saw
 
@@ -53,6 +63,13 @@ _SKY_POINT_M = 1e4
 _DEPTH_SHARE, _DEPTH_M = 0.05, 0.5  # a point so little behind what a view shows is seen by it
 _NUM_VIEWS = 24  # the nearest are asked: what they have not seen, those farther away saw worse
 _MIN_POINTS = 0.001  # of all: for fewer, a view's depths are not drawn
+_MIN_GAIN = 0.1  # of a point's trust, for which one more view is asked
+# Images whose colours are compared: of the same camera, from elsewhere, the nearest of them.
+_PARALLAX_M = 1.0  # a floating splat 5 m away moves by 50 pixels of 240 against what is behind it
+_NUM_WITNESSES = 4
+# Of 255: colours that differ by less are the same, by more are another thing's.
+_SAME_COLOR = 24.0
+_OTHER_COLOR = 64.0
 
 
 # ---- From where a scene was seen -----------------------------------------------------------------
@@ -222,6 +239,7 @@ class _Look(NamedTuple):
     """A view of the scene without weather. alpha, z_m [H, W]: z of its surfaces. owner: instance of
     the heaviest splat, 0 for the background. is_own_car: where that is the recording car.
     elevation_rad: of the rays. sky: what the recording shows as sky, None where that is unknown.
+    rgb: of the surfaces [H, W, 3], 0 to 1 in the scene's colours; None where nobody asked.
     """
 
     alpha: Float[np.ndarray, "H W"]
@@ -230,31 +248,49 @@ class _Look(NamedTuple):
     is_own_car: Bool[np.ndarray, "H W"]
     elevation_rad: Float[np.ndarray, "H W"]
     sky: RecordedSky | None
+    rgb: Float[np.ndarray, "H W 3"] | None
+
+    @property
+    def sky_share(self) -> float:
+        """The share of the image that the recording shows as sky; 0 where that is unknown."""
+        return 0.0 if self.sky is None else float(self.sky.sky.mean())
 
     @property
     def has_surface(self) -> Bool[np.ndarray, "H W"]:
         return self.alpha >= SURFACE_ALPHA
 
 
-def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> Bool[np.ndarray, "H W"]:
-    """Pixels that can be believed: they show a surface or the sky, in the right place, below the
-    horizon of MIN_GROUND_ALPHA; and an image that the scene was made from has seen the same,
-    unhidden, in no less than 1 / MAX_MAGNIFICATION of the pixels. camera: as rendered. Weather does
-    not count. Of a scene whose views are not known, and in orthographic cameras, no pixel is seen.
+def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> UInt8[np.ndarray, "H W"]:
+    """How far each pixel of a view can be believed, from 0, not at all, to 255.
+
+    The product of three parts:
+
+    - 1 where the pixel shows a surface or the sky, in the right place, and below the horizon a
+      surface of MIN_GROUND_ALPHA; else 0;
+    - by the image that has seen the same unhidden at most pixels a metre: 1 where those are as many
+      as are drawn, 0 from NO_TRUST_MAGNIFICATION times fewer on, smooth between;
+    - the share of images that show the surface's colour at its place: of this view and of up to
+      _NUM_WITNESSES of the same camera, at least _PARALLAX_M away, that see it. Splats that stand
+      where nothing is, fitted to one image, are contradicted by the others.
+
+    Args:
+        scene: weather does not count. Of a scene whose views are not known no pixel is seen.
+        camera: as rendered. In an orthographic camera no pixel is seen.
     """
     if camera.is_orthographic:
-        return np.zeros((camera.height, camera.width), bool)
+        return np.zeros((camera.height, camera.width), np.uint8)
     pose = camera.camera_from_world.numpy().tobytes()
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     key = "trust", camera.name, camera.timestamp_ns, camera.width, camera.height, intrinsics, pose
     return memo_of(scene).get(
-        key, lambda: _trusted(scene, camera, _look(scene, camera, backend), backend)
+        key, lambda: _trusted(scene, camera, _look(scene, camera, backend, True), backend)
     )
 
 
-def _look(scene: Scene, camera: Camera, backend: str) -> _Look:
+def _look(scene: Scene, camera: Camera, backend: str, with_rgb: bool = False) -> _Look:
     parts = scene.parts_for(camera)
-    raster = rasterize(parts, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS), backend=backend)
+    buffers = (ALPHA, MEDIAN_DEPTH, SPLAT_IDS, *((RGB,) if with_rgb else ()))
+    raster = rasterize(parts, camera, buffers=buffers, backend=backend)
     assert raster.alpha is not None
     assert raster.median_depth is not None and raster.splat_ids is not None
     ends = np.cumsum([len(part.gaussians) for part in parts])
@@ -269,7 +305,13 @@ def _look(scene: Scene, camera: Camera, backend: str) -> _Look:
         is_own_car=np.isin(owner, own_car) & (alpha >= SURFACE_ALPHA),
         elevation_rad=elevation_rad(camera),
         sky=_sky_of(scene, camera),
+        rgb=None if raster.rgb is None else _opaque(raster.rgb.cpu().numpy(), alpha),
     )
+
+
+def _opaque(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """The colours of surfaces from those weighted by their alpha."""
+    return rgb / np.maximum(alpha, SURFACE_ALPHA)[..., None]
 
 
 def _sky_of(scene: Scene, camera: Camera) -> RecordedSky | None:
@@ -305,8 +347,15 @@ def _trusted(scene: Scene, camera: Camera, look: _Look, backend: str) -> np.ndar
     solid = surface & ~(below & (look.alpha < MIN_GROUND_ALPHA))
     if look.sky is not None:
         open_sky &= ~_inner(look.sky.solid)
-        solid &= ~_pane(scene, camera, look)
-    return np.where(surface, solid, open_sky) & _was_seen(scene, camera, look, backend)
+        if look.sky_share >= MIN_SKY_SHARE:
+            solid &= ~_pane(scene, camera, look)
+    is_fit = np.where(surface, solid, open_sky)
+    points = _points(camera, look)
+    trust = _seen_detail(scene, camera, points, backend)
+    trust *= _support(scene, camera, look, points, backend)
+    steps = np.rint(255 * trust.reshape(points.grid.height, points.grid.width)).astype(np.uint8)
+    size = camera.width, camera.height
+    return cv2.resize(steps, size, interpolation=cv2.INTER_NEAREST) * is_fit
 
 
 def _pane(scene: Scene, camera: Camera, look: _Look) -> np.ndarray:
@@ -317,8 +366,20 @@ def _pane(scene: Scene, camera: Camera, look: _Look) -> np.ndarray:
     return _inner(look.sky.sky) & look.has_surface & is_near
 
 
-def _was_seen(scene: Scene, camera: Camera, look: _Look, backend: str) -> np.ndarray:
-    """Which pixels' points some view of the scene has seen from near enough, found on a grid."""
+class _Points(NamedTuple):
+    """What the pixels of a grid show, P points. grid: the camera at the grid's size. world [P, 3]:
+    metres. owner [P]: instance whose point it is, 0 for the background. density [P]: pixels a metre
+    that are drawn. has_surface [P]: others are sky, far away.
+    """
+
+    grid: Camera
+    world: np.ndarray
+    owner: np.ndarray
+    density: np.ndarray
+    has_surface: np.ndarray
+
+
+def _points(camera: Camera, look: _Look) -> _Points:
     columns = min(_GRID_WIDTH, camera.width)
     grid = camera.resized(columns, max(1, round(camera.height * columns / camera.width)))
     rows_of = ((np.arange(grid.height) + 0.5) * camera.height / grid.height).astype(int)
@@ -327,26 +388,110 @@ def _was_seen(scene: Scene, camera: Camera, look: _Look, backend: str) -> np.nda
     surface, owner = look.has_surface[at].ravel(), look.owner[at].ravel()
     rays = camera.ray_directions(torch.float64).numpy()[at].reshape(-1, 3)
     z_m = np.where(surface, look.z_m[at].ravel(), _SKY_POINT_M)
-    points = camera.centre.numpy() + z_m[:, None] * rays
-    owner = np.where(surface, owner, 0)
-    density = camera.fx / np.maximum(z_m, 1e-6)  # pixels a metre
-    left, all_seen = np.arange(len(points)), seen_views(scene)
+    return _Points(
+        grid=grid,
+        world=camera.centre.numpy() + z_m[:, None] * rays,
+        owner=np.where(surface, owner, 0),
+        density=camera.fx / np.maximum(z_m, 1e-6),
+        has_surface=surface,
+    )
+
+
+def _seen_detail(scene: Scene, camera: Camera, points: _Points, backend: str) -> np.ndarray:
+    """How finely some view of the scene has seen each point unhidden, 0 to 1, [P]."""
+    trust = np.zeros(len(points.world))
+    all_seen = seen_views(scene)
     for number, view in _nearest_views(all_seen, camera):
-        from_ns, to_ns = camera.timestamp_ns, view.camera.timestamp_ns
-        then = _moved(scene, points[left], owner[left], from_ns, to_ns)
-        local = _in_camera(view.camera, then)
-        is_seen = _shown(view.camera, local, density[left])
-        if not (from_ns == to_ns and _same_pose(view.camera, camera)):
-            if is_seen.sum() < _MIN_POINTS * len(points):
-                continue
-            depths = _depths(scene, number, view.camera, backend)
-            is_seen &= ~_hidden(view.camera, local, depths)
-        left = left[~is_seen]
+        left = np.flatnonzero(trust < 1 - _MIN_GAIN)
         if len(left) == 0:
             break
-    seen = np.ones(len(points), bool)
-    seen[left] = False
-    return _enlarged(seen.reshape(grid.height, grid.width), camera)
+        local = _seen_from(scene, camera, points, left, view.camera)
+        detail = _detail(view.camera, local, points.density[left])
+        gains = detail > trust[left] + _MIN_GAIN
+        if not (
+            camera.timestamp_ns == view.camera.timestamp_ns and _same_pose(view.camera, camera)
+        ):
+            if gains.sum() < _MIN_POINTS * len(trust):
+                continue
+            gains &= ~_hidden(view.camera, local, _depths(scene, number, view.camera, backend))
+        trust[left[gains]] = detail[gains]
+    return trust
+
+
+def _support(
+    scene: Scene, camera: Camera, look: _Look, points: _Points, backend: str
+) -> np.ndarray:
+    """The share of images that show each point's colour at its place, [P]: of those that see it,
+    and of this view, which counts as one that does.
+    """
+    assert look.rgb is not None
+    size = points.grid.width, points.grid.height
+    rgb = cv2.resize(look.rgb, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    agreeing, asked = np.ones(len(rgb)), np.ones(len(rgb))
+    surface = np.flatnonzero(points.has_surface)
+    for number, view in _witnesses(scene, camera):
+        image = _recorded_range(scene, number, view)
+        if image is None:
+            continue
+        local = _seen_from(scene, camera, points, surface, view.camera)
+        sees = _detail(view.camera, local, points.density[surface]) > 0
+        sees &= ~_hidden(view.camera, local, _depths(scene, number, view.camera, backend))
+        colors = rgb[surface[sees]]
+        color_map = scene.color_map(view.camera)
+        if color_map is not None:
+            colors = colors @ color_map[:, :3].numpy().T + color_map[:, 3].numpy()
+        row, column = _pixels(view.camera, local[sees], image.lowest.shape[:2])
+        steps = 255 * np.clip(colors, 0, 1)
+        below, above = image.lowest[row, column] - steps, steps - image.highest[row, column]
+        apart = np.maximum(below, above).max(axis=1)
+        share = (_OTHER_COLOR - apart) / (_OTHER_COLOR - _SAME_COLOR)
+        agreeing[surface[sees]] += np.clip(share, 0, 1)
+        asked[surface[sees]] += 1
+    return agreeing / asked
+
+
+def _witnesses(scene: Scene, camera: Camera) -> list[tuple[int, SeenView]]:
+    """The nearest views of the same camera from another place, with their numbers."""
+    seen = seen_views(scene)
+    distance_m, angle_rad = seen.away(camera) if seen.views else (np.zeros(0), np.zeros(0))
+    order = np.argsort(_away(distance_m, angle_rad), kind="stable").tolist()
+    names = {camera.name} if camera.name in seen.names else set(seen.names)
+    found = [n for n in order if distance_m[n] >= _PARALLAX_M]
+    found = [n for n in found if seen.views[n].camera.name in names][:_NUM_WITNESSES]
+    return [(n, seen.views[n]) for n in found]
+
+
+class _RecordedRange(NamedTuple):
+    """The lowest and highest values of 3x3 pixels of a small recorded image, float32 [h, w, 3]."""
+
+    lowest: np.ndarray
+    highest: np.ndarray
+
+
+def _recorded_range(scene: Scene, number: int, view: SeenView) -> _RecordedRange | None:
+    """Of the recorded image of a view; None where there is none that can be read."""
+
+    def make() -> tuple[_RecordedRange | None]:
+        frames = (frame for frame in _made_from(scene) if frame.index == view.frame)
+        path = next((frame.image_paths.get(view.camera.name) for frame in frames), None)
+        small = view.camera.scaled(min(1.0, _DEPTH_WIDTH / view.camera.width))
+        rgb = None if path is None else read_small_image(Path(path), small)
+        if rgb is None:
+            return (None,)
+        around = np.ones((3, 3), np.uint8)
+        lowest, highest = cv2.erode(rgb, around), cv2.dilate(rgb, around)
+        return (_RecordedRange(lowest.astype(np.float32), highest.astype(np.float32)),)
+
+    return memo_of(scene).get(("trust colours", number), make)[0]
+
+
+def _seen_from(
+    scene: Scene, camera: Camera, points: _Points, chosen: np.ndarray, view: Camera
+) -> np.ndarray:
+    """Column, row and z in a view of some points [C] of those that a camera sees, [C, 3]."""
+    world, owner = points.world[chosen], points.owner[chosen]
+    then = _moved(scene, world, owner, camera.timestamp_ns, view.timestamp_ns)
+    return _in_camera(view, then)
 
 
 def _nearest_views(seen: Seen, camera: Camera) -> list[tuple[int, SeenView]]:
@@ -379,22 +524,37 @@ def _in_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z], 1)
 
 
-def _shown(camera: Camera, local: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Which points lie in the image, in enough pixels. density: pixels a metre that are drawn."""
+def _detail(camera: Camera, local: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """How finely a view shows points, 0 to 1; 0 of those outside its image. density: pixels a metre
+    that are drawn.
+    """
     u, v, z = local.T
     # Half a pixel more: rays of the same camera at another size end at the border itself.
     inside = (np.abs(u - camera.width / 2) <= camera.width / 2 + 0.5) & (
         np.abs(v - camera.height / 2) <= camera.height / 2 + 0.5
     )
-    return inside & (density <= MAX_MAGNIFICATION * (1 + 1e-6) * camera.fx / z)
+    magnification = np.where(inside, density * z / camera.fx, math.inf)
+    # Rounding aside, a view of the same size is no magnification.
+    magnification = np.maximum(magnification / (1 + 1e-6), 1)
+    part = np.clip(1 - np.log(magnification) / math.log(NO_TRUST_MAGNIFICATION), 0, 1)
+    return part * part * (3 - 2 * part)
+
+
+def _pixels(
+    camera: Camera, local: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of points in an image of a view at another size, inside of it."""
+    height, width = shape
+    u, v, _ = np.nan_to_num(local).T
+    column = np.clip(u * width / camera.width, 0, width - 1).astype(int)
+    row = np.clip(v * height / camera.height, 0, height - 1).astype(int)
+    return row, column
 
 
 def _hidden(camera: Camera, local: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Which points something stands before. depths: of `_depths`."""
-    height, width = depths.shape
-    u, v, z = np.nan_to_num(local).T
-    column = np.clip(u * width / camera.width, 0, width - 1).astype(int)
-    row = np.clip(v * height / camera.height, 0, height - 1).astype(int)
+    row, column = _pixels(camera, local, depths.shape)
+    z = np.nan_to_num(local[:, 2])
     return z > depths[row, column] * (1 + _DEPTH_SHARE) + _DEPTH_M
 
 
@@ -418,8 +578,9 @@ def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarr
 
 @dataclass(frozen=True)
 class ViewTrust:
-    """Shares of one judged view, 0 to 1. sky_covered: of the sky, what has a surface nearer than
-    SKY_FROM_M; None where the sky is unknown or absent. ground_open, ground_leaks: of what lies
+    """Shares of one judged view, 0 to 1. sky: of all pixels, what the recording shows as sky; None
+    where that is unknown. sky_covered: of the sky, what has a surface nearer than SKY_FROM_M; None
+    where the sky is unknown or absent. ground_open, ground_leaks: of what lies
     below the horizon, the recording car left out, what has no surface, and what lets more than
     MAX_TRANSMITTANCE of the light through; None where nothing lies there or up is unknown.
     own_car: of all pixels. reach_m: distance within which 95 % of the surfaces lie; None without
@@ -427,6 +588,7 @@ class ViewTrust:
     """
 
     frame: int
+    sky: float | None
     sky_covered: float | None
     ground_open: float | None
     ground_leaks: float | None
@@ -489,6 +651,7 @@ def judge_view(scene: Scene, camera: Camera, frame_index: int, *, backend: str =
     distances_m = (look.z_m * camera.ray_lengths().numpy())[surface]
     return ViewTrust(
         frame=frame_index,
+        sky=None if look.sky is None else look.sky_share,
         sky_covered=covered,
         ground_open=_share(~surface, below),
         ground_leaks=_share(look.alpha < 1 - MAX_TRANSMITTANCE, below),
@@ -584,8 +747,8 @@ _LACKS = {  # by figure of ViewTrust
     "ground_open": "{share} of the ground has no surface{where}: fog and water stand in the holes",
     "ground_leaks": f"{{share}} of the ground lets more than {100 * MAX_TRANSMITTANCE:g} % of the "
     "light behind it through{where}",
-    "sky_covered": f"{{share}} of the sky has a surface nearer than {SKY_FROM_M:.0f} m{{where}}: "
-    "it stands as a pane in fog",
+    "sky_covered": "{share} of the sky, which is {sky} of the image, has a surface nearer than "
+    f"{SKY_FROM_M:.0f} m{{where}}: it stands as a pane in fog",
 }
 
 
@@ -601,7 +764,12 @@ def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
                 f"{len(own.away)} of {frames} frames stand away from all images that the scene was "
                 f"made from, up to {where} (limit {limits}): {_listed(own.away)}"
             )
-    worst = {figure: _worst(own.views, figure) for figure in _LACKS}
+    with_sky = [view for view in own.views if view.sky is None or view.sky >= MIN_SKY_SHARE]
+    worst = {
+        figure: _worst(with_sky if figure == "sky_covered" else own.views, figure)
+        for figure in _LACKS
+    }
+    sky = {view.frame: _percent(view.sky or 0.0) for view in own.views}
     hole, leak = worst["ground_open"], worst["ground_leaks"]
     if hole is not None and leak is not None and leak[1] < 2 * hole[1]:
         del worst["ground_leaks"]  # it is mostly the holes
@@ -610,7 +778,8 @@ def _problems(own: CameraTrust, is_unfitted: bool, frames: int) -> list[str]:
         if largest is not None and largest[1] > limit:
             where = f" in frame {largest[0]}, the worst of {len(own.views)}"
             where += f" (limit {_percent(limit)})"
-            found.append(_LACKS[figure].format(share=_percent(largest[1]), where=where))
+            shares = {"share": _percent(largest[1]), "sky": sky[largest[0]]}
+            found.append(_LACKS[figure].format(**shares, where=where))
     return found
 
 

@@ -19,6 +19,7 @@ from augment.drawing import LayerRenderer
 from augment.effects.effect import Drawn, EffectView
 from augment.jobs.layout import TRUST
 from augment.jobs.processes import awaited, choose_backend, renders_on_gpu
+from augment.own_car import own_car_mask
 from augment.plan import BARE, LENS, NOISE, Plan, ViewPlan, make_plan, plan_view
 from augment.prune import prune_parts
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, RenderOutput
@@ -57,8 +58,12 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     trust = dict[str, np.ndarray]()
     if recipe.output.trust:
         with timed("trust mask"):
-            trust[TRUST] = trust_mask(scene, camera, backend=backend).astype(np.uint8) * 255
-    return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust))
+            trust[TRUST] = trust_mask(scene, camera, backend=backend)
+    own_car = None
+    if plan.on_photo and plan.finds_boxes:
+        with timed("recording car"):
+            own_car = own_car_mask(scene, camera)
+    return PendingView(lambda: _weathered(images(), camera, plan, recipe, trust, own_car))
 
 
 def render_buffers(
@@ -164,7 +169,12 @@ def _bare(
 
 
 def _weathered(
-    images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe, trust: Mapping[str, np.ndarray]
+    images: ViewImages,
+    camera: Camera,
+    plan: Plan,
+    recipe: Recipe,
+    trust: Mapping[str, np.ndarray],
+    own_car: np.ndarray | None,
 ) -> WeatheredView:
     """The images with what labels are measured from."""
     masks, views = dict(trust), dict[str, EffectView]()
@@ -186,21 +196,24 @@ def _weathered(
         instance=images.instance,
         masks=masks,
         effects=views,
-        surface=_surface_view(images, plan),
+        surface=_surface_view(images, plan, own_car),
     )
 
 
-def _surface_view(images: ViewImages, plan: Plan) -> SurfaceView | None:
+def _surface_view(images: ViewImages, plan: Plan, own_car: np.ndarray | None) -> SurfaceView | None:
     depth, is_bare = images.scene_depth_m, bool(plan.bare_buffers)
     if depth is None:
         return None
     shows_first = plan.shows_first and plan.water_level_z_m is not None
+    is_of_depth = not (is_bare or shows_first)  # what the other images show
     return SurfaceView(
         depth_m=depth,
-        actors=None if is_bare or shows_first else images.instance,
+        actors=images.instance if is_of_depth else None,
+        classes=images.semantic if is_of_depth else None,
         shown_depth_m=images.depth_m if is_bare else depth,
         shown_classes=images.semantic,
         is_bare=is_bare,
+        own_car=own_car,
     )
 
 
@@ -244,7 +257,9 @@ class SurfaceView:
     depth_m: of the first solid surface, snow included and water not. actors: uint16 [H, W], the
     instance image of those surfaces, which knows of actors only; None where there is none.
     shown_depth_m, shown_classes: of the surfaces that the view's instance image shows; None without
-    one. is_bare: these are without what lies on the scene.
+    one. is_bare: these are without what lies on the scene. classes: uint8 [H, W], of the surfaces
+    of depth_m; None where no image shows them. own_car: bool [H, W], where a recorded picture shows
+    the recording car, of which the scene has no surfaces; None where it shows none.
     """
 
     depth_m: np.ndarray
@@ -252,6 +267,8 @@ class SurfaceView:
     shown_depth_m: np.ndarray | None
     shown_classes: np.ndarray | None
     is_bare: bool
+    classes: np.ndarray | None = None
+    own_car: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,9 +277,10 @@ class WeatheredView:
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene
-    (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], 255 where an
-    effect is what the pixel shows, by name, and of TRUST. effects: what their labels are measured
-    from; of all effects that the recipe has. surface: None where nobody asks for boxes.
+    (`augment.jobs.files.label_view` adds boxes without an actor). masks: uint8 [H, W], by name: 255
+    where an effect is what the pixel shows, else 0; and of TRUST, 0 to 255. effects: what their
+    labels are measured from; of all effects that the recipe has. surface: None where nobody asks
+    for boxes.
     """
 
     camera: Camera

@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
 
-_YAML_1_1_FLAGS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+# Words for a switch: YAML 1.1 read some of them as true and false, and other programs the rest.
+_SWITCHES = {
+    **dict.fromkeys(("true", "yes", "on", "1"), True),
+    **dict.fromkeys(("false", "no", "off", "none", "null", "nil", "0"), False),
+}
+_OFF_WORDS = ("none", "never", "still")
+_ON_WORDS = ("always",)
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _NUMBER_WITH_UNIT = re.compile(r"[-+]?[0-9.]+\s*[A-Za-z/%]+[0-9]?")
 _UNIT = re.compile(
@@ -45,6 +51,8 @@ def guess_value(node: Node, leaf: Leaf) -> str:
     """What was probably meant by a refused value, as the end of a message; '' without a guess."""
     if isinstance(node, ListNode) and leaf.is_number and leaf.rangeable and len(node) == 2:
         return f"; a range is written {{uniform: {show(node)}}}"
+    if isinstance(node, ScalarNode) and (guess := _guess_switch(node, leaf)):
+        return guess
     value = node.value if isinstance(node, ScalarNode) else None
     if isinstance(value, str):
         return _guess_text(value.strip(), leaf)
@@ -54,9 +62,40 @@ def guess_value(node: Node, leaf: Leaf) -> str:
     return ""
 
 
+def _switch(node: ScalarNode) -> bool | None:
+    """What a value says as a switch; None where it is none."""
+    if node.value is None:
+        return False
+    return _SWITCHES.get(node.text.strip().lower())
+
+
+def _guess_switch(node: ScalarNode, leaf: Leaf) -> str:
+    """What turns a field on or off, where the refused value is a word for that."""
+    is_on = _switch(node)
+    is_number = isinstance(node.value, int | float) and not isinstance(node.value, bool)
+    if is_on is None or (leaf.is_number and (is_on or is_number)):
+        return ""
+    if not is_on and leaf.nullable:
+        return "; write null"
+    if leaf.is_number:
+        return "; write 0" if leaf.accepts(0) else ""
+    if leaf.accepts(is_on):
+        return f"; write {str(is_on).lower()}"
+    word = next((w for w in (_ON_WORDS if is_on else _OFF_WORDS) if w in leaf.words), None)
+    if word is not None:
+        return f"; write {word}"
+    has_default = leaf.words and not leaf.info.is_required()
+    return f"; leave it out for {leaf.info.default}" if has_default else ""
+
+
+def guess_section(node: Node, path: str) -> str:
+    """What was probably meant by a value in the place of a section. path: of the section."""
+    if path not in SECTIONS or not isinstance(node, ScalarNode):
+        return ""
+    return "; write null to leave it out" if _switch(node) is False else ""
+
+
 def _guess_text(text: str, leaf: Leaf) -> str:
-    if leaf.kind is bool and text.lower() in _YAML_1_1_FLAGS:
-        return f"; write {_YAML_1_1_FLAGS[text.lower()]}"
     if leaf.words:
         near = nearest_word(text, leaf.words)
         return f"; did you mean {near}?" if near else ""

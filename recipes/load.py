@@ -20,7 +20,7 @@ from recipes.ranges import is_number
 from recipes.recipe_file import Section, read_file, recipe_file
 from recipes.schema import VERSION, Recipe, free_knobs
 from recipes.template import RecipeTemplate
-from recipes.yaml_tree import MapNode, Node, ScalarNode, read_tree
+from recipes.yaml_tree import MapNode, Node, ScalarNode, check_text, read_tree
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,6 +89,7 @@ def read_overrides(
         place = Place(f"{option} {short(text, 100)}", None, folder or Path())
         if not equals or not path.strip():
             raise place.error("write PATH=VALUE, as in weather.smog.visibility_m=60")
+        check_text(path, place)
         overrides[path.strip()] = _value_node(value, place)
     return overrides
 

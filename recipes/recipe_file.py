@@ -40,7 +40,7 @@ from typing_extensions import TypeAliasType
 from recipes.errors import Place, Problems, dotted, join, readable
 from recipes.fields import Closed, Digest, FilePath, Number, Unit, Whole
 from recipes.files import file_below
-from recipes.guesses import RANGE_KINDS, guess_value, show, why_no_key, why_no_range
+from recipes.guesses import RANGE_KINDS, guess_section, guess_value, show, why_no_key, why_no_range
 from recipes.ranges import (
     Channels,
     Choice,
@@ -390,7 +390,8 @@ class Section(Closed):
         if isinstance(node, ScalarNode) and shorthand is not None:
             node = MapNode(node.place, {shorthand: node})
         if not isinstance(node, MapNode):
-            raise refusal(f"must be a mapping, with {', '.join(cls.model_fields)}")
+            guess = guess_section(node, cls.PATH)
+            raise refusal(f"must be a mapping, with {', '.join(cls.model_fields)}{guess}")
         section = handler(node)
         read = {name: getattr(section, name) for name in section.model_fields_set}
         given = {name: read[name] for name in cls.model_fields if read.get(name) is not None}

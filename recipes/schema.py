@@ -341,7 +341,7 @@ class Output(Section):
     """Hidden objects are left out, or marked: iscrowd in coco, DontCare in kitti; yolo has no
     mark."""
     trust: Flag = False
-    """Write which pixels can be believed: those that the scene's images saw from near enough."""
+    """Write how far each pixel can be believed, 0 to 255: by what the scene's images saw there."""
 
     @property
     def label_formats(self) -> tuple[LabelFormat, ...]:

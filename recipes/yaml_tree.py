@@ -145,6 +145,7 @@ class _Reader:
         if event.tag is not None:
             raise own.error(f"the tag {short(str(event.tag))!r}: tags are not allowed")
         if isinstance(event, ScalarEvent):
+            check_text(event.value, place)
             value = plain_value(event.value) if event.implicit[0] else event.value
             node = ScalarNode(place, event.value, value)
         elif isinstance(event, SequenceStartEvent):
@@ -166,6 +167,7 @@ class _Reader:
         if not isinstance(event, ScalarEvent) or event.tag is not None:
             raise place.error("a key must be plain text, not a list, a mapping or an alias")
         key = event.value
+        check_text(key, place)
         if key == "<<":
             text = "merge keys (<<) are not read; write the fields out, or use *alias as a value"
             raise place.error(text)
@@ -189,6 +191,18 @@ class _Reader:
         inner = node.values() if isinstance(node, MapNode) else node
         for below in () if isinstance(inner, ScalarNode) else inner:
             self._count_nodes(below, place, depth + 1)
+
+
+def check_text(text: str, place: Place) -> None:
+    """Raise RecipeError for what no file can hold as UTF-8: an escape of half a surrogate, or bytes
+    of a command line in another encoding.
+    """
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise place.error(
+            f"{short(text)} holds {text[error.start]!a}, which is no character; write it in UTF-8"
+        ) from None
 
 
 def _place(place: Place, event: Event) -> Place:

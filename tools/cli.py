@@ -130,7 +130,7 @@ class GenerateOptions(SceneCommand):
             large it gets. Nothing is written.
         status: Say how far the jobs of the output have come; needs no job file. The exit code is 0
             if all is done.
-        rescan: Open all scenes again, in case they have got frames since.
+        rescan: Open all scenes again, in place of what the output knows of them.
         scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
             on Ray the CPU.
@@ -639,6 +639,7 @@ def main(arguments: list[str] | None = None) -> int:
     description = "Weather for driving scenes made of 3D Gaussians."
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[NoteHandler()])
     try:
+        check_arguments(arguments)
         if arguments and arguments[0] in ("bench", *GROUPS):
             group, *arguments = arguments
             table = _bench_commands() if group == "bench" else GROUPS[group]
@@ -661,6 +662,20 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def check_arguments(arguments: list[str]) -> None:
+    """Raise ClimateGSError for one that is not UTF-8: paths go into manifests, which hold texts."""
+    for number, argument in enumerate(arguments, 1):
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            from augment.errors import ClimateGSError
+
+            raise ClimateGSError(
+                f"argument {number} is not UTF-8 text: {argument!a}. Texts and names of files "
+                f"must be; rename the file, or move it to a folder whose name is"
+            ) from None
 
 
 def _bench_commands() -> dict[str, Callable[..., int]]:

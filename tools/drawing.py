@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 
 from augment.errors import OutputError
 from augment.jobs.atomic import replaced_file, write_atomic
+from augment.jobs.files import decode_image
 from augment.jobs.layout import folder_name, reading_back, resolve_inside
 from augment.jobs.manifest import OK, Row, read_manifest
 from augment.jobs.store import Store, open_store
@@ -231,10 +232,12 @@ def _weather(row: Row) -> str:
 def _read(out: Path, row: Row) -> np.ndarray:
     """uint8 [H, W, 3] RGB of a row's image."""
     path = resolve_inside(out, row["image_path"])
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise OutputError(f"cannot read the image {path}: it is missing or damaged")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    try:
+        return decode_image(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f"cannot read the image {path}: it is missing or damaged ({error})"
+        ) from error
 
 
 # ---- Contact sheets and videos -------------------------------------------------------------------

@@ -9,7 +9,9 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -45,6 +47,7 @@ from recipes.template import readable
 from recipes.yaml_tree import read_plain
 from tools.drawing import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
 from tools.options import names_in
+from tools.output import duration_text, print_note
 from tools.report_pictures import evenly
 
 if TYPE_CHECKING:
@@ -61,6 +64,8 @@ _KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mo
 MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
 ALL, DRY, WATER = "all", "dry", "water"
 _NUMBERS = ("rmse", "relative", "share", "noise")
+_TIMED_PAIR = 2  # the first pair also loads what all of them need
+_MIN_SAID_S = 20.0  # what takes less is not said
 PANEL_PX = 640  # wide
 ERROR_GAIN = 5.0  # of the error's picture: white is a fifth of the range
 # Of the mask: what counts, went along with a box, shows water; what does not count is black.
@@ -79,19 +84,29 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
     out, short, long = options.out, options.short, options.long
     network = options.lpips and load_lpips(options.lpips, options.lpips_heads)
     views = Views(open_store(out), names_in(options.scenes), names_in(options.recipes))
+    drives = views.drives()
     found = [
         (drive, pair)
-        for drive in views.drives()
+        for drive in drives
         for pair in pairs_of(views, drive, short, long, options.pairs)
     ]
+    notes = _notes(drives, {pair.kind for _, pair in found}, short, long)
     if not found:
+        hint = "".join(f" ({note})" for note in notes)
         raise OutputError(
             f"{out} has no two images to compare: neither frames {short} or {long} apart of one "
             f"camera, nor cameras of one frame whose axes are less than 90 degrees apart. Render "
-            f"consecutive frames"
+            f"consecutive frames{hint}"
         )
-    shown = tqdm(found, unit="pair", disable=not progress)
-    records = [_record(views, drive, pair, network) for drive, pair in shown]
+    if progress:
+        for note in notes:
+            print_note(f"note: {note}")
+    records: list[dict[str, Any]] = []
+    for drive, pair in tqdm(found, unit="pair", disable=not progress):
+        started = time.perf_counter()
+        records.append(_record(views, drive, pair, network))
+        if progress and len(records) == _TIMED_PAIR:
+            _say_duration(len(found), time.perf_counter() - started)
     worst = _worst(records)
     if options.pictures is not None:
         for record in worst:
@@ -102,12 +117,48 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
     return {
         "out": out,
         "frames_apart": {"short": short, "long": long},
+        "notes": notes,
         "lpips": None if network is None else network.name,
         "recipes": _summaries(records, ("recipe",)),
         "variants": _summaries(records, ("scene", "variant", "recipe")),
         "worst": worst,
         "pairs": records,
     }
+
+
+def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: int) -> list[str]:
+    """Why tables are empty. kinds: of the pairs that there are."""
+    asked = {SHORT: short, LONG: long}
+    missing = [kind for kind in asked if kind not in kinds]
+    by_camera = [
+        sorted(frame for frame, own in drive.rows if own == camera)
+        for drive in drives
+        for camera in {camera for _, camera in drive.rows}
+    ]
+    steps = Counter(b - a for frames in by_camera for a, b in itertools.pairwise(frames))
+    if not missing or not steps:
+        return []
+    step, span = steps.most_common(1)[0][0], max(frames[-1] - frames[0] for frames in by_camera)
+    far = min(math.ceil(long / step), span // step) * step
+    hint = "render more frames"
+    if far > step:
+        hint = f"add --short {step} --long {far}, or render consecutive frames"
+    apart = " or ".join(str(asked[kind]) for kind in missing)
+    return [
+        f"no two frames of a camera are {apart} apart, so the tables of {' and '.join(missing)} "
+        f"range are empty: the numbers of most are {step} apart, of the first and last {span}; "
+        f"{hint}"
+    ]
+
+
+def _say_duration(pairs: int, pair_s: float) -> None:
+    """Say how long a long evaluation takes, once it is known what a pair does."""
+    total_s = pairs * pair_s
+    if total_s > _MIN_SAID_S:
+        print_note(
+            f"{pairs} pairs of images, {pair_s:.1f} s each: about {duration_text(total_s)}. "
+            f"--pairs N takes N evenly chosen ones of each kind and variant"
+        )
 
 
 class View(NamedTuple):
@@ -462,7 +513,7 @@ def evaluation_text(facts: dict[str, Any]) -> str:
     """All tables."""
     apart = {k: f"{n} frame{'s' * (n != 1)} apart" for k, n in facts["frames_apart"].items()}
     with_lpips = facts["lpips"] is not None
-    lines = []
+    lines = [line for note in facts["notes"] for line in (f"Note: {note}", "")]
     for kind, title in (*apart.items(), (CAMERAS, "Neighbouring cameras")):
         lines += [title, "", *_table(facts, kind, with_lpips), ""]
     noises = _noises(facts)

@@ -416,8 +416,16 @@ def label_files(
     if hidden := max(done.hidden.values(), default=0):
         lines.append(f"  {hidden} objects are hidden by the weather (output.min_visibility)")
     if done.unmapped:
-        listed = ", ".join(f"{label} ({count})" for label, count in done.unmapped.items())
+        listed = ", ".join(
+            f"{label or 'boxes without a label'} ({count})"
+            for label, count in done.unmapped.items()
+        )
         lines.append(f"  of no category, and left out: {listed}")
+    if done.without_numbers:
+        lines.append(
+            f"  {done.without_numbers} objects are DontCare in kitti: centre, size or rotation of "
+            f"their box is not finite, or a side is not longer than 0"
+        )
     if done.unused:
         lines.append(f"  rows of output.categories that no label is of: {', '.join(done.unused)}")
     return lines

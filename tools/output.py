@@ -35,6 +35,15 @@ class NoteHandler(logging.Handler):
         print_note(self.format(record))
 
 
+def duration_text(seconds: float) -> str:
+    """A time in a unit that suits it."""
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
 def print_images(result: Any, took: str) -> None:
     """What became of a job's images: counts on stdout, the first failures as notes."""
     rate = result.written / result.seconds if result.seconds else 0.0

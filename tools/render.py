@@ -19,6 +19,7 @@ import torch
 
 from adapters.base import open_scene, scenes_of
 from adapters.camera_files.paths import frames_from_path_file
+from adapters.scene_cache import scene_digest
 from augment import effects
 from augment.boxes import PlacedBoxes, find_occlusion
 from augment.cameras import Camera, Frame
@@ -52,7 +53,14 @@ from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.drawing import draw_sheet, draw_video, write_rgb
 from tools.export import clear_notes, label_files, mirror_outputs, recipes_for_source
 from tools.options import FITTED, names_in
-from tools.output import LABELS_OF_STORES, compiling_noted, fill, print_images, print_note
+from tools.output import (
+    LABELS_OF_STORES,
+    compiling_noted,
+    duration_text,
+    fill,
+    print_images,
+    print_note,
+)
 
 if TYPE_CHECKING:
     from tools.cli import GenerateOptions, RenderOptions
@@ -210,6 +218,7 @@ def generate_dataset(options: GenerateOptions) -> int:
         scratch=options.scratch or default_scratch(out),
         backend=backend,
         open_scene=open_scene,
+        digest_of=scene_digest,
     )
     task = GenerateJob(
         recipes,
@@ -228,7 +237,7 @@ def generate_dataset(options: GenerateOptions) -> int:
     store.delete([probe])
     with ended_by_sigterm():
         result = run_generate(task, prepare=lambda recipes: warm_up_for_workers(recipes, backend))
-    print_images(result, _duration(result.seconds))
+    print_images(result, duration_text(result.seconds))
     if shares := shares_of(result.timings):
         print(shares.sentence)
     for uri, why in result.unusable.items():
@@ -279,7 +288,7 @@ def _dry_run(job: GenerateJob) -> int:
     if guess.unsampled:
         print(f"  taken as their mean: {', '.join(guess.unsampled)}")
     print(
-        f"about {_duration(guess.seconds)} of one worker, {_size(guess.bytes)} "
+        f"about {duration_text(guess.seconds)} of one worker, {_size(guess.bytes)} "
         f"(from one picture a recipe; right to a factor of two or so)"
     )
     return 1 if plan.unusable else 0
@@ -290,7 +299,7 @@ def _status_text(status: JobStatus) -> str:
         kind: [(name, g) for name, g in groups.items() if g.published < g.planned]
         for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe))
     }
-    left = _duration(status.left_s) if status.left_s and not _is_done(status) else ""
+    left = duration_text(status.left_s) if status.left_s and not _is_done(status) else ""
     return fill("status.txt", status=status, left=left, unfinished=unfinished, max_lines=_MAX_LINES)
 
 
@@ -311,14 +320,6 @@ def ended_by_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.1f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
 
 
 def _size(count: float) -> str:
@@ -384,6 +385,7 @@ def render_recipes(options: RenderOptions) -> int:
         workers=options.workers,
         backend=backend,
         overwrite=options.overwrite,
+        source_digest=scene_digest(options.scene),
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
     print_images(result, f"{result.seconds:.1f} s")
@@ -486,7 +488,7 @@ def run_demo(out: Path, frames: int) -> int:
         scene = open_scene(uri)
         warm_up(recipes)
     ready = time.perf_counter()
-    job = RenderJob(scene_uri=uri, recipes=recipes, out_dir=out)
+    job = RenderJob(uri, recipes, out, source_digest=scene_digest(uri))
     result = run_job(job, scene_loader=lambda _uri: scene)
     for failure in result.failures:
         print_note(f"failed: {failure}")

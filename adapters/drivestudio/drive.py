@@ -569,6 +569,11 @@ def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
         )
     first = min((run.data / "images").glob(f"*_{number}.jpg"), default=None)
     header = None if first is None else read_image_header(first)
+    if header is not None and header.orientation != 1:
+        problems.append(
+            f"images of camera {kind.name} have an EXIF orientation, such as {header.orientation} "
+            f"in {first}; it is ignored: poses and intrinsics are of the pixels as they are stored"
+        )
     if header is not None and (header.width, header.height) != (kind.width, kind.height):
         problems.append(
             f"{first} is of {header.width}x{header.height} pixels; drivestudio takes the "

@@ -34,11 +34,11 @@ from adapters.lidar_scene.surfels import (
     thin_points,
 )
 from adapters.raw_drive import BoxSample, DriveOptions, RawDrive, TimedBoxes
-from adapters.training_views.masks import find_ego_mask, moving_frames
 from adapters.world import join_gaussians
 from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.ground import measure_from_classes
+from augment.own_car import find_ego_mask, moving_frames
 from augment.scene import Actor, Gaussians, Ground, Scene
 
 logger = logging.getLogger(__name__)

@@ -259,6 +259,13 @@ def _class_meanings(tables: SceneTables) -> dict[int, int]:
     return {n: meaning.get(name, SemanticClass.UNKNOWN) for n, name in _class_names(tables).items()}
 
 
+# NotImplementedError, RuntimeError: a compression or a password that zipfile does not know.
+_NPZ_FAULTS = (
+    *(OSError, ValueError, LookupError, EOFError, zlib.error, zipfile.BadZipFile),
+    *(NotImplementedError, RuntimeError),
+)
+
+
 def _class_names(tables: SceneTables) -> Mapping[int, str]:
     """The classes by number; the published ones where category.json has none."""
     return tables.class_names or {number: name for number, (name, _) in enumerate(_CLASSES)}
@@ -272,7 +279,7 @@ def _panoptic_of(file: Path, rows: np.ndarray, in_air: np.ndarray, noise: int) -
             opened: Any = member
             numbers = read_npy(opened)[rows]
             numbers[in_air] = _PANOPTIC_STEP * noise
-    except (OSError, ValueError, KeyError, IndexError, zlib.error, zipfile.BadZipFile) as error:
+    except _NPZ_FAULTS as error:
         raise AdapterError(
             f"{file} must hold an array `data`, one number a return ({error}); copy it again"
         ) from error

@@ -44,6 +44,7 @@ from adapters.raw_drive import (
     class_of_air,
     find_objects,
     is_in_box,
+    names_in,
     scene_of_drive,
     some,
     world_classes,
@@ -233,8 +234,8 @@ def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> FrameBoxes:
     used = {*_REQUIRED, "timestamp_ns"}
     return FrameBoxes(
         Boxes(
-            tuple(str(value) for value in columns["track_id"][rows]),
-            tuple(str(value) for value in columns["label"][rows]),
+            names_in(columns["track_id"][rows]),
+            names_in(columns["label"][rows]),
             **vectors,
             attributes={
                 name.removeprefix(ATTRIBUTE_PREFIX): values[rows]

@@ -38,7 +38,7 @@ from pydantic import AfterValidator, BaseModel, Field
 from adapters.plain_files import Number, read_json, validated
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.cameras import Camera, Frame
-from augment.errors import AdapterError
+from augment.errors import AdapterError, SceneError
 from augment.geometry import invert_rigid
 from augment.jobs.layout import folder_name
 from augment.jobs.manifest import MAX_SIDE_PX
@@ -299,7 +299,10 @@ def _frame(path: Path, content: Any) -> Frame:
             cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
         except ValueError as error:
             raise AdapterError(f"{own}: {error}") from None
-    return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
+    try:
+        return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
+    except SceneError as error:
+        raise AdapterError(f"{path}: {error}") from None
 
 
 def _recentred(frame: Frame, origin: np.ndarray) -> Frame:

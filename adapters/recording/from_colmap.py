@@ -28,6 +28,7 @@ from adapters.plain_files import LARGEST, decode_image, inside, read_text
 from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
 from adapters.world import invert_pose
 from augment.errors import AdapterError
+from augment.files.recorded_images import twelve_bits_fault
 from augment.jobs.files import encode_depth
 
 CAMERA = "camera"  # of images that lie in no folder of their own
@@ -386,13 +387,15 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
         plain = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     fx, fy = plain.focal_length_x, plain.focal_length_y
     cx, cy = plain.principal_point_x, plain.principal_point_y
-    image = decode_image(source, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(source, cv2.IMREAD_COLOR)
     if image is None or image.shape[:2] != (lens.height, lens.width):
         got = "no image" if image is None else f"{image.shape[1]}x{image.shape[0]} pixels"
         raise AdapterError(
             f"{source} is {got}, the model's camera {lens.width}x{lens.height}; give the folder of "
             f"the images that COLMAP was run on"
         )
+    if fault := twelve_bits_fault(source):
+        raise AdapterError(f"{source} {fault}")
     if lens.is_undistorted() and source.suffix.lower() in (".jpg", ".jpeg"):
         shutil.copyfile(source, target)
     else:

@@ -35,10 +35,12 @@ from pydantic import (
 
 from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_json, read_numbers, read_pose, read_text
+from adapters.raw_drive import Picture, image_notes
 from adapters.world import invert_pose
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.files.image_size import read_image_header
+from augment.files.image_size import ImageHeader, read_image_header
+from augment.files.recorded_images import exif_hint
 from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
@@ -317,27 +319,29 @@ def find_images(
                 raise AdapterError(f"{other} and {path} are one image; delete one of them")
     paths: dict[tuple[int, int], Path] = {}
     sizes: dict[int, tuple[int, int]] = {}
+    used: list[tuple[Picture, ImageHeader]] = []
     problems: list[str] = []
     without_images = []
     for cam, lens in lenses.items():
         name = CAMERA_NAMES[cam]
         keys = [key for key in sorted(listed) if key[0] in frames and key[1] == cam]
-        seen = {key: _image_size(listed[key]) for key in keys}
-        counts = Counter(size for size in seen.values() if size is not None)
+        seen = {key: _image_header(listed[key]) for key in keys}
+        counts = Counter(header.size for header in seen.values() if header is not None)
         waymo_size = _SIDE_SIZE if name.startswith("SIDE") else _FULL_SIZE
         sizes[cam] = width, height = counts.most_common(1)[0][0] if counts else waymo_size
         if not counts:
             without_images.append(f"{width}x{height} for {name}")
-        for key, size in seen.items():
-            if size is None:
+        for key, header in seen.items():
+            if header is None:
                 problems.append(f"{listed[key]} is no image, or a damaged one; left out")
-            elif size != sizes[cam]:
+            elif header.size != sizes[cam]:
                 problems.append(
-                    f"{listed[key]} is {size[0]}x{size[1]} pixels, most images of {name} are "
-                    f"{width}x{height}; left out"
+                    f"{listed[key]} is {header.width}x{header.height} pixels, most images of "
+                    f"{name} are {width}x{height}; left out{exif_hint(header, sizes[cam])}"
                 )
             else:
                 paths[key] = listed[key]
+                used.append((Picture(name, key[0], listed[key]), header))
         if not (0 < lens.cx < width and 0 < lens.cy < height):
             whose = "as its images are" if counts else "assumed for want of images"
             raise AdapterError(
@@ -350,16 +354,15 @@ def find_images(
             f"{folder} holds no usable image NNNNNN_C.png or .jpg of {len(without_images)} "
             f"cameras: their size is taken to be Waymo's, {', '.join(without_images)}"
         )
-    return paths, sizes, problems
+    return paths, sizes, problems + image_notes(used)
 
 
-def _image_size(path: Path) -> tuple[int, int] | None:
-    """Width and height, or None for what is no image."""
+def _image_header(path: Path) -> ImageHeader | None:
+    """The header of an image; None for what is none."""
     try:
-        header = read_image_header(path)
+        return read_image_header(path)
     except OSError:
         return None
-    return None if header is None else (header.width, header.height)
 
 
 # ---- The tracked objects of a drive, in the columns in which a trained model has them ------------

@@ -22,7 +22,6 @@ import torch
 
 from adapters.lidar_scene.depth import project_points
 from adapters.training_views.depth_priors import visible
-from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -34,6 +33,7 @@ from augment.geometry import (
     slerp,
 )
 from augment.labels import LidarSweep
+from augment.own_car import spread
 from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 
@@ -201,7 +201,7 @@ def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
     rows = np.concatenate([p.rows[::stride] for p in seen])
     intensity = np.concatenate([p.intensity[::stride] for p in seen])
     images = np.repeat(np.arange(len(seen)), [len(p.rows[::stride]) for p in seen])
-    grey = np.stack([points.grey for points in seen])
+    grey = _stacked([points.grey for points in seen])
     ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
     a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
     bins = np.quantile(grey[images, rows, columns], ranks)
@@ -215,6 +215,15 @@ def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
             both = _entropy(joint)
             table = joint.reshape(_BINS, _BINS)
             out[i, j] = (_entropy(table.sum(0)) + _entropy(table.sum(1)) - both) / max(both, 1e-12)
+    return out
+
+
+def _stacked(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Grey images uint8 [I, H, W], smaller ones filled up to the largest to the right and below."""
+    size = np.max([image.shape for image in images], axis=0)
+    out = np.zeros((len(images), *size), np.uint8)
+    for place, image in zip(out, images, strict=True):
+        place[: image.shape[0], : image.shape[1]] = image
     return out
 
 
@@ -394,7 +403,12 @@ def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
     median, over blocks, of the logarithm of their ratio, so that what moves hardly counts."""
     if len(keys) < 3:
         return []
-    levels = [_block_stops(views.image(key)) for key in keys]
+    cameras = [views.camera(key) for key in keys]
+    size = (
+        min(_BLOCKS[0], *(camera.width for camera in cameras)),
+        min(_BLOCKS[1], *(camera.height for camera in cameras)),
+    )
+    levels = [_block_stops(views.image(key), size) for key in keys]
     change = np.array([np.median(b - a) for a, b in itertools.pairwise(levels)])
     usual = float(np.median(np.abs(change)))
     bound = max(_JUMP_STOPS, _JUMP_TIMES * usual)
@@ -413,8 +427,7 @@ def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
     return out
 
 
-def _block_stops(rgb: np.ndarray) -> np.ndarray:
-    """Logarithm to base 2 of the blocks' mean brightness, float32."""
-    size = (min(_BLOCKS[0], rgb.shape[1]), min(_BLOCKS[1], rgb.shape[0]))
+def _block_stops(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Logarithm to base 2 of the mean brightness of so many blocks across and down, float32."""
     grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     return np.log2(grey.astype(np.float32) + 4)  # a few levels, so that black does not count

@@ -23,12 +23,12 @@ import numpy as np
 import torch
 
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
-from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
 from adapters.world import join_gaussians
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.labels import EGO_VEHICLE
+from augment.own_car import spread
 from augment.reconstruct.view import ViewSource
 from augment.recorded_sky import TOP_MARGIN_RAD
 from augment.render.buffers import ALPHA, MEDIAN_DEPTH, SPLAT_IDS

@@ -9,15 +9,17 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tqdm import tqdm
 
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
-from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
+from adapters.training_views.masks import read_ego_mask
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
+from augment.own_car import find_ego_mask, moving_frames
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.recorded_sky import lidar_top_rad, sky_mask
 from augment.scene import Scene
@@ -26,7 +28,7 @@ NONE = "none"
 _EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
 CACHE_BYTES = 1 << 30
 _MAX_POSITION_M = 1e6  # float32 has a resolution of 6 cm there
-_MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
+_SIZE_SHARE = 0.05  # by which the sides of one camera's images may differ
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
 
@@ -141,7 +143,12 @@ class RecordedViews:
     def _ego(self, camera: Camera) -> np.ndarray | None:
         """Where the camera sees the recording car; None if it does not."""
         mask = self.ego_masks.get(camera.name)
-        return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
+        if mask is None or not _is_about(mask.shape[::-1], camera):
+            return None
+        if mask.shape == (camera.height, camera.width):
+            return mask
+        size = camera.width, camera.height
+        return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
     def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
         size = (camera.height, camera.width)
@@ -206,9 +213,9 @@ class RecordedViews:
             views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
             if not views:
                 continue
-            # Should a camera's size change, masks are for the size it has at first.
+            # Should a camera's size change, masks are for about the size it has at first.
             size = (views[0][1].width, views[0][1].height)
-            views = [(k, c) for k, c in views if (c.width, c.height) == size]
+            views = [(k, c) for k, c in views if _is_about(size, c)]
             if masks_dir is not None:
                 path = masks_dir / f"{name}.png"
                 if path.exists():
@@ -235,6 +242,13 @@ class RecordedViews:
         return top
 
 
+def _is_about(size: tuple[int, ...], camera: Camera) -> bool:
+    """True where the camera's width and height differ from others by a few pixels at most, as
+    those of images do that were undistorted one by one."""
+    ratios = camera.width / size[0], camera.height / size[1]
+    return all(abs(ratio - 1) <= _SIZE_SHARE for ratio in ratios)
+
+
 def _check_camera(key: ViewKey, camera: Camera) -> None:
     """Refuse what a Camera may be but a recording cannot."""
     where = f"camera {key.camera}, frame {key.frame}"
@@ -243,11 +257,6 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
         raise AdapterError(
             f"{where}: its position in the scene must be finite and within {_MAX_POSITION_M:.0f} m "
             f"of the origin; got {position}. Check the pose in the dataset"
-        )
-    if not _MIN_FOCAL < camera.fx / camera.width < _MAX_FOCAL:
-        raise AdapterError(
-            f"{where}: a focal length of {camera.fx:g} px is impossible for an image of "
-            f"{camera.width} columns; check the intrinsics and their unit (pixels)"
         )
 
 

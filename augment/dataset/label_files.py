@@ -27,12 +27,20 @@ import numpy as np
 import torch
 from pydantic import BaseModel, NonNegativeInt
 
+from augment.boxes import are_usable
 from augment.dataset.clips_pairs import split_by_scene
 from augment.dataset.samples import moved_points
 from augment.dataset.weather_dataset import RowReader
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat
-from augment.jobs.atomic import copy_file, link_file, refusals_of, replaced_folder
+from augment.jobs.atomic import (
+    copy_file,
+    link_file,
+    path_below,
+    read_file,
+    refusals_of,
+    replaced_folder,
+)
 from augment.jobs.box_tables import BOXES_2D, MASK_SIDES, MASKS, SIDES
 from augment.jobs.claims import hold
 from augment.jobs.files import CameraRecord, box_tables, visibility
@@ -87,8 +95,9 @@ class LabelsRecord(BaseModel, frozen=True, extra="forbid"):
 @dataclass(frozen=True)
 class LabelsWritten:
     """images, objects, hidden: how many, by format; hidden are objects that the weather hides,
-    marked or left out. parts: images by part. unmapped: labels of no category, and how many boxes.
-    unused: rows of category tables that no label is of.
+    marked or left out. parts: images by part. unmapped: labels of no category ("": the dataset has
+    none), and how many boxes. unused: rows of category tables that no label is of. without_numbers:
+    objects of kitti whose 3D box has numbers that no box can have: DontCare there.
     """
 
     folder: Path
@@ -98,6 +107,7 @@ class LabelsWritten:
     parts: Mapping[str, int]
     unmapped: Mapping[str, int]
     unused: tuple[str, ...]
+    without_numbers: int = 0
 
 
 def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWritten:
@@ -108,7 +118,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
     a part that is no name.
     """
     out = Path(out).absolute()
-    folder, store = out / LABELS, open_store(out)
+    folder, store = path_below(out, (LABELS,)), open_store(out)
     asked = asked or _asked_before(folder)
     if wrong := [part for part in asked.split if folder_name(part) != part]:
         raise ValueError(f"parts are names of files: letters, digits, -, _ and .; got {wrong[0]!r}")
@@ -137,7 +147,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
 
 def _asked_before(folder: Path) -> LabelsAsked:
     try:
-        return LabelsAsked.model_validate(json.loads((folder / RECORD).read_bytes())["asked"])
+        return LabelsAsked.model_validate(json.loads(read_file(folder / RECORD))["asked"])
     except (OSError, LookupError, TypeError, ValueError, RecursionError):
         return LabelsAsked()
 
@@ -164,9 +174,11 @@ def _policies(
 
 
 def category_of(label: str, table: Sequence[Category] | None) -> str | None:
-    """The name of the first row that takes the label; None of no row. table: None for the labels
-    themselves.
+    """The name of the first row that takes the label; None of no row, and where the dataset gives
+    no label (""). table: None for the labels themselves.
     """
+    if not label:
+        return None
     if table is None:
         return label
     return next((row.name for row in table if row.takes(label)), None)
@@ -226,9 +238,8 @@ def _categories(
     for key, output in policies.items():
         known.update(labels[key])
         if output.categories is None:
-            own.update(labels[key])
-            continue
-        names |= dict.fromkeys(row.name for row in output.categories)
+            own.update(label for label in labels[key] if label)
+        names |= dict.fromkeys(row.name for row in output.categories or ())
         unmapped.update({
             label: count
             for label, count in labels[key].items()
@@ -252,9 +263,10 @@ def _categories(
 @dataclass(frozen=True, eq=False)
 class LabelledObject:
     """One object that an image shows. is_hidden: by the weather, as the recipe counts it. amodal:
-    left, top, right, bottom of its projected box inside the image, hidden or not; None where that
-    is not known. visible: of the pixels that show it; rle: these as COCO's run lengths. visibility:
-    what the weather leaves of it, visible_fraction: what other objects leave, NaN: not known.
+    left, top, right, bottom of its projected box inside the image, hidden or not; of `visible`
+    where the box has no projection there. visible: of the pixels that show it; rle: these as COCO's
+    run lengths. visibility: what the weather leaves of it, visible_fraction: what other objects
+    leave, NaN: not known. is_estimated: the pixels follow from its 3D box (`box_estimates`).
     centre_m, size_m (length, width, height), camera_from_box: of its box.
     """
 
@@ -262,16 +274,23 @@ class LabelledObject:
     track_id: str
     instance: int
     is_hidden: bool
-    amodal: np.ndarray | None
+    amodal: np.ndarray
     visible: np.ndarray
     pixels: int
     rle: str
     visibility: float
     visible_fraction: float
     truncated_fraction: float
+    is_estimated: bool
     centre_m: np.ndarray
     size_m: np.ndarray
     camera_from_box: np.ndarray
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether its 3D box can stand somewhere."""
+        numbers = np.concatenate([self.centre_m, self.size_m, self.camera_from_box[:, 0]])
+        return bool(are_usable(numbers[None], self.size_m[None])[0])
 
 
 def objects_of(
@@ -304,19 +323,21 @@ def objects_of(
         if category is None or not masks["pixels"][k]:
             continue
         amodal = np.array([flat[side][k] for side in SIDES])
+        visible = np.array([masks[side][k] for side in MASK_SIDES])
         found.append(
             LabelledObject(
                 category=category,
                 track_id=boxes.track_ids[k],
                 instance=int(flat["instance"][k]),
                 is_hidden=bool(left[k] < output.min_visibility),
-                amodal=amodal if (amodal[2:] > amodal[:2]).all() else None,
-                visible=np.array([masks[side][k] for side in MASK_SIDES]),
+                amodal=amodal if (amodal[2:] > amodal[:2]).all() else visible.astype(np.float64),
+                visible=visible,
                 pixels=int(masks["pixels"][k]),
                 rle=masks["rle"][k],
                 visibility=float(left[k]),
                 visible_fraction=float(flat["visible_fraction"][k]),
                 truncated_fraction=float(flat["truncated_fraction"][k]),
+                is_estimated=bool(flat["is_estimated"][k]),
                 centre_m=centres[k],
                 size_m=boxes.sizes_m[k],
                 camera_from_box=world_from_camera[:3, :3].T @ rotations[k],
@@ -330,17 +351,19 @@ def objects_of(
 
 def coco_annotation(it: LabelledObject, size: tuple[int, int]) -> dict[str, Any]:
     """An annotation without its numbers. size: of the image, width and height. Beside COCO's own
-    keys: bbox_amodal, occlusion, truncation, visibility, track_id, instance; null: not known.
+    keys: bbox_amodal, occlusion, truncation, visibility, is_estimated (the box by its 3D box, not
+    by pixels), track_id, instance; null: not known.
     """
     return {
         "bbox": _xywh(it.visible),
         "area": it.pixels,
         "segmentation": {"size": [size[1], size[0]], "counts": it.rle},
         "iscrowd": int(it.is_hidden),
-        "bbox_amodal": None if it.amodal is None else _xywh(it.amodal),
+        "bbox_amodal": _xywh(it.amodal),
         "occlusion": _rounded(1 - it.visible_fraction),
         "truncation": _rounded(it.truncated_fraction),
         "visibility": _rounded(it.visibility),
+        "is_estimated": it.is_estimated,
         "track_id": it.track_id,
         "instance": it.instance,
     }
@@ -372,10 +395,9 @@ def kitti_line(it: LabelledObject) -> str:
     that leans, which the format cannot say. A hidden object, or one whose box has no numbers, is
     DontCare.
     """
-    sides = it.visible if it.amodal is None else it.amodal
+    sides = it.amodal
     heading = it.camera_from_box[:, 0]
-    numbers = np.concatenate([it.centre_m, it.size_m, heading])
-    if it.is_hidden or not np.isfinite(numbers).all():
+    if it.is_hidden or not it.has_numbers:
         unknown = [-1.0, -1.0, -1.0, -1000.0, -1000.0, -1000.0, -10.0]
         return _kitti_text(DONT_CARE, -1.0, -1, [-10.0, *sides, *unknown])
     length, width, height = it.size_m
@@ -420,7 +442,9 @@ def kitti_calibration(camera: CameraRecord, world_from_ego: torch.Tensor) -> str
 
 @dataclass(eq=False)
 class _Writing:
-    """One call of write_labels. counts: of images, objects and hidden ones, by kind and format."""
+    """One call of write_labels. counts: of images, objects and hidden ones, by kind and format.
+    without_numbers: as of LabelsWritten.
+    """
 
     out: Path
     reader: RowReader
@@ -429,6 +453,7 @@ class _Writing:
     categories: _Categories
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     parts: Counter[str] = field(default_factory=Counter)
+    without_numbers: int = 0
 
     def go(
         self, new: Path, rows: Sequence[Mapping[str, Any]], of_scene: Mapping[str, str]
@@ -456,6 +481,7 @@ class _Writing:
             parts=dict(self.parts),
             unmapped=self.categories.unmapped,
             unused=self.categories.unused,
+            without_numbers=self.without_numbers,
         )
 
     def _counted(self, asked: set[str]) -> dict[str, Any]:
@@ -489,6 +515,7 @@ class _Writing:
             if kind == "coco":
                 coco.add(number, part, row, [(numbers[it.category], it) for it in listed])
             elif kind == "kitti":
+                self.without_numbers += sum(not it.has_numbers for it in listed)
                 top, name = new / "kitti/training", f"{number:06d}"
                 _put_image(image, top / "image_2" / f"{name}{image.suffix}")
                 _put_lines(top / "label_2" / f"{name}.txt", [kitti_line(it) for it in listed])

@@ -11,6 +11,7 @@ import torch
 from torch.utils.data import Dataset
 
 from augment.base_photo import check_photos
+from augment.box_estimates import evidence_of
 from augment.cameras import Camera, Frame
 from augment.dataset.samples import (
     BoxFrame,
@@ -186,8 +187,9 @@ class SceneDataset(Dataset):
             return view, Labels()
         boxes = self.scene.boxes(frame.index)
         view, measured = label_view(
-            boxes, index.instances, index.world_origin_m, camera, view, recipe
-        )
+            boxes, index.instances, index.world_origin_m, camera, view, recipe,
+            evidence=lambda: evidence_of(self.scene, frame.index),
+        )  # fmt: skip
         if not (recipe.output.labels and "boxes" in load):
             return view, Labels()
         return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))

@@ -9,7 +9,8 @@ A sample is a dictionary:
     water             bool [H, W], where a ray meets water first; None where there is no flood
     snow              bool [H, W], where the pixel shows snow; None where there is no snow
     rain, snowfall    bool [H, W], where a streak or a flake covers the pixel; None without
-    trust             bool [H, W], where the picture can be believed; None where nobody asked
+    trust             float32 [H, W], how far the picture can be believed, 0 to 1; None where nobody
+                      asked
     boxes             all boxes of the frame, see `box_tensors`; None where there are none
     lidar             the frame's sweep, see `lidar_tensors`; None where there is none
     camera            name, width, height, timestamp_ns, K float64 [3, 3] in pixels of the image,
@@ -39,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from torch.utils.data import get_worker_info
 
 from augment.jobs.files import BoxWeather, CameraRecord, box_tables, depth_in_metres, visibility
-from augment.jobs.layout import mask_names
+from augment.jobs.layout import TRUST, mask_names
 from augment.labels import Boxes, LidarSweep
 
 ImageType = Literal["float32", "uint8"]
@@ -65,11 +66,12 @@ _BUFFERS = {
 }
 # Only such weather has it, or who asked for it. uint8, 0 or 255.
 _MASK = Buffer(np.uint8, lambda mask: torch.from_numpy(mask == 255), in_all=False)
+_TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_all=False)  # graded
 
 
 def buffers() -> dict[str, Buffer]:
     """By name: depth, semantic, instance, and the masks."""
-    return _BUFFERS | dict.fromkeys(mask_names(), _MASK)
+    return _BUFFERS | dict.fromkeys(mask_names(), _MASK) | {TRUST: _TRUST}
 
 
 def loadable() -> tuple[str, ...]:

@@ -36,6 +36,7 @@ from augment.dataset.samples import (
     make_sample,
 )
 from augment.errors import OutputError
+from augment.jobs.atomic import read_file
 from augment.jobs.box_tables import BoxNumbers
 from augment.jobs.files import (
     CameraRecord,
@@ -342,11 +343,12 @@ class RowReader:
             self._folders[folder] = f"{resolve_inside(root, folder) if folder else root}/"
         try:
             flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+            flags |= os.O_NONBLOCK  # or a pipe would be waited for
             descriptor = os.open(self._folders[folder] + name, flags)
         except OSError as error:
             if error.errno != errno.ELOOP:
                 raise
-            return resolve_inside(root, path).read_bytes()  # a link may stay inside
+            return read_file(resolve_inside(root, path))  # a link may stay inside
         with open(descriptor, "rb", buffering=0) as file:
             return file.read()
 

@@ -259,7 +259,7 @@ def box_transmittance(
     pixels = np.full(len(placed), NOT_COUNTED)
     transmittance = np.ones(len(placed))
     if medium is None:
-        return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
+        return BoxTransmittance(np.where(placed.is_usable, transmittance, np.nan), pixels)
     eye_m = camera.centre.numpy()
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
@@ -281,7 +281,7 @@ def box_transmittance(
             distance = z * np.sqrt(1 + across**2 + down**2)
             pixels[number] = len(rows)
             transmittance[number] = float(transmittance_to(distance, point_z).mean())
-    return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
+    return BoxTransmittance(np.where(placed.is_usable, transmittance, np.nan), pixels)
 
 
 # ---- On a LiDAR sweep ----------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from pydantic.dataclasses import dataclass
 
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import image_header
+from augment.files.recorded_images import decode_pixels
 from augment.files.stated_sizes import StatedSizeError, check_row_group
 from augment.jobs.atomic import temporary_beside
 from augment.jobs.tables import opened_parquet
@@ -328,8 +329,7 @@ def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
     if path is None:
         return ""
     if not lens.is_pinhole:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = decode_pixels(data, cv2.IMREAD_COLOR)
         if image is None:
             return "cannot be decoded"
         quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]

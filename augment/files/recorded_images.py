@@ -1,4 +1,8 @@
-"""Recorded images read at the size of a camera, from files that may be missing or damaged."""
+"""Recorded images read at the size of a camera, from files that may be missing or damaged.
+
+Pixels are read as they are stored: poses and intrinsics are of these, so no image is turned as its
+EXIF orientation asks for.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import cv2
 import numpy as np
 
 from augment.cameras import Camera
+from augment.files.image_size import ImageHeader, read_image_header
 from recipes.files import open_file
 
 _MAX_BYTES = 1 << 30  # of a file
@@ -21,16 +26,53 @@ _REDUCED = {
 }
 
 
+_LARGEST_OF_12_BITS = (1 << 12) - 1
+TWELVE_BITS = (
+    f"has 16 bits a channel and no value above {_LARGEST_OF_12_BITS} of 65535, as files of a "
+    "sensor's 12 bits; it would be black: store 8 bits, or multiply its values by 16"
+)
+
+
+def decode_pixels(data: bytes | np.ndarray, flags: int) -> np.ndarray | None:
+    """The pixels of an image file's content as they are stored, whatever EXIF says of turning them.
+
+    Args:
+        data: the file's bytes.
+        flags: of cv2.imdecode.
+
+    Returns:
+        As of cv2.imdecode; None where the content cannot be decoded.
+    """
+    data = np.frombuffer(data, np.uint8)
+    try:
+        return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    except cv2.error:  # larger than OpenCV allows
+        return None
+
+
+def has_12_bits(data: bytes | np.ndarray) -> bool:
+    """True for the content of an image file of 16 bits a channel whose values fit into 12.
+
+    Such an image holds a sensor's own numbers and would be shown at a sixteenth of its brightness.
+    """
+    values = decode_pixels(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if values is None or values.dtype != np.uint16:
+        return False
+    return int(values.max()) <= _LARGEST_OF_12_BITS
+
+
 def decode_image(path: Path, flags: int) -> np.ndarray | None:
-    """As cv2.imread, but of regular files only: a pipe would keep it waiting."""
+    """The stored pixels of an image file, see `decode_pixels`; None where it cannot be read.
+
+    Only regular files are read: a pipe would keep the program waiting.
+    """
     if _unpacked(path):
         return None
     try:
         with open_file(path) as file:
-            data = np.frombuffer(file.read(_MAX_BYTES), np.uint8)
+            return decode_pixels(file.read(_MAX_BYTES), flags)
     except OSError:
         return None
-    return cv2.imdecode(data, flags) if len(data) else None
 
 
 def has_image(path: Path) -> bool:
@@ -87,6 +129,8 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
     Raises:
         ImageFault: missing, cut short, not decodable, or not of the camera's size."""
     is_jpeg = is_whole_jpeg(path)
+    if fault := twelve_bits_fault(path):
+        raise ImageFault(fault)
     step = 1
     while is_jpeg and step < 8 and _can_be_reduced(full, scaled, 2 * step):
         step *= 2
@@ -99,10 +143,32 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
         about = "about " if step > 1 else ""
         raise ImageFault(
             f"is of {about}{width}x{height} pixels; its camera is of {full.width}x{full.height}"
+            f"{exif_hint(read_image_header(path), (full.width, full.height))}"
         )
     if (scaled.height, scaled.width) != size:
         image = cv2.resize(image, (scaled.width, scaled.height), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def twelve_bits_fault(path: Path) -> str:
+    """What is wrong with an image file of 16 bits a channel that holds 12, else nothing."""
+    header = read_image_header(path)
+    if header is None or header.bits != 16:
+        return ""
+    with open_file(path) as file:
+        return TWELVE_BITS if has_12_bits(file.read(_MAX_BYTES)) else ""
+
+
+def exif_hint(header: ImageHeader | None, expected: tuple[int, int]) -> str:
+    """The end of a sentence on an image that is not of the expected width and height: EXIF, where
+    the image would be of them if it were turned; else nothing.
+    """
+    if header is None or header.size == expected or header.turned_size != expected:
+        return ""
+    return (
+        f"; its EXIF orientation is {header.orientation}, and images are read as they are stored: "
+        f"turn the pixels in the file, or give size, intrinsics and pose of the stored image"
+    )
 
 
 def _can_be_reduced(full: Camera, scaled: Camera, step: int) -> bool:

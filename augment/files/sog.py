@@ -159,9 +159,13 @@ class _Files:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:  # sizes that it refuses
             image = None
-        is_whole = image is not None and image.shape[:2] == (header.height, header.width)
-        if not is_whole or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] < 3:
+        if image is None or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] < 3:
             raise SceneError(f"{where} is damaged, or no image of 8 bits in three or four channels")
+        if image.shape[:2] != (header.height, header.width):
+            raise SceneError(
+                f"{where} is damaged: it says {header.width} x {header.height} pixels and holds "
+                f"{image.shape[1]} x {image.shape[0]}"
+            )
         if image.shape[2] == 3:  # decoders leave out an alpha that is 255 everywhere
             return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA)
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)

@@ -14,8 +14,8 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 # Bytes of a table that is read as a whole; a manifest of a million images has some 0.5 GB.
@@ -133,8 +133,9 @@ def check_texts(column: pa.ChunkedArray) -> None:
     """
     num_bytes = 0
     for chunk in column.chunks:
-        lengths = pc.binary_length(chunk.dictionary).cast(pa.int64())
-        num_bytes += pc.sum(lengths.take(chunk.indices)).as_py() or 0
+        buffers = (text.as_buffer() for text in chunk.dictionary)
+        lengths = np.array([0 if b is None else b.size for b in buffers], np.int64)
+        num_bytes += int(lengths[chunk.indices.drop_null().to_numpy()].sum())
     if num_bytes > MAX_TABLE_BYTES:
         raise _too_large()
 
@@ -196,19 +197,26 @@ def _read_pages(file: pa.NativeFile, chunk: Any, max_pages: int) -> list[_Page]:
         if len(pages) >= max_pages:
             raise StatedSizeError(f"it has more than {MAX_PAGES} pages; write larger ones")
         header, header_bytes = _read_header(file, start)
-        stored, num_bytes = header.get(_STORED_BYTES), header.get(_PAGE_BYTES)
-        kind = header.get(_KIND)
         data, data_v2 = header.get(_DATA, {}), header.get(_DATA_V2, {})
-        count = data_v2.get(_COUNT, 0) if data_v2 else data.get(_COUNT, 0)
-        encoding = data_v2.get(_ENCODING_V2) if data_v2 else data.get(_ENCODING)
-        if not all(isinstance(n, int) and n >= 0 for n in (stored, num_bytes, kind, count)):
+        values, encoding_field = (data_v2, _ENCODING_V2) if data_v2 else (data, _ENCODING)
+        if not isinstance(values, dict):
             raise _damaged(start)
-        is_dictionary = kind == _DICTIONARY_PAGE
+        stored, num_bytes = (_count(header, field, start) for field in (_STORED_BYTES, _PAGE_BYTES))
+        count, encoding = _count({_COUNT: 0} | values, _COUNT, start), values.get(encoding_field)
+        is_dictionary = _count(header, _KIND, start) == _DICTIONARY_PAGE
         if encoding == _SHARED_LETTERS_ENCODING:
             num_bytes *= max(1, count)
         pages.append(_Page(is_dictionary, encoding in _DICTIONARY_ENCODINGS, count, num_bytes))
         start += header_bytes + stored
     return pages
+
+
+def _count(fields: dict[int, Any], number: int, start: int) -> int:
+    """A whole number that is not negative. start: of the page, for the message."""
+    value = fields.get(number)
+    if not isinstance(value, int) or value < 0:
+        raise _damaged(start)
+    return value
 
 
 def _read_header(file: pa.NativeFile, start: int) -> tuple[dict[int, Any], int]:

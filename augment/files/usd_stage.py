@@ -73,35 +73,43 @@ def reason_of(error: Exception) -> str:
         return "it holds text that is not UTF-8"
 
 
+def openusd() -> Any:
+    """The modules of usd-core as attributes, which no type checker knows."""
+    import pxr
+    from pxr import Sdf, Usd, UsdGeom, UsdVol  # noqa: F401 - attributes of pxr
+
+    return pxr
+
+
 def read_stage(path: Path, arrays: list[np.ndarray]) -> dict[str, Any]:
     """The facts of all visible prims with Gaussians; their columns are appended to `arrays`."""
-    from pxr import Sdf, Usd, UsdGeom, UsdVol
-
-    root = Sdf.Layer.FindOrOpen(str(path))
+    pxr = openusd()
+    usd, geometry = pxr.Usd, pxr.UsdGeom
+    root = pxr.Sdf.Layer.FindOrOpen(str(path))
     if root is None:
         raise Refusal("OpenUSD cannot open it")
     check_layers(path, root)
-    stage = Usd.Stage.Open(root)
-    time = Usd.TimeCode.EarliestTime()
-    transforms = UsdGeom.XformCache(time)
+    stage = usd.Stage.Open(root)
+    time = usd.TimeCode.EarliestTime()
+    transforms = geometry.XformCache(time)
     room = path.stat().st_size // LEAST_ROW
     notes, problems, prims, unit = {}, [], [], 1.0
-    if stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit):
-        unit = float(UsdGeom.GetStageMetersPerUnit(stage))
+    if stage.HasAuthoredMetadata(geometry.Tokens.metersPerUnit):
+        unit = float(geometry.GetStageMetersPerUnit(stage))
         notes["unit"] = "metre"
         if not (np.isfinite(unit) and unit > 0):
             raise Refusal(f"metersPerUnit must be positive; got {unit}")
-    if stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
-        notes["up"] = f"+{UsdGeom.GetStageUpAxis(stage).lower()}"
-    for prim in Usd.PrimRange(
-        stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+    if stage.HasAuthoredMetadata(geometry.Tokens.upAxis):
+        notes["up"] = f"+{geometry.GetStageUpAxis(stage).lower()}"
+    for prim in usd.PrimRange(
+        stage.GetPseudoRoot(), usd.TraverseInstanceProxies(usd.PrimDefaultPredicate)
     ):
         where = prim.GetPath()
         if prim.HasMetadata("clips"):
             raise Refusal(f"{where} takes values from other files (clips)")
-        if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+        if not prim.IsA(pxr.UsdVol.ParticleField3DGaussianSplat):
             continue
-        if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+        if geometry.Imageable(prim).ComputeVisibility(time) == geometry.Tokens.invisible:
             problems.append(f"{where} is invisible and left out")
             continue
         with np.errstate(over="ignore", invalid="ignore"):
@@ -174,8 +182,7 @@ def column(prim: Any, name: str, width: int, time: Any) -> np.ndarray | None:
 
 def check_layers(path: Path, root: Any) -> None:
     """Refuse a file with layers in other files; a .usdz can have several in itself."""
-    from pxr import Sdf
-
+    layers = openusd().Sdf.Layer
     waiting, visited = [root], set()
     while waiting:
         layer = waiting.pop()
@@ -184,7 +191,7 @@ def check_layers(path: Path, root: Any) -> None:
         visited.add(layer.identifier)
         for name in filter(None, layer.GetCompositionAssetDependencies()):  # '': the layer itself
             where = layer.ComputeAbsolutePath(name)
-            inner = Sdf.Layer.FindOrOpen(where) if where.startswith(f"{path}[") else None
+            inner = layers.FindOrOpen(where) if where.startswith(f"{path}[") else None
             if inner is None:
                 raise Refusal(
                     f"it refers to {name!r}, which is not in it; make one file of all: usdcat "

@@ -15,16 +15,21 @@ import contextlib
 import ctypes
 import errno
 import fcntl
+import logging
 import os
 import re
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from augment.errors import OutputError
+from recipes.files import open_file
+
+_log = logging.getLogger(__name__)
 
 TEMPORARY_SUFFIX = ".climategs-tmp"
 _MAX_SHOWN = 200  # bytes of the final name in the temporary one, which may have 255
@@ -81,6 +86,27 @@ def replaced_file(
                 file.close()
         if flush:
             flush_folder(path.parent)
+
+
+def read_file(path: Path) -> bytes:
+    """Return the bytes of a regular file. Raises OSError: there is none, or it is a folder, a pipe
+    (which might be waited for without end) or a device.
+    """
+    with open_file(path) as file:
+        return file.read()
+
+
+def path_below(root: Path, parts: tuple[str, ...]) -> Path:
+    """The path of these components, which no link leads out of the root."""
+    path = root.joinpath(*parts)
+    # Not Path.resolve, which raises RuntimeError where links lead round in circles.
+    real, real_root = os.path.realpath(path), os.path.realpath(root)
+    if not Path(real).is_relative_to(real_root):
+        raise OutputError(
+            f"{path} leads through a link to {real}, outside {real_root}; "
+            f"put the files themselves under the output folder"
+        )
+    return path
 
 
 def temporary_beside(path: Path) -> Path:
@@ -193,6 +219,103 @@ def _clear_abandoned(path: Path, flags: int, clear: Callable[[], object]) -> Non
             clear()
     finally:
         os.close(descriptor)
+
+
+# ---- Lock files: whatever else has the name of one stays as it is --------------------------------
+# A folder may come from somebody else, and a link in it lead anywhere. Nothing but a mark of who
+# holds the lock is ever written into one, and only where nothing else is in it.
+
+MAX_MARK_BYTES = 64
+_MARK = re.compile(rb"\d{0,20}( \d{0,20})?\s*")  # as processes.process_mark, cut short by a kill
+_POLL_S = 0.05
+_SAY_AFTER_S = 2.0  # of waiting
+
+
+def open_lock(path: Path) -> int:
+    """Descriptor of a lock file, open for reading and writing; the file and its folder are made if
+    missing. Raises OutputError: the name is that of a link, a pipe, a folder or a device, or the
+    file holds something else than a lock's mark; nothing has been changed then.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with refusals_of(path):
+        make_folder(path.parent)
+        try:
+            descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            if error.errno not in _KINDS:
+                raise
+            raise _no_lock(path, _KINDS[error.errno]) from error
+        facts = os.fstat(descriptor)
+        kind = "" if stat.S_ISREG(facts.st_mode) else "a pipe or device"
+        if not kind and facts.st_size:
+            data = os.pread(descriptor, MAX_MARK_BYTES, 0)
+            is_ours = facts.st_size <= MAX_MARK_BYTES and _MARK.fullmatch(data)
+            kind = "" if is_ours and facts.st_nlink <= 1 else "a file with other content"
+        if kind:
+            os.close(descriptor)
+            raise _no_lock(path, kind)
+    return descriptor
+
+
+def wait_for_lock(path: Path, descriptor: int, *, patience_s: float, doing: str) -> None:
+    """Lock the open file; says so once where that takes a while.
+
+    Args:
+        path: the file's name, for messages.
+        patience_s: how long to wait at most, seconds.
+        doing: what the holder does, after "another process".
+
+    Raises:
+        OutputError: another process has held it for that long.
+    """
+    started, is_said = time.monotonic(), False
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            waited_s = time.monotonic() - started
+        if waited_s > patience_s:
+            raise OutputError(
+                f"{path}: another process{lock_holder(descriptor)} has held this lock for "
+                f"{patience_s:.0f} s ({doing}); end it, then run the same command again"
+            )
+        if waited_s > _SAY_AFTER_S and not is_said:
+            is_said = True
+            _log.info(
+                "another process%s %s; waiting for it at most %.0f min (%s)",
+                *(lock_holder(descriptor), doing, patience_s / 60, path),
+            )
+        time.sleep(_POLL_S)
+
+
+def lock_holder(descriptor: int) -> str:
+    """` (process 1234)`: who holds the kernel's lock of an open file; empty where the system does
+    not tell, as of other machines.
+    """
+    inode = os.fstat(descriptor).st_ino
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/locks").read_text().splitlines():
+            words = line.split()  # proc(5): 1: FLOCK ADVISORY WRITE 1234 08:01:5678 0 EOF
+            is_held = words[1] == "FLOCK" and int(words[5].rpartition(":")[2]) == inode
+            if is_held and int(words[4]) > 0:
+                return f" (process {words[4]})"
+    return ""
+
+
+_KINDS = {
+    errno.ELOOP: "a link",
+    errno.EISDIR: "a folder",
+    errno.ENXIO: "a device or socket",
+    errno.ENODEV: "a device or socket",
+}
+
+
+def _no_lock(path: Path, kind: str) -> OutputError:
+    return OutputError(
+        f"{path} is {kind}, where a lock of climategs was expected: a small file that nothing else "
+        f"is kept in. Nothing has been changed. See where it comes from, then delete it, or choose "
+        f"another folder"
+    )
 
 
 # ---- Folders replaced as a whole: readers find the old one or the new one ------------------------

@@ -10,7 +10,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -19,20 +19,32 @@ import pyarrow as pa
 
 from augment import effects
 from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
-from augment.jobs.atomic import link_file, make_folder, refusals_of, remove_temporaries
+from augment.jobs.atomic import copy_file, link_file, make_folder, refusals_of, remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
 from augment.jobs.files import box_tables
 from augment.jobs.layout import (
+    MANIFEST,
     STATE_FOLDER,
     SWEEPS,
+    FileListing,
     folder_name,
     item_paths,
     path_kinds,
     reading_back,
     variant_folder,
 )
-from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
+from augment.jobs.manifest import (
+    OK,
+    PARTS,
+    Identity,
+    Part,
+    list_parts,
+    parse_manifest,
+    publish_part,
+    read_manifest,
+    write_manifest,
+)
 from augment.jobs.pools import OnOutcome
 from augment.jobs.processes import file_lock
 from augment.jobs.quality import FOLDER as QUALITY
@@ -87,7 +99,8 @@ class Publisher:
     def finish(self) -> Part:
         """Send what is left, then make the block visible."""
         rows = read_manifest(self._folder)
-        new = _renamed(rows, self._block.file_stem)
+        stem = self._block.file_stem  # `labels/boxes.parquet` becomes `labels/boxes/<stem>.parquet`
+        new = _renamed(rows, lambda path: path.with_suffix("") / f"{stem}{path.suffix}")
         # The recipe, and the files that it names: every block of a variant has the same.
         globs = ("*/*/recipe.yaml", *(f"*/*/{folder}/*" for folder in file_folders()))
         of_variant = [p for glob in globs for p in sorted(self._folder.glob(glob))]
@@ -125,6 +138,28 @@ def take_sweeps(store: Store, folder: Path, block: Block) -> None:
                 link_file(str(store.local_dir / path), str(folder / path))
 
 
+def take_published(store: Store, folder: Path, block: Block, part: Part) -> None:
+    """Give the folder, by links, what is left of a published block that has lost files: `run_job`
+    then makes there what is missing, and nothing else.
+    """
+    if store.local_dir is None or (folder / MANIFEST).is_file():
+        return
+    rows = parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
+    staged = _renamed(rows, lambda path: path.parent.with_suffix(path.suffix))
+    names: dict[str, str] = {}
+    for column in (f"{kind}_path" for kind in path_kinds()):
+        pairs = zip(rows[column].to_pylist(), staged[column].to_pylist(), strict=True)
+        names |= {there: here for there, here in pairs if there is not None}
+    listing = FileListing(store.local_dir)
+    for there, here in names.items():
+        if listing.has(there):
+            with refusals_of(folder / here):
+                make_folder((folder / here).parent)
+                if not link_file(str(store.local_dir / there), str(folder / here)):
+                    copy_file(str(store.local_dir / there), str(folder / here))
+    write_manifest(folder, staged)
+
+
 def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
     """Where a block is rendered: on the output's own disk, else in `scratch`. There a killed job
     finds again what it had finished of the block.
@@ -135,11 +170,11 @@ def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
     return scratch / "blocks" / block.claim
 
 
-def _renamed(rows: pa.Table, stem: str) -> pa.Table:
-    """`labels/boxes.parquet` becomes `labels/boxes/<stem>.parquet`."""
+def _renamed(rows: pa.Table, rename: Callable[[PurePosixPath], PurePosixPath]) -> pa.Table:
+    """The rows with other names of the files that belong to several images."""
     for name in (f"{kind}_path" for kind in _of_block()):
         files = [None if p is None else PurePosixPath(p) for p in rows[name].to_pylist()]
-        paths = [f and str(f.with_suffix("") / f"{stem}{f.suffix}") for f in files]
+        paths = [None if file is None else str(rename(file)) for file in files]
         place = rows.column_names.index(name)
         rows = rows.set_column(place, rows.schema.field(place), pa.array(paths, pa.string()))
     return rows.combine_chunks()
@@ -196,10 +231,25 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
             claim.release()
 
 
+def clear_staged(store: Store, scratch: Path | None, scene_folder: str) -> None:
+    """Delete the folders that blocks of a scene are rendered in, but for those that live processes
+    are at.
+    """
+    root = store.local_dir / STATE_FOLDER if store.local_dir is not None else scratch
+    for folder in sorted(root.glob(f"blocks/{scene_folder}.*")) if root is not None else ():
+        claim = try_claim(store, folder_name(folder.name))
+        if claim is not None:
+            with claim:
+                _remove_tree(folder)
+
+
 def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
     """Delete the folder that a block was rendered in; who calls holds its claim."""
-    folder = staging_folder(store, scratch, block)
     clear_files_of(store, block)
+    _remove_tree(staging_folder(store, scratch, block))
+
+
+def _remove_tree(folder: Path) -> None:
     try:
         shutil.rmtree(folder)
     except FileNotFoundError:
@@ -223,8 +273,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class WorkSetup:
     """What all workers of a job share; picklable. store_uri: the output. scratch: where blocks are
-    rendered on their way to an output that is not on this machine. open_scene, renderer: importable
-    functions; None renders with the library's.
+    rendered on their way to an output that is not on this machine. open_scene, renderer, digest_of:
+    importable functions; None renders with the library's, and notes no digest of a scene's content.
     """
 
     store_uri: str
@@ -232,6 +282,7 @@ class WorkSetup:
     backend: str
     open_scene: SceneLoader
     renderer: Renderer | None = None
+    digest_of: Callable[[str], str | None] | None = None
 
     @property
     def output(self) -> str:
@@ -252,12 +303,14 @@ class IndexTask:
 @dataclass(frozen=True)
 class BlockTask:
     """Render a block. is_trial: its worker died before, so each image is rendered in a process of
-    its own, and one that ends it is the only one lost.
+    its own, and one that ends it is the only one lost. is_damaged: it is published, and has lost
+    files since.
     """
 
     block: Block
     name: str | None
     is_trial: bool = False
+    is_damaged: bool = False
 
 
 @dataclass(frozen=True)
@@ -336,7 +389,8 @@ class BlockWorker:
     def _index(self, task: IndexTask) -> SceneRecord:
         started = time.perf_counter()
         scene = self._scene_of(task.uri, task.name)
-        return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
+        digest = self._setup.digest_of(task.uri) if self._setup.digest_of is not None else None
+        return SceneRecord.of(scene, task.uri, time.perf_counter() - started, digest)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
         scene, setup = self._scene_of(task.uri, task.name), self._setup
@@ -381,12 +435,12 @@ class BlockWorker:
             return BlockDone(is_elsewhere=True)
         with claim:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
-            if part is not None and not part.has_failures:
+            if part is not None and not part.has_failures and not task.is_damaged:
                 clear_block(self._store, self._setup.scratch, block)  # killed just before it did
                 return BlockDone(skipped=block.images)
-            return self._render_claimed(task)
+            return self._render_claimed(task, part if task.is_damaged else None)
 
-    def _render_claimed(self, task: BlockTask) -> BlockDone:
+    def _render_claimed(self, task: BlockTask, damaged: Part | None) -> BlockDone:
         block, times = task.block, WorkTimes()
         if task.is_trial:  # its processes share a scene of their own: not two at a time
             self._forget()
@@ -399,6 +453,8 @@ class BlockWorker:
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
             clear_files_of(self._store, block)
+        if damaged is not None:
+            take_published(self._store, folder, block, damaged)
         take_sweeps(self._store, folder, block)
         job = RenderJob(
             scene_uri=block.uri,
@@ -409,6 +465,7 @@ class BlockWorker:
             backend=self._setup.backend,
             workers=2 if task.is_trial else 1,
             shared_dir=self._shared_dir(),
+            source_digest=block.digest,
         )
         with Publisher(self._store, folder, block) as publisher:
 
@@ -448,7 +505,8 @@ class BlockWorker:
         recipe, backend = block.recipe, self._setup.backend
         if any(e.shares_files and e.of(recipe) is not None for e in effects.EFFECTS):
             folder = self._shared_dir()
-            with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
+            lock = folder / f"beds-{folder_name(block.scene)}.lock"
+            with file_lock(lock, "finds where snow can lie"):
                 job = effects.Sharing(scene, [recipe], folder=folder, backend=backend)
                 effects.share_effects(job, only_files=True)
 

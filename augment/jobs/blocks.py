@@ -21,6 +21,7 @@ from pydantic import Field, TypeAdapter
 import augment
 from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
+from augment.jobs.atomic import read_file
 from augment.jobs.claims import CLAIMS_FOLDER, try_claim
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, reading_back, variant_name
@@ -48,7 +49,8 @@ class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
     has_lidar: whether there is any. open_s: how long opening it took. unfitted: cameras that it was
     never fitted to. learnt_scale: of the images that it was made from over the cameras. problems:
-    what is not fit for weather, as of augment.trust.SceneTrust.
+    what is not fit for weather, as of augment.trust.SceneTrust. digest: of its content, None where
+    nobody knows it.
     """
 
     uri: str
@@ -60,9 +62,10 @@ class SceneRecord:
     unfitted: tuple[str, ...] = ()
     learnt_scale: float | None = None
     problems: tuple[str, ...] = ()
+    digest: str | None = None
 
     @staticmethod
-    def of(scene: Scene, uri: str, open_s: float) -> SceneRecord:
+    def of(scene: Scene, uri: str, open_s: float, digest: str | None = None) -> SceneRecord:
         select_frames(SceneIndex.of(scene), None, None)  # or it holds no image at all
         frames = [
             FrameRecord(
@@ -80,6 +83,7 @@ class SceneRecord:
             unfitted=unfitted,
             learnt_scale=seen_views(scene).scale,
             problems=judge_scene(scene, cameras=cameras, scale=None, count=1).problems,
+            digest=digest,
         )
 
     def to_json(self) -> bytes:
@@ -100,7 +104,8 @@ class Block:
     """Images that one worker renders in a row and that appear in the output at once. key:
     `<scene>/<variant>-<first frame>-<digest>`, the digest of all that decides the block's images,
     whatever else is in the job. uri: what opens the scene. source: the scene's own word for that.
-    scene: its name in the output. images: how many it has.
+    scene: its name in the output. images: how many it has. digest: of the scene's content; no part
+    of the key, so that outputs of before it was noted are gone on with.
     """
 
     key: str
@@ -111,6 +116,7 @@ class Block:
     frames: tuple[int, ...]
     cameras: tuple[str, ...]
     images: int
+    digest: str | None = None
 
     @property
     def variant(self) -> str:
@@ -128,7 +134,8 @@ class Block:
 
     def identity(self, backend: str) -> Identity:
         """What its images are made from. backend: as named, or as chosen where that is known."""
-        return Identity(self.source, self.recipe.hash, RECORDED, augment.__version__, backend)
+        version = augment.__version__
+        return Identity(self.source, self.recipe.hash, RECORDED, version, backend, self.digest)
 
     def pictured(self, record: SceneRecord) -> list[Pictured]:
         """All images of the block, by frame and camera."""
@@ -194,7 +201,7 @@ def cut_into_blocks(
                 decides = [record.source, recipe.hash, held, names, augment.__version__, backend]
                 digest = hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
                 key = f"{stem}-{run[0].number:06d}-{digest}"
-                blocks.append(Block(key, *origin, recipe, held, names, sum(counts)))
+                blocks.append(Block(key, *origin, recipe, held, names, sum(counts), record.digest))
     if not blocks:
         raise SceneError(
             f"scene {record.name!r} ({record.uri}): frames {frames!r} and cameras "
@@ -452,7 +459,7 @@ def _staged(store: Store) -> dict[str, int]:
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
         with contextlib.suppress(OSError, OutputError):  # published meanwhile
             progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
-            finished = sum(j.read_bytes().count(b'"status":"ok"') for j in progress_logs)
+            finished = sum(read_file(j).count(b'"status":"ok"') for j in progress_logs)
             if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished

@@ -49,7 +49,8 @@ class BoxTable:
     """How the numbers of one kind are stored. name: as of the manifest's column of paths,
     without `_path`. file: inside a variant's folder. kind: what the file says that it holds.
     columns: the file's, with their types, `object` for texts. derived: what follows from the
-    others; those that are columns are there for other readers. sampled: those that samples of
+    others; those that are columns are there for other readers. later: columns, the last ones, that
+    files of older versions lack, with the value that these mean. sampled: those that samples of
     the datasets have. visible, hidden: the column that says how much of a box the effect leaves
     to be seen, or takes; 0 to 1, NaN where it says nothing.
     """
@@ -62,6 +63,7 @@ class BoxTable:
     derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
     visible: str = ""
     hidden: str = ""
+    later: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def stored(self) -> tuple[str, ...]:
@@ -85,7 +87,10 @@ class BoxTable:
     def from_json(self, columns: Sequence[Sequence[Any]]) -> BoxNumbers:
         """What `to_json` made a list of."""
         track_ids, *arrays = columns
-        pairs = zip(self.stored, arrays, strict=True)
+        names = self.stored
+        if len(arrays) == len(names) - len(self.later):  # of an older version's log
+            arrays += [[value] * len(track_ids) for value in self.later.values()]
+        pairs = zip(names, arrays, strict=True)
         return self.numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})
 
     def to_bytes(self, items: Mapping[Item, BoxNumbers]) -> bytes:
@@ -120,7 +125,13 @@ class BoxTable:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
         with as_described(path):
             track_ids = texts_of(table["track_id"])
-            columns = {name: self._column(table[name], name) for name in self.stored}
+            absent = self.later.keys() - set(table.column_names)
+            columns = {
+                name: np.full(len(table), self.later[name], self.columns[name])
+                if name in absent
+                else self._column(table[name], name)
+                for name in self.stored
+            }
             items, start = {}, 0
             for frame, camera, count in note["images"]:
                 rows = slice(start, start + count)
@@ -167,7 +178,8 @@ MODAL_SIDES = ("modal_x0", "modal_y0", "modal_x1", "modal_y1")
 # part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of the
 # pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those inside its
 # outline that show what stands before it. truncated_fraction: of the outline's area, outside the
-# image.
+# image. is_estimated: depth does not resolve the box, and its pixels are those that its projection,
+# other boxes and LiDAR returns tell (`augment.box_estimates`).
 BOXES_2D = BoxTable(
     name="box_2d",
     file="labels/boxes_2d.parquet",
@@ -179,8 +191,10 @@ BOXES_2D = BoxTable(
         "hidden_pixels": np.int64,
         "visible_fraction": np.float64,
         "truncated_fraction": np.float64,
+        "is_estimated": np.bool_,
     },
-    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
+    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction", "is_estimated"),
+    later={"is_estimated": False},
     derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
 )
 # Which pixels show each box: in the instance image, where the recipe has one, else by depth, the

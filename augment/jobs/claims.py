@@ -28,11 +28,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from augment.errors import OutputError
-from augment.jobs.atomic import is_named, make_folder, refusals_of
+from augment.jobs.atomic import is_named, open_lock, path_below, refusals_of
 from augment.jobs.layout import STATE_FOLDER, folder_name
 from augment.jobs.store import RemoteStore, Store, StoredVersion
 
 CLAIMS_FOLDER = f"{STATE_FOLDER}/claims"
+_FIRST_WAIT_S = 0.05  # between the first two looks at a claim that another process holds
+_MAX_WAIT_S = 0.5  # between later ones
+_SAY_AFTER_S = 2.0  # of waiting
+_log = logging.getLogger(__name__)
 
 
 class Claim(ABC):
@@ -77,24 +81,36 @@ def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim
             f"first a letter or digit; got {name!r}. layout.folder_name makes such names"
         )
     if store.local_dir is not None:
-        return try_lock(store.local_dir / CLAIMS_FOLDER / f"{name}.lock")
+        return try_lock(path_below(store.local_dir, (CLAIMS_FOLDER,)) / f"{name}.lock")
     assert isinstance(store, RemoteStore), "a claim elsewhere needs conditional puts"
     return _contend(store, f"{CLAIMS_FOLDER}/{name}", times or CLAIM_TIMES)
 
 
 @contextlib.contextmanager
-def hold(store: Store, name: str, patience_s: float = 120.0) -> Iterator[None]:
-    """Be inside with the claim; waits for others that are."""
-    deadline = time.monotonic() + patience_s
+def hold(
+    store: Store, name: str, patience_s: float = 120.0, doing: str = "writes there"
+) -> Iterator[Claim]:
+    """Be inside with the claim; waits for others that are, and says so once. doing: what they do,
+    after "another process". Raises OutputError: one of them takes longer than the patience.
+    """
+    started, wait_s, is_said = time.monotonic(), _FIRST_WAIT_S, False
     while (claim := try_claim(store, name)) is None:
-        if time.monotonic() > deadline:
+        waited_s = time.monotonic() - started
+        if waited_s > patience_s:
             raise OutputError(
                 f"{store.uri}: another process has held the claim {name!r} for {patience_s:.0f} s; "
                 f"end it, then run the same command again"
             )
-        time.sleep(0.05)
+        if waited_s > _SAY_AFTER_S and not is_said:
+            is_said = True
+            _log.info(
+                "%s: another process %s; waiting for its claim %r, at most %.0f min",
+                *(store.uri, doing, name, patience_s / 60),
+            )
+        time.sleep(wait_s)
+        wait_s = min(2 * wait_s, _MAX_WAIT_S)
     with claim:
-        yield
+        yield claim
 
 
 # ---- Among the processes of one machine ----------------------------------------------------------
@@ -139,12 +155,13 @@ def try_lock(path: Path) -> FileClaim | None:
     """Lock the file, which is made if missing; None where another process holds it."""
     with refusals_of(path):
         for _ in range(_MAX_RACES):
-            make_folder(path.parent)
             with contextlib.ExitStack() as stack:
-                stack.enter_context(
-                    contextlib.suppress(FileNotFoundError)
-                )  # the folder was deleted
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+                try:
+                    descriptor = open_lock(path)
+                except OutputError as error:
+                    if isinstance(error.__cause__, FileNotFoundError):  # its folder was deleted
+                        continue
+                    raise
                 stack.callback(os.close, descriptor)
                 try:
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -158,7 +175,6 @@ def try_lock(path: Path) -> FileClaim | None:
 
 # ---- Among machines that share nothing but a remote store ----------------------------------------
 
-_log = logging.getLogger(__name__)
 _RESOLUTION_S = 1.0  # of the times that stores tell
 _CLOCK_AGE_S = 600.0  # after which the store's clock is read again
 _clocks: dict[str, tuple[float, float]] = {}  # by URI: when it was read, and how far it is ahead

@@ -21,11 +21,15 @@ from typing import Any, Protocol, runtime_checkable
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8, UInt16
 
-from augment import effects
+from augment import base_photo, effects
+from augment.box_estimates import Estimate, Evidence, estimate_boxes
 from augment.boxes import (
+    NEAR_M,
     Instances,
+    Occlusion,
+    Outlines,
     PlacedBoxes,
     encode_masks,
     find_occlusion,
@@ -35,7 +39,8 @@ from augment.boxes import (
 )
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.jobs.atomic import write_atomic
+from augment.files.recorded_images import decode_pixels
+from augment.jobs.atomic import read_file, write_atomic
 from augment.jobs.box_tables import (
     BOXES_2D,
     MASKS,
@@ -50,7 +55,11 @@ from augment.jobs.processes import renders_on_gpu, uninterrupted
 from augment.jobs.tables import whole
 from augment.labels import Boxes, LabelSource
 from augment.scene import Scene
+from augment.semantics import SemanticClass
 from recipes.schema import Output, Recipe
+
+# Depth of the recording car in a picture that shows it: before every box.
+OWN_CAR_DEPTH_M = NEAR_M / 2
 
 
 @runtime_checkable
@@ -61,7 +70,7 @@ class View(Protocol):
     depth_m: np.ndarray | None  # float32 [H, W], 0 = none
     semantic: np.ndarray | None  # uint8 [H, W]
     instance: np.ndarray | None  # uint16 [H, W]
-    masks: Mapping[str, np.ndarray]  # uint8 [H, W], 0 or 255, by name
+    masks: Mapping[str, np.ndarray]  # uint8 [H, W], by name: 0 or 255, of TRUST also between
     # What labels are measured from, as in augment.views.
     effects: Mapping[str, Any]  # EffectView by name, of the recipe's effects
     surface: Any  # SurfaceView, None without boxes
@@ -80,21 +89,21 @@ def measure_boxes(
     camera: Camera,
     view: View,
     *,
-    masks: bool = False,
+    shown: BoxesShown | None = None,
 ) -> dict[str, BoxNumbers]:
-    """The boxes of a frame in one of its images. camera: at the written resolution. masks: also
-    those by depth.
+    """The boxes of a frame in one of its images. camera: at the written resolution. shown: what
+    `show_boxes` found of them, with masks by depth if that has owners; None: it is found here.
     """
     placed = PlacedBoxes.of(boxes, world_origin_m)
     measured: dict[str, BoxNumbers] = {}
     if view.surface is not None:
         numbers = instances.of(boxes.track_ids)
-        columns, owners = _measure_2d(
-            placed, numbers, len(instances.actors), camera, view, masks=masks
-        )
+        shown = shown or show_boxes(boxes, instances, placed, camera, view)
+        columns = {"instance": numbers.astype(np.int64), **shown.columns()}
         measured[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
-        if owners is not None:
+        if shown.occlusion.owners is not None:
             places = np.arange(1, len(boxes) + 1).astype(np.uint16)
+            owners = shown.paint_estimates(shown.occlusion.owners, places)
             measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(owners, places))
     for effect in effects.EFFECTS:
         table, seen = effect.table, view.effects.get(effect.name)
@@ -112,30 +121,103 @@ def _grown(placed: PlacedBoxes, view: View) -> PlacedBoxes:
     return placed
 
 
-def _measure_2d(
+@dataclass(frozen=True, eq=False)
+class BoxesShown:
+    """A frame's boxes in one image. outlines: of the projected boxes. occlusion: what rendered
+    depth shows of them. estimates: of those that depth does not resolve, by their places.
+    """
+
+    outlines: Outlines
+    occlusion: Occlusion
+    estimates: Mapping[int, Estimate]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The columns of BOXES_2D that are stored, without the instances."""
+        found = self.occlusion
+        xyxy, pixels, hidden = found.xyxy.copy(), found.shown.copy(), found.hidden.copy()
+        is_estimated = np.zeros(len(pixels), bool)
+        for box, estimate in self.estimates.items():
+            xyxy[box], pixels[box], hidden[box] = estimate.xyxy, estimate.pixels, estimate.hidden
+            is_estimated[box] = True
+        return {
+            **dict(zip(SIDES, self.outlines.xyxy.T.copy(), strict=True)),
+            **dict(zip(MODAL_SIDES, xyxy.T.copy(), strict=True)),
+            "pixels": pixels,
+            "hidden_pixels": hidden,
+            "truncated_fraction": self.outlines.truncated_fraction,
+            "is_estimated": is_estimated,
+        }
+
+    def paint_estimates(
+        self,
+        image: UInt16[np.ndarray, "H W"],
+        numbers: UInt16[np.ndarray, " B"],
+        classes: UInt8[np.ndarray, "H W"] | None = None,
+    ) -> UInt16[np.ndarray, "H W"]:
+        """The image with the numbers of the estimated boxes, where it has none and does not show
+        water. classes: of the surfaces that the image shows.
+        """
+        if not self.estimates:
+            return image
+        painted, can_show = image.copy(), image == 0
+        if classes is not None:
+            can_show &= classes != SemanticClass.WATER
+        for box, estimate in self.estimates.items():
+            free = can_show[estimate.rows, estimate.columns]
+            free &= painted[estimate.rows, estimate.columns] == 0
+            painted[estimate.rows[free], estimate.columns[free]] = numbers[box]
+        return painted
+
+
+def show_boxes(
+    boxes: Boxes,
+    instances: Instances,
     placed: PlacedBoxes,
-    instance: np.ndarray,
-    num_actors: int,
     camera: Camera,
     view: View,
     *,
-    masks: bool,
-) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-    """Columns of the boxes in 2D; and which box each pixel shows, if masks ask."""
-    outlines, surface = outline_placed(placed, camera), view.surface
-    actors = np.where(instance <= num_actors, instance, 0)
-    found = find_occlusion(
-        _grown(placed, view), camera, surface.depth_m, surface.actors, actors, with_owners=masks
+    masks: bool = False,
+    evidence: Callable[[], Evidence | None] | None = None,
+    on_photo: bool = False,
+) -> BoxesShown:
+    """Return which pixels of an image show each of its frame's boxes.
+
+    Args:
+        boxes: of the frame.
+        instances: of the scene.
+        placed: the boxes in the scene's world.
+        camera: of the image, at the written resolution.
+        view: the image, with its surface.
+        masks: also find the owner of each pixel by depth.
+        evidence: reads what else is known of the frame's objects; None: depth alone decides.
+        on_photo: the picture is a recorded one.
+    """
+    surface, outlines = _with_own_car(view.surface), outline_placed(placed, camera)
+    numbers = instances.of(boxes.track_ids)
+    actors = np.where(numbers <= len(instances.actors), numbers, 0)
+    occlusion = find_occlusion(
+        _grown(placed, view), camera, surface.depth_m, surface.actors, actors,
+        classes=surface.classes, with_owners=masks,
+    )  # fmt: skip
+    estimates: Mapping[int, Estimate] = {}
+    if evidence is not None:
+        estimates = estimate_boxes(
+            placed, boxes.track_ids, camera, outlines, occlusion, evidence,
+            on_photo=on_photo, own_car=surface.own_car,
+        )  # fmt: skip
+    return BoxesShown(outlines, occlusion, estimates)
+
+
+def _with_own_car(surface: Any) -> Any:
+    """A SurfaceView in which the recording car of its picture is what is nearest."""
+    if surface.own_car is None:
+        return surface
+    actors = surface.actors
+    return dataclasses.replace(
+        surface,
+        depth_m=np.where(surface.own_car, np.float32(OWN_CAR_DEPTH_M), surface.depth_m),
+        actors=None if actors is None else np.where(surface.own_car, np.uint16(0), actors),
     )
-    columns = {
-        "instance": instance.astype(np.int64),
-        **dict(zip(SIDES, outlines.xyxy.T.copy(), strict=True)),
-        **dict(zip(MODAL_SIDES, found.xyxy.T.copy(), strict=True)),
-        "pixels": found.shown,
-        "hidden_pixels": found.hidden,
-        "truncated_fraction": outlines.truncated_fraction,
-    }
-    return columns, found.owners
 
 
 def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
@@ -342,7 +424,7 @@ def calibration_bytes(
 def read_entries(path: Path) -> dict[int, dict[str, Any]]:
     """The frame entries of a calibration file by frame number."""
     try:
-        frames = json.loads(Path(path).read_bytes())["frames"]
+        frames = json.loads(read_file(path))["frames"]
         return {entry["frame"]: entry for entry in frames}
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise OutputError(f"{path} is missing or not a calibration file: {error!r}") from error
@@ -432,7 +514,7 @@ def encode_image(rgb: np.ndarray, output: Output) -> bytes:
 
 def decode_image(data: bytes) -> np.ndarray:
     """uint8 [H, W, 3] RGB. Raises ValueError where the bytes are no complete image."""
-    bgr = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = _decode(data, cv2.IMREAD_COLOR)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
@@ -491,10 +573,7 @@ def _encode(extension: str, array: np.ndarray, settings: list[int]) -> bytes:
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise ValueError(f"not a readable image file ({len(data)} bytes): {error}") from error
+    image = decode_pixels(data, flags)
     if image is None:
         raise ValueError(f"not a readable image file ({len(data)} bytes)")
     return image
@@ -510,6 +589,11 @@ def _require(array: np.ndarray, dtype: type, ndim: int, name: str) -> None:
 
 
 # ---- The files of a view: its buffers first, its image last --------------------------------------
+
+
+def _mean_share(mask: np.ndarray) -> float:
+    """The mean of a mask, 0 to 1."""
+    return int(mask.sum(dtype=np.int64)) / (255 * mask.size)
 
 
 @dataclass(frozen=True)
@@ -582,7 +666,10 @@ def write_view(
     for kind, (buffer, encode) in _BUFFERS.items():
         if kind in used:
             files[used[kind]] = encode(getattr(view, buffer))
-    files |= {used[name]: encode_mask(mask) for name, mask in view.masks.items()}
+    files |= {
+        used[name]: encode_ids(mask, np.uint8) if name == TRUST else encode_mask(mask)
+        for name, mask in view.masks.items()
+    }
     files[used["image"]] = image = encode_image(view.rgb, recipe.output)
     checksum = hashlib.sha256(image).hexdigest()
     encoded = time.perf_counter()
@@ -590,7 +677,7 @@ def write_view(
         write_atomic(out_dir / relative, data, clear=False)
     write_s = time.perf_counter() - encoded
     columns = {mask: c for mask, c in share_columns().items() if mask in view.masks}
-    shares = {column: float((view.masks[mask] == 255).mean()) for mask, column in columns.items()}
+    shares = {column: _mean_share(view.masks[mask]) for mask, column in columns.items()}
     return Written(checksum, tuple(files), encoded - started, write_s, shares)
 
 
@@ -676,21 +763,28 @@ def label_view(
     camera: Camera,
     view: View,
     recipe: Recipe,
+    evidence: Callable[[], Evidence | None] | None = None,
 ) -> tuple[View, BoxWeather]:
     """A checked view with its frame's boxes: those without an actor are added to its instance
     image; and what is measured of them, where labels are written. camera: at the written
-    resolution.
+    resolution. evidence: reads what else is known of the frame's objects.
     """
     measured: dict[str, BoxNumbers] = {}
-    wants_masks = bool(recipe.output.label_formats)
-    if recipe.output.labels:
-        by_depth = wants_masks and not recipe.output.instance
-        measured = measure_boxes(boxes, instances, world_origin_m, camera, view, masks=by_depth)
-    surface = view.surface
-    if view.instance is None or surface is None:
+    wants_masks, output, surface = bool(recipe.output.label_formats), recipe.output, view.surface
+    placed, shown = PlacedBoxes.of(boxes, world_origin_m), None
+    if surface is not None:
+        by_depth = wants_masks and not output.instance
+        on_photo = recipe.render.base == base_photo.RECORDED
+        shown = show_boxes(
+            boxes, instances, placed, camera, view,
+            masks=by_depth, evidence=evidence, on_photo=on_photo,
+        )  # fmt: skip
+    if output.labels:
+        measured = measure_boxes(boxes, instances, world_origin_m, camera, view, shown=shown)
+    if view.instance is None or surface is None or shown is None:
         return view, measured
     assert surface.shown_depth_m is not None and surface.shown_classes is not None
-    placed, numbers = PlacedBoxes.of(boxes, world_origin_m), instances.of(boxes.track_ids)
+    numbers = instances.of(boxes.track_ids)
     if not surface.is_bare:
         placed = _grown(placed, view)
     painted = with_boxes(
@@ -702,6 +796,9 @@ def label_view(
         surface.shown_classes,
         len(instances.actors),
     )
+    painted = shown.paint_estimates(painted, numbers, surface.shown_classes)
+    if surface.own_car is not None:
+        painted = np.where(surface.own_car, np.uint16(0), painted)
     if wants_masks:
         measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(painted, numbers))
     changed: Any = view

@@ -15,7 +15,7 @@ import os
 import tempfile
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,32 +38,45 @@ from augment.jobs.block_worker import (
 from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, variant_name
+from augment.jobs.layout import (
+    MANIFEST,
+    STATE_FOLDER,
+    FileListing,
+    path_kinds,
+    variant_folder,
+    variant_name,
+)
 from augment.jobs.manifest import (
     FAILED,
+    KEY,
     OK,
+    TRAILING,
     Identity,
     compact,
     image_row,
+    leading_columns,
     lidar_notes,
     list_parts,
     parts_to_merge,
     publish_part,
     read_finished,
     rows_to_table,
+    rows_without_files,
 )
 from augment.jobs.pools import ProcessPool, RayPool, SerialPool, Work, WorkerPool, run_tasks
 from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.quality import Question, recorded
-from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.render_job import RenderJob, SceneLoader, lacks_recipe, run_job, write_recipe
+from augment.jobs.scene_changes import SceneChange, changes_in
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.worker import WORKERS, Outcome, TaskFailed
 from augment.progress import ProgressBar
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from augment.trust import left_out_sentence, magnified_sentence
+from recipes.files import with_digest
 from recipes.job import JobRecipes, JobScene
-from recipes.schema import Recipe
+from recipes.schema import Recipe, columns_of_effects
 
 # ---- Which block a worker gets next: one of the scene it has open, as long as there are any ------
 
@@ -165,7 +178,8 @@ class SceneWork(Work):
 class BlockWork(Work):
     """Renders and publishes blocks. names: by scene, what the job calls it. opened: the scene that
     each slot has open. fail: records all images of a block as failed. on_image: told how many
-    images are done, and how many of them failed. A block whose worker dies is tried once more, each
+    images are done, and how many of them failed. damaged: keys of published blocks that have lost
+    files. A block whose worker dies is tried once more, each
     of its images in a process of its own.
     """
 
@@ -176,8 +190,10 @@ class BlockWork(Work):
         opened: dict[int, str],
         fail: FailBlock,
         on_image: Callable[[int, int], None] = lambda done, failed: None,
+        damaged: Collection[str] = (),
     ) -> None:
         self.tally = Tally()
+        self._damaged = frozenset(damaged)
         self._queue, self._names = BlockQueue(blocks), names
         self._fail, self._on_image = fail, on_image
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
@@ -203,7 +219,8 @@ class BlockWork(Work):
             return None
         self._opened[slot] = block.scene
         self._busy.add(slot)
-        return BlockTask(block, self._names.get(block.scene))
+        is_damaged = block.key in self._damaged
+        return BlockTask(block, self._names.get(block.scene), is_damaged=is_damaged)
 
     def later_s(self) -> float | None:
         return max(0.0, self._later[0][0] - time.monotonic()) if self._later else None
@@ -476,7 +493,10 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
     with contextlib.closing(Workers(job)) as workers:
-        return _plan(job, store, workers, progress, keep=False)
+        plan, changes = _plan(job, store, workers, progress, keep=False)
+    for change in changes:
+        change.check(store)
+    return plan
 
 
 class Workers:
@@ -544,13 +564,16 @@ class _Generation:
     def go(self) -> GenerateResult:
         started = time.perf_counter()
         with contextlib.closing(Workers(self._job)) as workers:
-            plan = _plan(self._job, self._store, workers, self._progress, keep=True)
+            plan, changes = _plan(self._job, self._store, workers, self._progress, keep=True)
             self._plan = plan
+            self._accept(changes)
             self._timings["plan"] = time.perf_counter() - started
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
             self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
-            work = BlockWork(pending, plan.names, workers.opened, self._fail, self._show)
+            work = BlockWork(
+                pending, plan.names, workers.opened, self._fail, self._show, self._damaged_keys
+            )
             total = sum(block.images for block in blocks)
             work.tally.skipped = total - sum(block.images for block in pending)
             begun = time.perf_counter()
@@ -570,8 +593,21 @@ class _Generation:
 
     def _pending(self, blocks: Sequence[Block]) -> list[Block]:
         """What is not published, or with failures that are tried again; refuses a mixed output."""
+        table = self._finished_rows()
+        if table is not None and (changes := changes_in(table, blocks)):
+            # A record that says otherwise would hide the change from the next run.
+            names = self._plan.names
+            paths = [_record_path(change.uri, names.get(change.scene)) for change in changes]
+            self._store.delete(paths)
+            self._accept(changes)
+            table = self._finished_rows()
         parts = list_parts(self._store)
+        published = [block for block in blocks if block.key in parts]
+        damaged = [] if table is None else self._damaged(table, published)
+        self._restore_recipes(published)
         pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        pending += [block for block in damaged if not parts[block.key].has_failures]
+        self._damaged_keys = {block.key for block in damaged}
         new = [block for block in pending if block.key not in parts]
         if new:
             _check_not_mixed(self._store, self._plan, new)
@@ -580,6 +616,56 @@ class _Generation:
         published = [block for block in blocks if block.key not in left]
         clear_leftovers(self._store, self._job.setup.scratch, published)
         return pending
+
+    def _accept(self, changes: Iterable[SceneChange]) -> None:
+        """Refuse to mix images of changed scenes with those of before; what is left of deleted ones
+        is forgotten.
+        """
+        for change in changes:
+            change.check(self._store)
+        for change in changes:
+            change.accept(self._store, self._job.setup.scratch)
+
+    def _finished_rows(self) -> pa.Table | None:
+        """What an output on this machine has of finished images: their files, and what they were
+        made from; None where nothing is finished, or the output is elsewhere.
+        """
+        if self._store.local_dir is None:
+            return None
+        known = (*leading_columns(), *columns_of_effects(), *TRAILING)
+        columns = {*KEY, "status", "source_digest", *(f"{kind}_path" for kind in path_kinds())}
+        try:
+            return read_finished(self._store, [name for name in known if name not in columns])
+        except OutputError:
+            if self._store.exists(MANIFEST):
+                raise
+            return None
+
+    def _damaged(self, table: pa.Table, published: Sequence[Block]) -> list[Block]:
+        """The blocks of which a file is gone."""
+        assert self._store.local_dir is not None, "the files of others are not looked at"
+        images = rows_without_files(table, FileListing(self._store.local_dir))
+        if not images:
+            return []
+        return [
+            block
+            for block in published
+            if any(
+                (block.scene, block.variant, frame, camera) in images
+                for frame in block.frames
+                for camera in block.cameras
+            )
+        ]
+
+    def _restore_recipes(self, published: Sequence[Block]) -> None:
+        """Write what is missing of the recipes in the folders of variants."""
+        out = self._store.local_dir
+        if out is None:
+            return
+        for block in {(block.scene, block.variant): block for block in published}.values():
+            folder = out / variant_folder(block.scene, block.variant)
+            if lacks_recipe(block.recipe, folder):
+                write_recipe(with_digest(block.recipe), folder)
 
     def _render(
         self, workers: Workers, work: BlockWork, pending: Sequence[Block], total: int
@@ -674,12 +760,15 @@ def _trust_notes(blocks: Sequence[Block], records: Mapping[str, SceneRecord]) ->
     return notes
 
 
-def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool) -> Plan:
-    found: dict[tuple[str, str | None], SceneRecord | str] = {}
-    for entry in job.scenes:
-        record = None if job.rescan else _known(store, entry)
-        if record is not None:
-            found[entry.uri, entry.name] = record
+def _plan(
+    job: GenerateJob, store: Store, workers: Workers, progress: bool, *, keep: bool
+) -> tuple[Plan, list[SceneChange]]:
+    """The plan, and the scenes that have changed since the output's record of them was made. keep:
+    whether records of other scenes are written.
+    """
+    known, changes = _known_scenes(job, store, keep=keep)
+    changed = {change.record_path for change in changes}
+    found: dict[tuple[str, str | None], SceneRecord | str] = {} if job.rescan else {**known}
     tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
     with ProgressBar(
         total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
@@ -687,14 +776,50 @@ def _plan(job: GenerateJob, store: Store, workers: Workers, progress: bool, *, k
 
         def each(task: IndexTask, record: SceneRecord | str) -> None:
             found[task.uri, task.name] = record
-            if keep and isinstance(record, SceneRecord):
-                store.write(_record_path(task.uri, task.name), record.to_json())
+            path = _record_path(task.uri, task.name)
+            if keep and isinstance(record, SceneRecord) and path not in changed:
+                store.write(path, record.to_json())
             bar.update()
 
         opening = SceneWork(dict.fromkeys(tasks), each, "opening the scene", workers.opened)
         workers.do(opening)
     resolved = resolve_recipes(job, store, workers, found, progress=progress, keep=keep)
-    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved), changes
+
+
+def _known_scenes(
+    job: GenerateJob, store: Store, *, keep: bool
+) -> tuple[dict[tuple[str, str | None], SceneRecord], list[SceneChange]]:
+    """The records of the job's scenes by URI and name, and those of scenes that have changed."""
+
+    def look_up(entry: JobScene) -> tuple[SceneRecord | None, str | None]:
+        record, digest_of = _known(store, entry), job.setup.digest_of
+        return record, None if record is None or digest_of is None else digest_of(entry.uri)
+
+    known: dict[tuple[str, str | None], SceneRecord] = {}
+    changes: list[SceneChange] = []
+    with ThreadPoolExecutor(_READS, thread_name_prefix="scenes") as pool:
+        pairs = list(pool.map(look_up, job.scenes))
+    for entry, (record, digest) in zip(job.scenes, pairs, strict=True):
+        path = _record_path(entry.uri, entry.name)
+        if record is None:
+            continue
+        if digest is not None and record.digest is None:
+            _log.warning(
+                "note: %s holds the scene %s of an older version, which did not note its content; "
+                "it is taken to be the scene as it is now",
+                store.uri,
+                record.name,
+            )
+            record = replace(record, digest=digest)
+            if keep:
+                store.write(path, record.to_json())
+        if digest in (None, record.digest):
+            known[entry.uri, entry.name] = record
+        else:
+            digests = str(record.digest), str(digest)
+            changes.append(SceneChange(record.name, entry.uri, *digests, record_path=path))
+    return known, changes
 
 
 def _known(store: Store, entry: JobScene) -> SceneRecord | None:

@@ -26,6 +26,8 @@ from augment.jobs.atomic import (
     flush_folder,
     make_folder,
     output_error,
+    path_below,
+    read_file,
     refusals_of,
     remove_temporaries,
     write_atomic,
@@ -37,6 +39,7 @@ from augment.jobs.layout import (
     MANIFEST,
     STATE_FOLDER,
     SWEEPS,
+    FileListing,
     box_weather_files,
     folder_name,
     item_paths,
@@ -51,6 +54,7 @@ from augment.jobs.manifest import (
     PARTS,
     Identity,
     Pictured,
+    check_rows,
     image_row,
     later_columns,
     merge_rows,
@@ -65,6 +69,7 @@ from augment.jobs.worker import Chunk, Outcome, describe
 from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
+JOURNAL = "journal"  # the folder of progress logs in that of the state
 
 
 class ProgressLog:
@@ -74,7 +79,7 @@ class ProgressLog:
     """
 
     def __init__(self, out_dir: Path, scene: str, variant: str) -> None:
-        folder = out_dir / STATE_FOLDER / "journal" / folder_name(scene)
+        folder = out_dir / STATE_FOLDER / JOURNAL / folder_name(scene)
         self.path = folder / f"{folder_name(variant)}.jsonl"
         self._file: int | None = None
         self._lock = threading.Lock()
@@ -82,20 +87,31 @@ class ProgressLog:
     def load(self) -> tuple[Identity | None, list[dict[str, Any]]]:
         """The identity and rows in it; (None, []) where there is none."""
         try:
-            lines = self.path.read_bytes().split(b"\n")[:-1]  # the last part has no line break
+            lines = read_file(self.path).split(b"\n")[:-1]  # the last part has no line break
         except FileNotFoundError:
             return None, []
-        with reading_back(str(self.path), "Delete it; what it lists is rendered again"):
+        except OSError as error:
+            raise OutputError(
+                f"{self.path} cannot be read: {error.strerror}. Delete it; what it lists is "
+                f"rendered again"
+            ) from error
+        with self.reading():
             identity, *rows = [json.loads(line) for line in lines]
+            if not all(isinstance(value, str | None) for value in identity.values()):
+                raise ValueError(f"its first line must hold texts; got {identity!r:.200}")
             return Identity(**identity), rows
 
+    def reading(self) -> contextlib.AbstractContextManager[None]:
+        """While its lines are taken apart, what goes wrong is an OutputError."""
+        return reading_back(str(self.path), "Delete it; what it lists is rendered again")
+
     def begin(self, identity: Identity) -> None:
-        """Open for appending; starts with the identity, or goes on after the last whole line."""
+        """Open for appending; starts with the identity, and goes on after the last whole line."""
         with refusals_of(self.path):
-            whole = self.path.read_bytes() if self.path.exists() else b""
-            whole = whole[: whole.rfind(b"\n") + 1]
-            write_atomic(self.path, whole or _line(asdict(identity)))
-            self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+            whole = read_file(self.path) if self.path.exists() else b""
+            rows = whole[whole.find(b"\n") + 1 : whole.rfind(b"\n") + 1]
+            write_atomic(self.path, _line(asdict(identity)) + rows)
+            self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
 
     def append(self, row: dict[str, Any]) -> None:
         """Add a finished image. Returns when the line is on the disk."""
@@ -129,7 +145,7 @@ class ProgressLog:
 
 def logged_variants(out_dir: Path) -> list[str]:
     """Folders (`<scene>/<variant>`) of the variants that some job has begun and not ended."""
-    root = out_dir / STATE_FOLDER / "journal"
+    root = out_dir / STATE_FOLDER / JOURNAL
     return sorted(str(p.relative_to(root).with_suffix("")) for p in root.glob("*/*.jsonl"))
 
 
@@ -153,30 +169,47 @@ class VariantState:
         self.rows: dict[Item, dict[str, Any]] = {}
         self.box_weather: dict[str, dict[Item, BoxNumbers]] = {kind: {} for kind in box_tables()}
         self._out_dir, self._is_logged = out_dir, False
+        self._listing = FileListing(out_dir)
+        self._adopts = False  # images whose rows lack the digest of the scene's content
 
     @property
     def key(self) -> tuple[str, str]:
         return self.index.name, self.name
 
-    def load(self, table: pa.Table | None, overwrite: bool) -> bool:
-        """Read what is known; true where there is anything that has to be given up."""
+    def load(self, table: pa.Table | None, listing: FileListing, overwrite: bool) -> bool:
+        """Read what is known; true where there is anything that has to be given up. listing: of the
+        output folder.
+        """
+        self._listing = listing
         begun, logged = self.progress_log.load()
         rows = [] if table is None else rows_of(table, {self.key})
-        found = begun or (Identity.of_row(rows[0]) if rows else None)
-        if overwrite and found is not None:
+        identities = {Identity.of_row(row) for row in rows} | ({begun} if begun else set())
+        if overwrite and identities:
             return True
-        if found is not None:
+        for found in sorted(identities, key=repr):
             self.identity.check(found, str(self.place))
+        if self.identity.source_digest is not None:
+            self._adopts = any(found.source_digest is None for found in identities)
+            if self._adopts:
+                _log.warning(
+                    "note: %s is of an older version, which did not note the content of its "
+                    "scene; it is taken to be the scene as it is now",
+                    self.place,
+                )
         self._is_logged = begun is not None
         for kind, file in box_weather_files(self.recipe).items():
             if any(row.get(f"{kind}_path") for row in rows):
                 self.box_weather[kind] = _read_table(kind, self.place / file)
-        for row in logged:  # which have the boxes' numbers beyond the manifest's columns
-            for kind, own in box_tables().items():
-                if (numbers := row.pop(kind, None)) is not None:
-                    self.box_weather[kind][row["frame"], row["camera"]] = own.from_json(numbers)
+        with self.progress_log.reading():
+            for row in logged:  # which have the boxes' numbers beyond the manifest's columns
+                for kind, own in box_tables().items():
+                    if (numbers := row.pop(kind, None)) is not None:
+                        self.box_weather[kind][row["frame"], row["camera"]] = own.from_json(numbers)
+            check_rows(logged, self.key, str(self.progress_log.path))
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
         shown = shown_words(self.recipe)
+        if self._adopts:
+            shown["source_digest"] = self.identity.source_digest
         known = [{**later_columns(), **row, **shown} for row in [*rows, *logged]]
         self.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
@@ -197,7 +230,19 @@ class VariantState:
                 return False
         of_variant = {"labels", "calibration", *box_tables()}
         paths = [row[f"{kind}_path"] for kind in path_kinds() if kind not in of_variant]
-        return all((self._out_dir / path).is_file() for path in paths if path is not None)
+        return all(self._listing.has(path) for path in paths if path is not None)
+
+    def check_folders(self, cameras: Iterable[str]) -> None:
+        """Raise OutputError where a folder that will be written to is a link out of the output."""
+        recipe, index = self.recipe, self.index
+        paths = {
+            path
+            for name in {"", *cameras}
+            for path in item_paths(index.name, recipe, name, 0).values()
+            if path is not None
+        }
+        for folder in sorted({path.rpartition("/")[0] for path in paths}):
+            path_below(self._out_dir, tuple(folder.split("/")))
 
     def record(self, outcome: Outcome, frame: Frame) -> None:
         """Enter what became of an image, durably. May be called from several threads."""
@@ -236,8 +281,12 @@ class VariantState:
                 write_atomic(path, data)
 
     def is_complete(self) -> bool:
-        """Whether `write_files` has nothing to do, and no progress log is open."""
-        return not self._is_logged and all(path.is_file() for path in self.files().values())
+        """Whether `finish` has nothing to do for it, and no progress log is open."""
+        return (
+            not self._is_logged
+            and not self._adopts
+            and all(path.is_file() for path in self.files().values())
+        )
 
     def _boxes(self, path: Path, cache: BoxCache) -> bytes:
         frames = {frame for frame, _ in self.rows}
@@ -326,7 +375,9 @@ class JobState:
         """Clear away what a killed run left, and read what it finished."""
         if (self.out_dir / MANIFEST).is_file():
             self._table = read_manifest(self.out_dir)
-        replaced = [variant for variant in self.variants if variant.load(self._table, overwrite)]
+        path_below(self.out_dir, (STATE_FOLDER, JOURNAL, folder_name(self.index.name)))
+        listing = FileListing(self.out_dir)
+        replaced = [v for v in self.variants if v.load(self._table, listing, overwrite)]
         self._clear_leftovers()
         if replaced:
             self._give_up(replaced)
@@ -406,7 +457,7 @@ class JobState:
         state = self.out_dir / STATE_FOLDER
         remove_temporaries(self.out_dir, recursive=False)
         remove_temporaries(state, recursive=False)  # blocks of other jobs may be at work below it
-        remove_temporaries(state / "journal")
+        remove_temporaries(state / JOURNAL)
         _remove_tree(state / "trash")
         mine = {variant.folder for variant in self.variants}
         sweeps = f"{folder_name(self.index.name)}/{SWEEPS}"

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from augment import effects
 from augment.errors import OutputError
+from augment.jobs.atomic import path_below
 from augment.jobs.box_tables import BOXES_2D, MASKS
 from recipes.schema import Recipe
 
@@ -48,7 +49,7 @@ def variant_name(recipe: Recipe) -> str:
 # Kinds of files whose paths a row of the manifest has, but for those of effects.
 _IMAGES, _LABELS = ("image", "depth", "semantic", "instance"), ("lidar", "labels")
 _LAST = "calibration"
-TRUST = "trust"  # the mask of what of a picture can be believed, see augment.trust
+TRUST = "trust"  # the mask of how far a picture can be believed, 0 to 255, see augment.trust
 
 
 def path_kinds() -> tuple[str, ...]:
@@ -119,6 +120,33 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> dict[str,
     return {kind: used.get(kind) for kind in path_kinds()}
 
 
+class FileListing:
+    """Which files an output folder on this machine has. A folder is looked at once, when it is
+    first asked for: tens of thousands of single looks would take longer than all else of a resume.
+    """
+
+    def __init__(self, out_dir: Path) -> None:
+        self._out_dir = out_dir
+        self._names: dict[str, frozenset[str]] = {}
+
+    def has(self, path: str) -> bool:
+        """Whether there is a file of this path, which is relative to the output folder. Raises
+        OutputError: a link leads out of the output folder.
+        """
+        folder, _, name = path.rpartition("/")
+        if folder not in self._names:
+            self._names[folder] = self._names_in(folder)
+        return name in self._names[folder]
+
+    def _names_in(self, folder: str) -> frozenset[str]:
+        place = path_below(self._out_dir, tuple(folder.split("/")) if folder else ())
+        try:
+            with os.scandir(place) as entries:
+                return frozenset(entry.name for entry in entries if entry.is_file())
+        except OSError:  # missing, or what is no folder
+            return frozenset()
+
+
 @contextlib.contextmanager
 def reading_back(where: str, advice: str) -> Iterator[None]:
     """While JSON of the output is taken apart as it was put together, what goes wrong is an
@@ -159,15 +187,3 @@ def resolve_inside(root: Path, relative: str) -> Path:
             f"trust the folder"
         )
     return path_below(root, parts)
-
-
-def path_below(root: Path, parts: tuple[str, ...]) -> Path:
-    """The path of these components, which no link leads out of the root."""
-    path = root.joinpath(*parts)
-    real_root, real_path = (Path(os.path.realpath(each)) for each in (root, path))
-    if not real_path.is_relative_to(real_root):  # a link to itself is left to who opens it
-        raise OutputError(
-            f"{path} leads through a link to {real_path}, outside {real_root}; "
-            f"put the files themselves under the output folder"
-        )
-    return path

@@ -21,8 +21,15 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from augment.errors import OutputError
-from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import MANIFEST, STATE_FOLDER, path_kinds, share_columns, variant_name
+from augment.jobs.atomic import read_file, write_atomic
+from augment.jobs.layout import (
+    MANIFEST,
+    STATE_FOLDER,
+    FileListing,
+    path_kinds,
+    share_columns,
+    variant_name,
+)
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
 from recipes.schema import KNOBS, SECTIONS, Recipe, columns_of_effects, settings_of
@@ -61,7 +68,7 @@ def leading_columns() -> dict[str, pa.DataType]:
         **dict.fromkeys((f"{kind}_path" for kind in path_kinds()), text),
         **{"width": whole, "height": whole},
         **dict.fromkeys(("base", "surface", "lidar", "lidar_note", *words, "quality"), text),
-        **{"render_scale": pa.float64(), "settings": text},
+        **{"render_scale": pa.float64(), "settings": text, "source_digest": text},
         **dict.fromkeys(share_columns().values(), pa.float64()),
     }
 
@@ -112,10 +119,11 @@ def effect_masks(numbers: Mapping[str, np.ndarray], rows: int) -> dict[str, np.n
 def rows_to_table(rows: Iterable[Row]) -> pa.Table:
     """Rows as a sorted table."""
     rows, others = list(rows), leading_columns().keys() | TRAILING.keys()
-    absent = {name: _absent(name) for name in sorted({n for row in rows for n in row} - others)}
+    numbers = sorted({name for row in rows for name in row} - others)
+    absent = {**later_columns(), **{name: _absent(name) for name in numbers}}
     columns = {
         name: pa.array([row[name] if name in row else absent[name] for row in rows], kind)
-        for name, kind in _kinds(absent).items()
+        for name, kind in _kinds(numbers).items()
     }
     return _sorted(pa.table(columns))
 
@@ -134,7 +142,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
             f"manifest when it ends; run it again to let it finish"
         )
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except OSError as error:
         raise OutputError(f"{path} cannot be read: {error.strerror}") from error
     return parse_manifest(data, str(path))
@@ -152,6 +160,15 @@ def parse_manifest(data: bytes, where: str, without: Collection[str] = ()) -> pa
             table = table.set_column(table.column_names.index(name), name, filled)
     _check_values(table, where)
     return table
+
+
+def check_rows(rows: Sequence[Row], key: tuple[str, str], where: str) -> None:
+    """Raise OutputError, or what Python and Arrow raise of wrong types, where rows are none of a
+    job's. key: scene and variant of all of them. where: the file that they are from.
+    """
+    if wrong := [row for row in rows if (row["scene"], row["variant"]) != key]:
+        raise ValueError(f"a line is of {wrong[0]['variant']!r:.80}, not of {key[1]!r}")
+    _check_values(rows_to_table(rows), where)
 
 
 def _check_types(table: pa.Table, where: str, without: Collection[str]) -> None:
@@ -222,6 +239,20 @@ def _refuse(table: pa.Table, name: str, wrong: pa.ChunkedArray, expected: str, w
         )
 
 
+def rows_without_files(table: pa.Table, listing: FileListing) -> set[tuple[str, str, int, str]]:
+    """The finished images, by `KEY`, of which a file that the manifest names is missing. listing:
+    of the output folder.
+    """
+    mask = np.zeros(table.num_rows, bool)
+    for name in (f"{kind}_path" for kind in path_kinds()):
+        missing = [p for p in pc.unique(table[name]).to_pylist() if p and not listing.has(p)]
+        if missing:
+            named = pc.is_in(table[name], pa.array(missing, pa.string()))
+            mask |= named.to_numpy(zero_copy_only=False)
+    rows = table.filter(pc.and_(pa.array(mask), pc.equal(table["status"], OK)))
+    return set(zip(*(rows[name].to_pylist() for name in KEY), strict=True))
+
+
 def merge_rows(
     old: pa.Table | None, rows: Collection[Row], replaced: set[tuple[str, str]]
 ) -> pa.Table:
@@ -261,7 +292,7 @@ def write_manifest(out_dir: Path, table: pa.Table) -> Path:
     """Replace the manifest in one step; untouched where it already says the same."""
     path = Path(out_dir) / MANIFEST
     data = manifest_bytes(table)
-    if not (path.is_file() and path.read_bytes() == data):
+    if not (path.is_file() and read_file(path) == data):
         write_atomic(path, data)
     return path
 
@@ -482,17 +513,26 @@ def _worth(part: Part) -> tuple[bool, float, str]:
 
 @dataclass(frozen=True)
 class Identity:
-    """What must agree for two runs to write into the same variant folder."""
+    """What must agree for two runs to write into the same variant folder. source_digest: of the
+    scene's content; None where nobody knows it, which agrees with any.
+    """
 
     source: str
     recipe_hash: str
     trajectory: str
     version: str
     backend: str
+    source_digest: str | None = None
 
     @staticmethod
     def of_row(row: dict[str, Any]) -> Identity:
         return Identity(**{name: row[name] for name in Identity.__dataclass_fields__})
+
+    def is_of_other_content(self, other: Identity) -> bool:
+        """Whether the scene's files are known to differ."""
+        return None not in (digests := {self.source_digest, other.source_digest}) and (
+            len(digests) > 1
+        )
 
     def check(self, found: Identity, where: str) -> None:
         """Raise OutputError where the folder was written by something else."""
@@ -509,6 +549,11 @@ class Identity:
             for name, label in names.items()
             if mine[name] != theirs[name]
         ]
+        if not different and self.is_of_other_content(found):
+            different = [
+                f"the files of the scene {self.source} have changed since: the digest of their "
+                f"content is {theirs['source_digest']!r} there, {mine['source_digest']!r} here"
+            ]
         if different:
             raise OutputError(
                 f"{where} already holds images of another kind: {'; '.join(different)}. Give the "

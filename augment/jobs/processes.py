@@ -28,7 +28,16 @@ import torch
 
 from augment.cameras import Frame
 from augment.errors import BackendUnavailable, ClimateGSError, OutputError
-from augment.jobs.atomic import make_folder, output_error, refusals_of, temporary_beside
+from augment.jobs.atomic import (
+    MAX_MARK_BYTES,
+    lock_holder,
+    make_folder,
+    open_lock,
+    output_error,
+    path_below,
+    temporary_beside,
+    wait_for_lock,
+)
 from augment.jobs.layout import STATE_FOLDER
 from augment.render.buffers import AUTO, BACKENDS, CPU, CUDA, REFERENCE, import_cpu, import_cuda
 from augment.scene import Scene
@@ -293,16 +302,17 @@ def sender(connection: Connection) -> Callable[[Any], None]:
 # last of them has gone. flock does not reach across machines on every network file system.
 
 ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
+MAX_SHARING_S = 3600.0  # how long to wait for what another process is making for all of them
 
 
 @contextlib.contextmanager
-def file_lock(path: Path) -> Iterator[None]:
-    """Be the only process of this machine inside; waits for the one that is, however it ends."""
-    with refusals_of(path):
-        make_folder(path.parent)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+def file_lock(path: Path, doing: str) -> Iterator[None]:
+    """Be the only process of this machine inside; waits for the one that is, however it ends.
+    doing: what is done inside, after "another process". Raises OutputError: it takes too long.
+    """
+    descriptor = open_lock(path)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        wait_for_lock(path, descriptor, patience_s=MAX_SHARING_S, doing=doing)
         yield
     finally:
         os.close(descriptor)
@@ -316,9 +326,8 @@ class OutputLock:
         self._descriptor = -1
 
     def __enter__(self) -> OutputLock:
-        with refusals_of(self._path):
-            make_folder(self._path.parent)
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+        path_below(self._path.parent.parent, (STATE_FOLDER,))
+        self._descriptor = open_lock(self._path)
         try:
             self._acquire()
         except BaseException:
@@ -341,12 +350,14 @@ class OutputLock:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
+                mark = os.pread(self._descriptor, MAX_MARK_BYTES, 0)
+                holder = mark.decode("ascii", "replace").strip()
                 if _is_held_by(holder) or time.monotonic() > deadline:
+                    process = f" (process {holder.split()[0]})" if holder else ""
                     raise OutputError(
                         f"{self._path.parent.parent} is being written by another job"
-                        + (f" (process {holder.split()[0]})" if holder else "")
-                        + "; wait for it to end, or choose another output folder"
+                        f"{process or lock_holder(self._descriptor)}; wait for it to end, or "
+                        f"choose another output folder"
                     ) from None
                 time.sleep(0.05)
         os.ftruncate(self._descriptor, 0)

@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from time import perf_counter, sleep
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,7 +20,7 @@ import augment
 from augment.cameras import Camera, Frame
 from augment.effects import Sharing, share_effects
 from augment.errors import SceneError
-from augment.jobs.claims import try_claim
+from augment.jobs.claims import hold
 from augment.jobs.files import trajectory_id
 from augment.jobs.layout import STATE_FOLDER, reading_back
 from augment.jobs.store import Store, StoredFileMissing
@@ -423,7 +423,7 @@ def _options(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
 
 FOLDER = f"{STATE_FOLDER}/quality"
 _FORMAT = 1
-_MAX_WAIT_S = 1.0  # between looks at what another process is choosing
+MAX_CHOOSING_S = 7200.0  # how long to wait for what another process is choosing
 
 
 @dataclass(frozen=True)
@@ -490,11 +490,8 @@ def resolve_quality_for(
         return found
     if not keep:
         return choose().recipe
-    wait_s = 0.05
-    while (claim := try_claim(store, f"quality.{question.digest}")) is None:  # another one chooses
-        sleep(wait_s)
-        wait_s = min(2 * wait_s, _MAX_WAIT_S)
-    with claim:
+    name, doing = f"quality.{question.digest}", "is choosing the same settings"
+    with hold(store, name, MAX_CHOOSING_S, doing) as claim:
         if not anew and (found := recorded(store, question)):
             return found
         chosen = choose()

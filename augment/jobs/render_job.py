@@ -23,7 +23,7 @@ from augment.base_photo import check_photos
 from augment.cameras import Frame
 from augment.effects import Sharing, share_effects
 from augment.errors import ClimateGSError, OutputError
-from augment.jobs.atomic import write_atomic
+from augment.jobs.atomic import path_below, read_file, write_atomic
 from augment.jobs.files import SceneIndex, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
@@ -59,6 +59,7 @@ from recipes.schema import SECTIONS, Recipe
 # ---- The files that a recipe names, beside the images: those of a style in `<variant>/style/` ----
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
+RECIPE_FILE = "recipe.yaml"
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
 
 
@@ -112,8 +113,25 @@ def copy_files(recipe: Recipe, folder: Path) -> None:
     for section_path, section in recipe.sections().items():
         for key, data in read_files(section).items() if section.files else ():
             path = folder / names[f"{section_path}.{key}"]
-            if not (path.is_file() and path.read_bytes() == data):
+            if not (path.is_file() and read_file(path) == data):
                 write_atomic(path, data)
+
+
+def write_recipe(recipe: Recipe, folder: Path) -> None:
+    """Write `recipe.yaml`, and the files that it names. folder: the variant's. Raises RecipeError:
+    as copy_files. OutputError: the system refused, or a link leads out of the output.
+    """
+    place = folder.parent.name, folder.name
+    for name in stored_names(recipe).values():
+        path_below(folder.parents[1], (*place, *PurePath(name).parts[:-1]))
+    copy_files(recipe, folder)
+    write_atomic(folder / RECIPE_FILE, dump_recipe(portable_recipe(recipe)).encode())
+
+
+def lacks_recipe(recipe: Recipe, folder: Path) -> bool:
+    """Whether `recipe.yaml` or a file that it names is missing. folder: the variant's."""
+    names = (RECIPE_FILE, *stored_names(recipe).values())
+    return not all((folder / name).is_file() for name in names)
 
 
 def _safe_name(path: str) -> str:
@@ -141,7 +159,8 @@ class RenderJob:
     the same number and timestamp. workers: 1 renders in this process. overwrite: replace the
     variants' folders, finished or not, and choose their settings anew. shared_dir: keeps
     what lies in files of what images share (where snow can lie) for later jobs; the output folder's
-    state if None.
+    state if None. source_digest: of the scene's content (adapters.scene_cache.scene_digest); images
+    of other content in the output are then refused.
     """
 
     scene_uri: str
@@ -154,6 +173,7 @@ class RenderJob:
     backend: str = "auto"
     overwrite: bool = False
     shared_dir: Path | None = None
+    source_digest: str | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -323,6 +343,7 @@ class _Run:
                     check_kept(recipe, folders)
                 self._prepare(self.recipes)
             self.job_state.open(overwrite=self.job.overwrite)
+            self._restore_recipes()
             chunks = list(self.job_state.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
@@ -344,6 +365,12 @@ class _Run:
                 ) from None
             finally:
                 self.job_state.close()
+
+    def _restore_recipes(self) -> None:
+        """Write the recipes of begun variants, and files that they name, where they are missing."""
+        for variant in self.job_state.variants:
+            if variant.rows and lacks_recipe(variant.recipe, variant.place):
+                write_recipe(variant.recipe, variant.place)
 
     def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
         if chunks:
@@ -403,8 +430,14 @@ class _Run:
             )
 
     def _identity(self, recipe: Recipe) -> Identity:
-        version = augment.__version__
-        return Identity(self.index.source, recipe.hash, self.trajectory, version, self.backend)
+        return Identity(
+            self.index.source,
+            recipe.hash,
+            self.trajectory,
+            augment.__version__,
+            self.backend,
+            self.job.source_digest,
+        )
 
     def _prepare(self, recipes: Sequence[Recipe]) -> None:
         """Find what images of these recipes share, for all cameras of the scene or the path."""
@@ -423,10 +456,9 @@ class _Run:
         """Announce the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
             variant = self.job_state.variants[number]
+            variant.check_folders(n for c in chunks if c.variant == number for n in c.cameras)
             variant.progress_log.begin(variant.identity)
-            copy_files(variant.recipe, variant.place)
-            text = dump_recipe(portable_recipe(variant.recipe)).encode()
-            write_atomic(variant.place / "recipe.yaml", text)
+            write_recipe(variant.recipe, variant.place)
 
     def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""

@@ -28,10 +28,12 @@ from augment.jobs.atomic import (
     flush_folder,
     link_file,
     make_folder,
+    path_below,
+    read_file,
     refusals_of,
     write_atomic,
 )
-from augment.jobs.layout import path_below, relative_parts
+from augment.jobs.layout import relative_parts
 
 _UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
 
@@ -144,7 +146,7 @@ class LocalStore:
         file = self._file(path)
         with _reading(file):
             try:
-                return file.read_bytes()
+                return read_file(file)
             except (FileNotFoundError, NotADirectoryError):
                 raise StoredFileMissing(f"{file} is missing") from None
 
@@ -369,7 +371,7 @@ class RemoteStore:
         """The file is read into memory first: one that fails to be read must not be uploaded."""
         stored_path(path, self.uri)
         with _reading(source):
-            data = source.read_bytes()
+            data = read_file(source)
         self.write(path, data)
 
     def list(self, folder: str) -> dict[str, StoredFile]:

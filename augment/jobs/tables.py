@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 from augment.errors import OutputError
 from augment.files.stated_sizes import StatedSizeError, check_table, check_texts
 from augment.labels import Boxes, LidarSweep
+from recipes.files import open_file
 
 METADATA_KEY = b"climategs"
 
@@ -212,6 +213,8 @@ def opened_parquet(
     by `augment.files.stated_sizes` before.
     """
     try:
+        if not isinstance(source, bytes):
+            open_file(source).close()  # refuses pipes, at which Arrow would wait without end
         with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:
             if _has_extension_types(at):
                 raise OutputError(

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from augment.box_estimates import evidence_of
 from augment.boxes import Instances
 from augment.cameras import Camera, Frame
 from augment.errors import GpuLost, OutputError
@@ -429,7 +430,10 @@ class FrameRunner:
                 self._boxes[frame] = self._scene.boxes(frame)
         origin = np.asarray(self._scene.world_origin_m, np.float64)
         boxes = self._boxes[frame]
-        return label_view(boxes, self._setup.instances, origin, camera, view, recipe)
+        return label_view(
+            boxes, self._setup.instances, origin, camera, view, recipe,
+            evidence=lambda: evidence_of(self._scene, frame),
+        )  # fmt: skip
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
         """Write the frame's sweep, in the weather or as it is, unless it is there already; what

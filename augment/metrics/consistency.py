@@ -352,7 +352,7 @@ def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Track, size [3] and world_from_box [4, 4] of every box whose numbers can be used."""
     placed = PlacedBoxes.of(boxes, np.zeros(3))
     poses = rigid(torch.from_numpy(placed.rotations), torch.from_numpy(placed.centres_m)).numpy()
-    for number in np.flatnonzero(placed.is_finite):
+    for number in np.flatnonzero(placed.is_usable):
         yield boxes.track_ids[number], placed.sizes_m[number], poses[number]
 
 

@@ -27,6 +27,8 @@ import numba
 import torch
 from torch.utils.data import get_worker_info
 
+from augment.errors import BackendUnavailable
+
 logger = logging.getLogger(__name__)
 
 TBB_LIBRARY = "libtbb.so.12"
@@ -42,13 +44,18 @@ def select_thread_pool() -> str:
     """Choose numba's threading layer, once, before its pool starts; returns the layer's name.
 
     A layer the user named (NUMBA_THREADING_LAYER) and a pool that runs already are left alone.
+
+    Raises:
+        BackendUnavailable: the layer that the user named cannot be used.
     """
     try:
         layer = numba.threading_layer()  # raises while no pool runs
     except ValueError:
-        layer = numba.config.THREADING_LAYER
+        layer, has_tbb = numba.config.THREADING_LAYER, _preload_tbb()
         if layer == "default":
-            layer = numba.config.THREADING_LAYER = "tbb" if _preload_tbb() else _ONE_CALLER
+            layer = numba.config.THREADING_LAYER = "tbb" if has_tbb else _ONE_CALLER
+        else:
+            layer = _start_named(layer)
     else:
         if layer == "omp":
             logger.warning(
@@ -63,6 +70,23 @@ def select_thread_pool() -> str:
             TBB_LIBRARY,
         )
     return layer
+
+
+def _start_named(layer: str) -> str:
+    """Start numba's pool on the layer that the user named, which may stand for several (`safe`).
+    Returns the name of the layer that it runs on.
+    """
+    try:
+        numba.get_num_threads()  # starts the pool
+        return numba.threading_layer()
+    except ValueError as error:
+        why = str(error).splitlines()[0].rstrip(".")
+        hint = ": install the package 'tbb'" if layer == "tbb" else ""
+        raise BackendUnavailable(
+            f"NUMBA_THREADING_LAYER={layer}: {why}{hint}; or leave the variable unset, and "
+            f"a layer that works is chosen (numba has tbb, omp, workqueue, safe, forksafe, "
+            f"threadsafe)"
+        ) from None
 
 
 def _preload_tbb() -> bool:

@@ -16,6 +16,7 @@ from drives import WHOLE, changed
 from scipy.spatial.transform import Rotation
 from shown import psnr, psnr_of, render
 
+from adapters.base import open_scene
 from adapters.pandaset import (
     NO_SURFACE,
     PandaSetLabels,
@@ -447,6 +448,16 @@ def test_a_sequence_that_contradicts_itself_is_refused(own):
         assert Path(name).name in str(caught.value)
 
 
+def test_a_lens_beyond_all_limits_is_refused_with_its_scene(own):
+    path = own / "camera/left_camera/intrinsics.json"
+    for focal in ("1e-320", "1e9"):
+        with (
+            changed(path, '(?<="fx": )[^,}]+', focal),
+            pytest.raises(AdapterError, match=r"'pandaset:.*': frame 0, camera 'left_.*: fx must"),
+        ):
+            open_scene(f"pandaset:{own}")
+
+
 def test_folders_that_are_no_sequence_are_refused(own):
     left = own / "camera/left_camera"
     (left / "03.jpg").write_bytes((left / "00.jpg").read_bytes())
@@ -454,7 +465,7 @@ def test_folders_that_are_no_sequence_are_refused(own):
         (lambda: None, r"image 03\.jpg, but timestamps\.json ends with frame"),
         (lambda: [path.unlink() for path in left.glob("*.jpg")], "left_camera holds no images"),
         (lambda: shutil.rmtree(left), "no LiDAR returns in 3 frames"),
-        (lambda: (own / "camera").rename(own / "cam"), "camera does not exist"),
+        (lambda: (own / "camera").rename(own / "cam"), "camera holds no images <camera>/NN"),
         (lambda: own.rename(own.parent / "elsewhere"), "is not a folder"),
     )
     for path in (own / "lidar").glob("*.pkl.gz"):

@@ -52,6 +52,7 @@ from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
 from augment.semantics import SemanticClass
 from recipes.load import load_recipe
+from tools.cli import main
 from tools.explain import describe_drive, drive_text
 
 QUERY = {"voxel_m": "0.3", "image_scale": "1", "sky_size": "8"}
@@ -152,6 +153,21 @@ def test_a_drive_without_images_or_returns_is_described_and_makes_no_scene(
     assert facts["boxes"]["count"] >= 2 or case == "waymo-lidar"  # whose pattern has lidar_box
     page = drive_text(facts)
     assert "scene       none: there" in page and "LiDAR       " in page and "boxes " in page
+
+
+def test_inspect_shows_a_drive_without_images_and_render_refuses_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = av2_files.write_log(tmp_path / "log", cameras=list(av2_files.CAMERAS)[:1])
+    shutil.rmtree(root / "sensors/cameras")
+    facts = tmp_path / "facts.json"
+    assert main(["inspect", str(root), "--json", str(facts)]) == 1
+    page = capsys.readouterr().out
+    assert "scene       none: there is no usable image in 4 frames" in page
+    assert "; map, " in page and "usable returns in 4 sweeps of 4 frames" in page
+    assert read_json(facts)["boxes"]["count"] == 8
+    assert main(["render", "dense-fog", "--scene", str(root), "--out", str(tmp_path / "out")]) == 2
+    assert "no usable image" in capsys.readouterr().err
 
 
 def test_returns_beyond_any_reach_are_left_out_and_paths_must_be_metres(tmp_path: Path) -> None:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import drives
 import numpy as np
 import pytest
+import torch
 
-from adapters.training_views.masks import find_ego_mask, moving_frames, read_ego_mask
+from adapters.training_views.masks import read_ego_mask
 from adapters.training_views.views import RecordedViews
+from augment.cameras import Frame
 from augment.errors import AdapterError
+from augment.own_car import find_ego_mask, moving_frames, own_car_mask
 from augment.reconstruct.view import ViewKey
 from augment.recorded_sky import lidar_top_rad, looks_like_sky, sky_mask
+from augment.scene import Scene
+from augment.sky import ConstantSky
+from tests.scenes import one_gaussian
 
 NO_RETURNS = np.zeros(0, np.int32)
 SIZE = (160, 120)
@@ -173,6 +182,29 @@ def test_nothing_is_found_where_the_car_is_not_seen(monkeypatch):
     assert not find_ego_mask(*drive_pictures(car_rows=None, lead_car=True)).any()
 
 
+@pytest.mark.parametrize("missing", [0, 8])
+def test_a_scene_tells_the_recording_car_in_its_photos_at_any_size(tmp_path, missing):
+    """Of twelve images; fewer than six tell nothing."""
+    cameras, pictures = drive_pictures(car_rows=np.full(160, 90))
+    frames = []
+    for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+        large, path = camera.scaled(4.0), tmp_path / f"{i}.png"
+        if i >= missing:
+            cv2.imwrite(str(path), cv2.resize(picture, (large.width, large.height)))
+        pose = torch.eye(4, dtype=torch.float64)
+        frames.append(Frame(i, camera.timestamp_ns, pose, {"a": large}, {"a": str(path)}))
+    scene = Scene("s", "test:", one_gaussian(), (), ConstantSky(torch.zeros(3)), tuple(frames))
+    whole = frames[3].cameras["a"]
+    mask = own_car_mask(scene, whole.scaled(0.5))
+    if missing:
+        assert mask is None
+        return
+    assert mask is not None and mask.shape == (240, 320)
+    assert np.abs(mask.argmax(axis=0) - 180).max() < 8 and mask[-1].all()
+    window = own_car_mask(scene, whole.cropped(100, 200, 300, 280))
+    assert window is not None and np.abs(window.argmax(axis=0) - 160).max() < 16
+
+
 def test_frames_are_taken_where_the_car_moved():
     def standing(count: int, step_m: float):
         return [drives.camera("a", f, position=(step_m * f, 0, 1.6)) for f in range(count)]
@@ -209,6 +241,27 @@ def test_views_know_the_own_car(bonnet_drive):
     assert (view.weight == 1).all() and len(view.depth_pixels) > 100
     # The floor behind the bonnet is not seen.
     assert not mask.reshape(-1)[view.depth_pixels].any()
+
+
+def test_images_that_differ_by_a_few_rows_share_a_mask(bonnet_drive):
+    def cut(frame):
+        """The frame without up to four of its lowest rows."""
+        camera = frame.cameras["front"]
+        height = camera.height - 2 * (frame.index % 3)
+        path = Path(frame.image_paths["front"])
+        drives.paint(path, cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)[:height])
+        camera = camera.cropped(0, 0, camera.width, height)
+        return dataclasses.replace(frame, cameras={"front": camera})
+
+    whole = RecordedViews(bonnet_drive, scale=1.0).ego_masks["front"]
+    drive = dataclasses.replace(bonnet_drive, frames=tuple(map(cut, bonnet_drive.frames)))
+    views = RecordedViews(drive, scale=1.0)
+    assert (views.ego_masks["front"] != whole).mean() < 0.03
+    for key in views.train:
+        mask = views.own_car(key)
+        assert mask.shape == (120 - 2 * (key.frame % 3), 160)
+        assert mask[102:].all() and not mask[:90].any()
+        assert not mask.reshape(-1)[views.load(key).depth_pixels].any()
 
 
 def test_masks_from_files(bonnet_drive, tmp_path):

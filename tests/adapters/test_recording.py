@@ -3,6 +3,7 @@ and with neither."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import pickle
@@ -32,11 +33,14 @@ from adapters.recording.adapter import (
 from adapters.recording.files import find_images, numbered_files, read_calibration, unlisted_images
 from adapters.uri import format_uri
 from augment.errors import AdapterError
+from augment.files.recorded_images import ImageFault, read_scaled
 from augment.jobs.layout import folder_name
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import lidar_bytes
+from augment.recorded_sky import recorded_sky
 from augment.semantics import SemanticClass
 from recipes.load import load_recipe
+from tests.exif import with_orientation
 from tests.streets import LABELLED_STREET, open_street
 
 
@@ -274,6 +278,23 @@ def test_a_generated_variant_opens_as_a_rendered_one_does(tmp_path):
         assert boxes.track_ids == expected.labels.boxes(frame.index).track_ids
 
 
+def test_boxes_without_a_label_or_a_size_are_said_and_make_no_object(tmp_path):
+    root = write_recording(tmp_path / "odd")
+    path = root / "labels" / "boxes.parquet"
+    boxes = pq.ParquetFile(path).read()
+    track_ids, lengths = boxes["track_id"].to_pylist(), boxes["length_m"].to_pylist()
+    labels = [None if track == "parked" else "Car" for track in track_ids]
+    lengths[track_ids.index("car")] *= -1
+    for name, values in {"label": labels, "length_m": lengths}.items():
+        boxes = boxes.set_column(boxes.column_names.index(name), name, pa.array(values))
+    pq.write_table(boxes, path)
+    scene = open_recording(str(root), QUERY)
+    assert set(scene.labels.boxes(0).labels) == {"", "Car"}
+    problems = " ".join(scene.problems)
+    assert f"{track_ids.count('parked')} boxes, the first in frame 0, have no label" in problems
+    assert "1 boxes, the first in frame 0, have a centre, size or rotation" in problems
+
+
 def images_of(copy: Path):
     return find_images(copy, read_calibration(copy).frames)
 
@@ -297,6 +318,60 @@ def test_jpeg_and_other_numbers_of_digits_are_read(copy):
     (copy / "images/left_camera/1.png").write_bytes(b"")
     with pytest.raises(AdapterError, match=r"01\.JPG and .*1\.png are both of frame 1; delete"):
         images_of(copy)
+
+
+def test_stored_pixels_count_whatever_exif_says_of_them(copy, tmp_path):
+    turned = Path(shutil.copytree(copy, tmp_path / "turned"))
+    for path in sorted(copy.glob("images/*/*.png")):
+        orientation = 3 if "front" in path.parent.name else 6
+        data = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+        for root, content in ((copy, data), (turned, with_orientation(data, orientation))):
+            own = root / path.relative_to(copy)
+            own.with_suffix(".jpg").write_bytes(content)
+            own.unlink()
+    upright, scene = (open_recording(str(root), QUERY) for root in (copy, turned))
+    assert upright.problems == ()
+    (note,) = scene.problems
+    assert "6 of 6 images have an EXIF orientation, such as 3 in camera front_camera" in note
+    assert_same_bits(upright, scene)
+    for a, b in zip(upright.frames, scene.frames, strict=True):
+        for name, camera in a.cameras.items():
+            photos = (read_scaled(Path(f.image_paths[name]), camera, camera) for f in (a, b))
+            np.testing.assert_array_equal(*photos)
+            np.testing.assert_array_equal(
+                recorded_sky(upright, a, name), recorded_sky(scene, b, name)
+            )
+
+    size = {"width": street.HEIGHT, "height": street.WIDTH}
+    edit_calibration(turned, lambda c: c["frames"][0]["cameras"]["left_camera"].update(size))
+    _, problems = images_of(turned)
+    assert "is 160x96 pixels, its camera 96x160; left out; its EXIF orientation is 6" in problems[0]
+    camera = dataclasses.replace(scene.frames[0].cameras["left_camera"], **size)
+    with pytest.raises(ImageFault, match="its camera is of 96x160; its EXIF orientation is 6"):
+        read_scaled(Path(scene.frames[0].image_paths["left_camera"]), camera, camera)
+
+
+def test_images_of_16_bits_are_read_and_those_of_12_refused(copy):
+    frames, _ = images_of(copy)
+    plain = open_recording(str(copy), QUERY)
+    paths = sorted(copy.glob("images/*/*.png"))
+    images = [cv2.imread(str(path)) for path in paths]
+    for path, image in zip(paths, images, strict=True):
+        cv2.imwrite(str(path), image.astype(np.uint16) * 257)
+    scene = open_recording(str(copy), QUERY)
+    (note,) = scene.problems
+    assert "6 of 6 images have 16 bits" in note and "values / 256" in note
+    assert_same_bits(plain, scene)
+    cv2.imwrite(str(paths[0]), images[0].astype(np.uint16) * 16)
+    _, problems = images_of(copy)
+    assert "000000.png has 16 bits a channel and no value above 4095 of 65535" in problems[0]
+    camera = frames[0].cameras["front_camera"]
+    with pytest.raises(ImageFault, match="no value above 4095"):
+        read_scaled(paths[0], camera, camera)
+    for path, image in zip(paths, images, strict=True):
+        cv2.imwrite(str(path), image.astype(np.uint16) * 16)
+    with pytest.raises(AdapterError, match=r"no usable image.*multiply its values by 16"):
+        open_recording(str(copy), QUERY)
 
 
 def test_links_out_of_the_folder_are_refused(copy, tmp_path):
@@ -420,6 +495,10 @@ WRONG_CALIBRATIONS = [
     (put_camera("fx", None), "frame 1, camera 'left_camera': fx is missing"),
     (put_camera("fx", -5), "camera 'left_camera': .*fx must be finite and > 0"),
     (put_camera("fx", "long"), "left_camera': fx must be a valid number; got 'long'"),
+    (put_camera("fy", 1e-320), "frame 1, camera 'left_camera': fy must be from 6.999 to 9167 px "
+     r"in an image of 160x96 \(a field of view from 170 to 1 degrees.*got 9.99989e-321"),
+    (put_camera("fx", 1e9), r"camera 'left_camera': fx must be from 6.999 to 9167 px.*got 1e\+09"),
+    (put_camera("cx", -1e6), "camera 'left_camera': cx must lie within 1600 px of the centre"),
     (put_camera("width", 10**9), "left_camera': width must be less than or equal to"),
     (put_camera("timestamp_ns", "now"), "left_camera': timestamp_ns must be a valid integer"),
     (lambda c: c.update(frames=[]), r"frames must have at least 1 item .* got \[\]"),
@@ -482,8 +561,11 @@ def test_images_that_cannot_be_used_are_problems(copy):
     assert "images/roof belongs to no camera of calibration.json" in more[1]
     for path in copy.glob("images/front_camera/00000[02].png"):
         path.unlink()
-    for query in ({"held_out": "1:2"}, {"frames": "0:1"}):
-        with pytest.raises(AdapterError, match=r"no usable image of .* not held out.*: camera"):
+    for query, some in (
+        ({"held_out": "1:2"}, r"2 frames \(0, 2\) that are not held out"),
+        ({"frames": "0:1"}, r"1 frame \(0\);"),
+    ):
+        with pytest.raises(AdapterError, match=rf"no usable image in {some}.*camera"):
             open_recording(str(copy), QUERY | query)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import resource
+import shutil
 import signal
 import threading
 import time
@@ -20,8 +21,10 @@ from pandaset_folder import write_sequence
 from recording_folder import write_recording
 
 from adapters.base import open_scene
-from adapters.scene_cache import LIMIT_KEY, cached_scene
+from adapters.scene_cache import LIMIT_KEY, cached_scene, scene_digest
 from augment.errors import AdapterError
+from augment.files.export import export_ply
+from augment.files.scene_file import save_scene
 from augment.render.rasterize import rasterize
 from tools.cli import main
 
@@ -189,3 +192,89 @@ def _kept(folder: Path):
     """A scene of everything that scenes hold, of a folder of its own."""
     folder.mkdir(exist_ok=True)
     return cached_scene("recording", str(folder), {}, fitted_scene)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe"])
+def test_what_others_put_in_the_caches_folder_is_neither_emptied_nor_waited_for(
+    kind: str, cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = _kept(tmp_path / "a")
+    (entry,) = cache.iterdir()
+    lock = cache / f"{entry.name.partition('-')[0]}.lock"
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    entry.unlink()
+    if kind == "pipe":
+        os.mkfifo(lock)
+        os.mkfifo(entry)
+    else:
+        lock.symlink_to(victim if kind == "link" else tmp_path / "nothing")
+        entry.symlink_to("/dev/zero")
+    assert_same(_kept(tmp_path / "a"), first)
+    assert victim.read_text() == "precious" and not (tmp_path / "nothing").exists()
+    assert "where a lock of climategs was expected" in caplog.text
+
+
+# ---- The digest of what a scene is made from -----------------------------------------------------
+
+
+def _scene(root: Path) -> str:
+    save_scene(fitted_scene(), root)
+    return f"scene:{root}?"
+
+
+def _splats(root: Path) -> str:
+    root.mkdir(parents=True)
+    export_ply(fitted_scene(), root / "point_cloud.ply", 0)
+    return f"gaussians:{root}?"
+
+
+DIGESTED = {**RAW, "scene": _scene, "gaussians": _splats}
+
+
+@pytest.mark.parametrize("scheme", DIGESTED)
+def test_a_digest_is_of_the_content_wherever_it_lies(
+    scheme: str, cache: Path, tmp_path: Path
+) -> None:
+    uri = DIGESTED[scheme](tmp_path / "data")
+    first = scene_digest(uri)
+    assert first is not None and len(first) == 32
+    shutil.copytree(tmp_path / "data", tmp_path / "copy")  # with other times
+    (tmp_path / "copy" / ".hidden").write_text("of a file manager")
+    (tmp_path / "copy" / "out" / ".climategs").mkdir(parents=True)
+    (tmp_path / "copy" / "out" / "manifest.parquet").write_bytes(b"an output that was put here")
+    copy = uri.replace(str(tmp_path / "data"), str(tmp_path / "copy"))
+    assert scene_digest(copy) == scene_digest(copy) == first
+    files = [p for p in (tmp_path / "copy").rglob("*") if p.suffix in (".json", ".bin", ".txt")]
+    files += [p for p in (tmp_path / "copy").rglob("*.safetensors")]
+    files += [p for p in (tmp_path / "copy").rglob("*.parquet") if "out" not in p.parts]
+    files += [p for p in (tmp_path / "copy").rglob("*.ply")]
+    files += [p for p in (tmp_path / "copy").rglob("sample.json")]  # of nuScenes its tables count
+    content = bytearray(files[-1].read_bytes())
+    content[len(content) // 2] ^= 1
+    files[-1].write_bytes(content)
+    assert scene_digest(copy) not in (first, None)
+
+
+def test_what_was_read_once_is_remembered_until_the_files_change(
+    cache: Path, tmp_path: Path
+) -> None:
+    uri = _scene(tmp_path / "a")
+    for path in (tmp_path / "a").iterdir():
+        os.utime(path, (1, 1))
+    first = scene_digest(uri)
+    (memo,) = (cache.with_name("digests")).iterdir()
+    memo.write_text(memo.read_text().replace(str(first), "f" * 32))
+    assert scene_digest(uri) == "f" * 32  # not read again
+    os.utime(tmp_path / "a" / "scene.json", (2, 2))
+    assert scene_digest(uri) == first
+    memo.write_text("[" * 100_000)
+    assert scene_digest(uri) == first
+
+
+def test_scenes_without_files_of_their_own_have_a_digest_too(tmp_path: Path) -> None:
+    first = scene_digest("procedural:street?seed=3&frames=2")
+    assert first == scene_digest("procedural:street?frames=2&seed=3")
+    assert first not in (None, scene_digest("procedural:street?seed=4&frames=2"))
+    assert scene_digest(f"scene:{tmp_path / 'missing'}") is None
+    assert scene_digest(str(tmp_path)) is None

@@ -11,15 +11,22 @@ from pathlib import Path
 
 import pytest
 
+from augment.errors import OutputError
 from augment.jobs import atomic
 from augment.jobs.atomic import (
     TEMPORARY_SUFFIX,
     copy_file,
+    open_lock,
+    path_below,
+    read_file,
     remove_temporaries,
     replaced_file,
     replaced_folder,
+    wait_for_lock,
     write_atomic,
 )
+from augment.jobs.claims import try_lock
+from augment.jobs.processes import OutputLock, file_lock
 from augment.jobs.store import LocalStore
 
 DATA = b"whole" * 1000
@@ -188,3 +195,80 @@ def test_a_name_may_be_as_long_as_the_system_allows(tmp_path):
         assert (tmp_path / name).read_bytes() == DATA
     assert not temporaries(tmp_path)
     assert atomic.temporary_beside(tmp_path / "x") != atomic.temporary_beside(tmp_path / "x")
+
+
+def _link(path: Path) -> None:
+    path.symlink_to(path.parent.parent / "victim")
+
+
+def _dangling_link(path: Path) -> None:
+    path.symlink_to(path.parent.parent / "nothing")
+
+
+def _hard_link(path: Path) -> None:
+    os.link(path.parent.parent / "victim", path)
+
+
+NO_LOCKS: dict[str, Callable[[Path], object]] = {
+    "link": _link,
+    "dangling link": _dangling_link,
+    "hard link": _hard_link,
+    "zeros": lambda path: path.symlink_to("/dev/zero"),
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+    "file of somebody's": lambda path: path.write_text("precious"),
+}
+LOCKERS: dict[str, Callable[[Path], object]] = {
+    "output": lambda path: OutputLock(path.parent.parent).__enter__(),
+    "claim": try_lock,
+    "shared file": lambda path: file_lock(path, "tests").__enter__(),
+}
+
+
+@pytest.mark.parametrize("locker", LOCKERS)
+@pytest.mark.parametrize("kind", NO_LOCKS)
+def test_what_is_no_lock_is_refused_and_stays_as_it_is(tmp_path, kind, locker):
+    (tmp_path / "victim").write_text("precious")
+    lock = tmp_path / ".climategs" / "lock"
+    lock.parent.mkdir()
+    NO_LOCKS[kind](lock)
+    before = lock.lstat()
+    with pytest.raises(OutputError, match=f"{lock} is a .*lock of climategs.*delete it"):
+        LOCKERS[locker](lock)
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert sorted(os.listdir(tmp_path)) == [".climategs", "victim"]
+    assert (lock.lstat().st_ino, lock.lstat().st_size) == (before.st_ino, before.st_size)
+
+
+def test_a_state_folder_that_leads_out_of_the_output_is_refused(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".climategs").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="leads through a link"):
+        OutputLock(tmp_path / "out").__enter__()
+    assert os.listdir(tmp_path / "elsewhere") == []
+
+
+def test_a_lock_held_for_ever_is_waited_for_no_longer_than_said(tmp_path):
+    path = tmp_path / "lock"
+    holder, waiter = open_lock(path), open_lock(path)
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    with pytest.raises(OutputError, match=r"has held this lock for 0 s \(builds\); end it"):
+        wait_for_lock(path, waiter, patience_s=0.1, doing="builds")
+    fcntl.flock(holder, fcntl.LOCK_UN)
+    wait_for_lock(path, waiter, patience_s=0.1, doing="builds")
+    os.close(holder)
+    os.close(waiter)
+
+
+def test_a_link_that_leads_to_itself_is_no_file(tmp_path):
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(OSError, match="symbolic links"):
+        read_file(path_below(tmp_path, ("loop", "file")))
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_pipes_and_devices_are_not_read(tmp_path, make):
+    make(tmp_path / "file")
+    with pytest.raises(OSError, match="not a regular file"):
+        read_file(tmp_path / "file")

@@ -384,6 +384,31 @@ def test_tbb_is_chosen():
     assert numba.threading_layer() == "tbb"
 
 
+NAMED_LAYER = """
+from augment.errors import BackendUnavailable
+from augment.render import threads
+try:
+    print(threads.select_thread_pool(), end=" ")
+    with threads.kernel_threads():
+        print(threads.thread_count() > 0)
+except BackendUnavailable as error:
+    print(error)
+"""
+
+
+@needs_tbb
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [("tbb", "tbb True"), ("bogus", "NUMBA_THREADING_LAYER=bogus: The threading layer requested")],
+)
+def test_a_layer_that_the_user_names_is_used_or_refused_in_our_words(layer: str, message: str):
+    result = subprocess.run(
+        [sys.executable, "-c", NAMED_LAYER], cwd=ROOT, capture_output=True, text=True, check=True,
+        env={**os.environ, "NUMBA_THREADING_LAYER": layer},
+    )  # fmt: skip
+    assert result.stdout.startswith(message)
+
+
 @needs_tbb
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux only")
 def test_workers_forked_after_the_parent_rendered():

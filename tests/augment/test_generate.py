@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -101,6 +102,25 @@ def test_a_finished_job_renders_nothing_and_touches_nothing(finished: Path) -> N
     result = run(small_job(finished, renderer=must_not_render))
     assert (result.written, result.skipped, result.failed) == (0, 12, 0)
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()} == before
+
+
+def test_any_file_that_was_deleted_is_made_again(finished, whole, tmp_path: Path) -> None:
+    """One of every folder; nothing but what is missing is rendered."""
+    out = Path(shutil.copytree(finished, tmp_path / "out"))
+    firsts = {path.rpartition("/")[0]: path for path in whole}
+    names = {*firsts.values(), *(path for path in whole if path.endswith("recipe.yaml"))}
+    for path in sorted(path for path in names if "/" in path):
+        (out / path).unlink()
+        images = rendered(small_job(out))
+        assert outputs(out) == whole, path
+        assert leftovers(out) == []
+        if "/images/" in path or "/depth/" in path:
+            assert len(images) == 1
+        if path.endswith("recipe.yaml"):
+            assert images == []
+    shutil.rmtree(out / "a")
+    assert len(rendered(small_job(out))) == 8
+    assert outputs(out) == whole and leftovers(out) == []
 
 
 def test_shards_in_any_order_give_the_files_of_one_run(tmp_path: Path, whole: dict) -> None:
@@ -379,3 +399,50 @@ def test_jobs_that_are_killed_stopped_or_starved_of_disk_go_on(quick_folder: Pat
     assert found["fill_the_disk"]["failures"] >= 2
     assert len(found["stop_jobs_with_workers"]["finished"]) == 6
     assert {"run_several_drivers", "die_at_one_image", "die_while_opening"} <= found.keys()
+
+
+# ---- Scenes whose files change between two runs --------------------------------------------------
+
+
+def digested_job(out: Path, digest: str | None, **options) -> GenerateJob:
+    """A small job in which scene a has this content, and scene b always the same."""
+    job = small_job(out, **options)
+    digests = {"fake:a?frames=2": digest, "fake:b?frames=1": "content of b"}
+    digest_of = None if digest is None else digests.get
+    return replace(job, setup=replace(job.setup, digest_of=digest_of))
+
+
+@pytest.mark.parametrize("executor", ["serial", "rescan", "without records"])
+def test_a_scene_whose_content_has_changed_is_refused(tmp_path: Path, executor: str) -> None:
+    run(digested_job(tmp_path, "content1"))
+    rows = rows_of(tmp_path, scene="a")
+    assert {row["source_digest"] for row in rows} == {"content1"}
+    before = outputs(tmp_path)
+    options = {"rescan": True} if executor == "rescan" else {}
+    if executor == "without records":
+        shutil.rmtree(tmp_path / ".climategs" / "scenes")
+    changed = digested_job(tmp_path, "content2", renderer=must_not_render, **options)
+    pattern = "scene a as it was before.*fake:a.*content1.*content2.*another output.*or delete"
+    with pytest.raises(OutputError, match=pattern):
+        run(changed)
+    assert outputs(tmp_path) == before
+    assert run(digested_job(tmp_path, "content1", renderer=must_not_render)).skipped == 12
+    shutil.rmtree(tmp_path / "a")
+    assert len(rendered(digested_job(tmp_path, "content2"))) == 8
+    assert {row["source_digest"] for row in rows_of(tmp_path, scene="a")} == {"content2"}
+    assert run(digested_job(tmp_path, "content2", renderer=must_not_render)).skipped == 12
+    assert leftovers(tmp_path) == []
+
+
+def test_an_output_without_a_digest_is_taken_for_the_scene_as_it_is_once(
+    tmp_path: Path, caplog
+) -> None:
+    recipes = make_recipes(["fog"], block_images=2)
+    run(digested_job(tmp_path, None, recipes=recipes))
+    more = digested_job(tmp_path, "content1")
+    assert len(rendered(more)) == 6  # of the other recipe
+    assert caplog.text.count("of an older version") == 2  # of each scene
+    run(more)
+    assert caplog.text.count("of an older version") == 2
+    with pytest.raises(OutputError, match="scene a as it was before"):
+        run(digested_job(tmp_path, "content2"))

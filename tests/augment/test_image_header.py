@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from augment.files.image_size import ImageHeader, image_header, read_image_header
+from tests.exif import with_orientation
 
 
 def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:
@@ -48,3 +49,20 @@ def test_the_size_of_a_jpeg_may_lie_behind_previews(tmp_path):
     assert read_image_header(path) is None
     with pytest.raises(FileNotFoundError):
         read_image_header(tmp_path / "b.jpg")
+
+
+def test_orientation_and_bits_are_told_and_damaged_exif_says_nothing():
+    pixels = np.zeros((9, 33, 3), np.uint8)
+    for suffix in (".jpg", ".png"):
+        data = encoded(suffix, pixels)
+        for orientation, said, turned in ((3, 3, (33, 9)), (6, 6, (9, 33)), (9, 1, (33, 9))):
+            header = image_header(with_orientation(data, orientation))
+            assert header is not None and (header.orientation, header.size) == (said, (33, 9))
+            assert header.turned_size == turned
+        whole = with_orientation(data, 6)
+        at = whole.index(b"II*\0")
+        for end in range(at, at + 26):  # within EXIF
+            damaged = image_header(whole[:at] + whole[at:end].ljust(26, b"\xff") + whole[at + 26 :])
+            assert damaged is not None and damaged.size == (33, 9)
+    deep = image_header(encoded(".png", pixels.astype(np.uint16)))
+    assert deep is not None and deep.bits == 16

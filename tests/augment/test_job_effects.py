@@ -431,6 +431,11 @@ def test_the_recipe_in_the_folder_renders_it_again(searches, tmp_path: Path) -> 
     )
     recipe = load_recipe(tmp_path / "looks" / "fog.yaml").resolve(2)
     run_styled(RenderJob("fake:street", [recipe], tmp_path / "out"))
+    before = tree_digest(tmp_path / "out")
+    for path in [*(tmp_path / "out").rglob("style/*"), *(tmp_path / "out").rglob("recipe.yaml")]:
+        path.unlink()
+        run_styled(RenderJob("fake:street", [recipe], tmp_path / "out"), must_not_render)
+        assert tree_digest(tmp_path / "out") == before  # what was deleted is made again
     (tmp_path / "out").rename(tmp_path / "taken")
     images = [p for p in (tmp_path / "looks").rglob("*.png")]
     contents = {p.read_bytes() for p in images}

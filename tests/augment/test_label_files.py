@@ -13,7 +13,7 @@ import pytest
 import torch
 from batch_scenes import FakeLabels, fake_render, open_fake, tree_digest
 from generate_jobs import make_job, make_recipes
-from test_boxes_2d import open_street, street
+from test_boxes_2d import StreetLabels, open_street, street
 
 from augment.boxes import PlacedBoxes, encode_masks, find_occlusion
 from augment.dataset import LabelsAsked, write_labels
@@ -23,6 +23,7 @@ from augment.jobs.generate import run_generate
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import read_boxes
+from augment.labels import Boxes
 from recipes.load import parse_recipe
 from recipes.schema import Category, Recipe
 
@@ -284,6 +285,32 @@ def test_every_image_is_in_the_index(output: Path) -> None:
     assert listed == [f"{number:06d}" for number in range(8)]
 
 
+class OddLabels(StreetLabels):
+    """The driving car has a negative length, the parked one no label."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        boxes = super().boxes(frame_index)
+        is_car = np.array([track == "car" for track in boxes.track_ids])
+        labels = tuple("" if track == "parked" else "Car" for track in boxes.track_ids)
+        sizes = np.where(is_car[:, None], boxes.sizes_m * [-1, 1, 1], boxes.sizes_m)
+        return replace(boxes, labels=labels, sizes_m=sizes)
+
+
+def test_boxes_without_a_size_or_a_label_are_no_objects(tmp_path: Path) -> None:
+    """Their tables keep them as they are; nothing for trainers has a number that is none."""
+    asked = recipe(f"{ALL}, instance: true")
+    job = RenderJob("test:odd", [asked], tmp_path, frames=[0], backend="cpu")
+    run_job(job, scene_loader=lambda uri: street(OddLabels()), progress=False)
+    done = write_labels(tmp_path)
+    assert done.unmapped == {"": 1} and done.without_numbers == 1
+    assert read_boxes(next(tmp_path.rglob("boxes.parquet")))[0].boxes.sizes_m.min() == -4
+    (annotation,) = coco_of(tmp_path)["annotations"]  # its pixels are the actor's
+    assert annotation["track_id"] == "car" and annotation["bbox_amodal"] == annotation["bbox"]
+    assert [c["name"] for c in coco_of(tmp_path)["categories"]] == ["Car"]
+    ((kind, numbers),) = kitti_objects(tmp_path, 0)[1]
+    assert kind == "DontCare" and numbers[7:].tolist() == [-1, -1, -1, -1000, -1000, -1000, -10]
+
+
 # ---- Categories, parts, going on -----------------------------------------------------------------
 
 
@@ -296,6 +323,8 @@ def test_the_first_row_that_takes_a_label_names_its_category() -> None:
     cases = {"vehicle.bus.rigid": "bus", "vehicle.car": "car", "a.rider": "person", "vehicle": None}
     assert {label: category_of(label, table) for label in cases} == cases
     assert category_of("anything", None) == "anything"
+    every = (Category(label="*", name="object"),)
+    assert category_of("", None) is category_of("", every) is None  # the dataset has no label
 
 
 def test_what_will_be_written_is_known_before(output: Path) -> None:

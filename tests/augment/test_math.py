@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from augment.cameras import Camera
+from augment.cameras import Camera, Frame
+from augment.errors import SceneError
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh, rotate_sh, sh_basis
 from augment.rng import rng_for
@@ -251,6 +252,25 @@ def test_scaling_keeps_the_field_of_view():
 def test_impossible_cameras_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         camera(**changes)
+
+
+def test_frames_take_lenses_of_1_to_170_degrees_alone():
+    def frame(**changes: float) -> Frame:
+        cam = camera(**({"width": 100, "height": 60, "cx": 50.0, "cy": 30.0} | changes))
+        return Frame(4, 0, torch.eye(4, dtype=torch.float64), {"left": cam})
+
+    shortest, longest = (50 / math.tan(math.radians(deg / 2)) for deg in (170, 1))
+    for focal in (shortest, longest):
+        frame(fx=focal, fy=focal, cx=-950.0, cy=1030.0)
+    for changes, message in (
+        ({"fx": 0.99 * shortest}, "fx must be from 4.374 to 5729 px.*100x60.*got 4.33"),
+        ({"fy": 1.01 * longest}, "fy must be from 4.374 .*got 5786"),
+        ({"fy": 1e-320}, "fy must be from 4.374 .*got 9.99989e-321"),
+        ({"cx": -951.0}, "cx must lie within 1000 px .*100x60; got -951"),
+        ({"cy": 1e12}, "cy must lie within 1000 px"),
+    ):
+        with pytest.raises(SceneError, match=f"frame 4, camera 'left': {message}"):
+            frame(**changes)
 
 
 KEY = {"seed": 7, "scene": "street", "effect": "snow.flakes", "frame": 3, "camera": "front"}

@@ -371,6 +371,35 @@ def test_a_missing_file_is_rendered_again_and_leftovers_of_a_killed_run_go(
     assert tree_digest(copied) == tree_digest(whole)
 
 
+def test_any_file_that_was_deleted_is_made_again(tmp_path: Path) -> None:
+    """One of every folder: images, masks, labels, sweeps, calibration, recipe."""
+    job = fog_job(tmp_path, uri="fake:street?frames=2")
+    run(job)
+    whole = tree_digest(tmp_path)
+    firsts = {path.rpartition("/")[0]: path for path in whole}
+    singles = ("recipe.yaml", "calibration.json", "boxes.parquet", "boxes_2d.parquet")
+    names = {*firsts.values(), *(path for path in whole if path.endswith(singles))}
+    deleted = {path for path in names if "/" in path and not path.startswith(".climategs")}
+    assert {"images", "depth", "labels"} <= {path.split("/")[2] for path in deleted}
+    for path in sorted(deleted):
+        (tmp_path / path).unlink()
+        run(job)
+        assert tree_digest(tmp_path) == whole, path
+
+
+def test_folders_that_lead_out_of_the_output_are_not_written_to(tmp_path: Path) -> None:
+    for number, inner in enumerate(
+        ("street", "street/fog-000", "street/fog-000/images", "street/fog-000/depth/front")
+    ):
+        out, elsewhere = tmp_path / f"out{number}", tmp_path / f"elsewhere{number}"
+        elsewhere.mkdir()
+        (out / inner).parent.mkdir(parents=True)
+        (out / inner).symlink_to(elsewhere)
+        with pytest.raises(OutputError, match="leads through a link"):
+            run(fog_job(out))
+        assert list(elsewhere.iterdir()) == []
+
+
 def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path) -> None:
     recipes = [make_recipe(), make_recipe(variant=1)]
     run(RenderJob("fake:street", recipes, tmp_path / "whole"))
@@ -405,6 +434,36 @@ def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
     progress_log.write_text(text[:-20])
     assert run(RenderJob("fake:street", recipes, out)).skipped == 3
     assert tree_digest(out) == tree_digest(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("image_path", 1e308),
+        ("image_path", "../victim.png"),
+        ("frame", "x"),
+        ("camera", None),
+        ("status", []),
+        ("variant", "fog-001"),
+        ("new", {}),
+        ("width", 2**70),
+        ("box_2d", {"pixels": 3}),
+    ],
+)
+def test_a_damaged_journal_is_told(tmp_path: Path, field: str, value: object) -> None:
+    """Whose lines are rows of the manifest, and come from anybody as that does."""
+    job = fog_job(tmp_path, frames=[0])
+    run(job)
+    identity, *rows = read_manifest(tmp_path).to_pylist()[:1] * 2
+    (tmp_path / "manifest.parquet").unlink()
+    progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+    progress_log.parent.mkdir(parents=True)
+    lines = [{name: identity[name] for name in IDENTITY}, {**rows[0], field: value}]
+    progress_log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(OutputError, match=f"{progress_log}"):
+        run(job)
+    progress_log.unlink()
+    assert run(job).written == 2
 
 
 @pytest.mark.parametrize("ended", [True, False], ids=["finished", "only begun"])
@@ -453,3 +512,50 @@ def test_overwriting_replaces_the_variant_and_no_other(tmp_path: Path) -> None:
     assert (
         read_manifest(tmp_path).column("variant").to_pylist() == ["fog-000"] * 2 + ["fog-001"] * 8
     )
+
+
+# ---- What the scene's files held when its images were made ---------------------------------------
+
+
+def test_a_scene_whose_content_has_changed_is_refused(tmp_path: Path) -> None:
+    job = fog_job(tmp_path, frames=[1], source_digest="content1")
+    run(job)
+    before = tree_digest(tmp_path)
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content1"}
+    assert run(job, must_not_render).skipped == 2
+    changed = dataclasses.replace(job, frames=[1, 2], source_digest="content2")
+    with pytest.raises(OutputError, match=r"have changed since.*content1.*content2.*overwr"):
+        run(changed, must_not_render)
+    assert {k: v for k, v in tree_digest(tmp_path).items() if "/" in k} == {
+        k: v for k, v in before.items() if "/" in k
+    }
+    assert run(dataclasses.replace(changed, overwrite=True)).written == 4
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content2"}
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_an_output_without_a_digest_is_taken_for_the_scene_as_it_is_once(
+    tmp_path: Path, caplog, ended: bool
+) -> None:
+    old = fog_job(tmp_path)
+    if ended:
+        run(old)
+    else:
+        calls = []
+
+        def killed(*given, backend):
+            calls.append(given)
+            if len(calls) == 3:
+                raise SystemExit("killed")
+            return fake_render(*given, backend=backend)
+
+        with pytest.raises(SystemExit, match="killed"):
+            run(old, killed)
+    known = dataclasses.replace(old, source_digest="content1")
+    run(known)
+    assert caplog.text.count("of an older version") == 1
+    assert set(read_manifest(tmp_path)["source_digest"].to_pylist()) == {"content1"}
+    run(known, must_not_render)
+    assert caplog.text.count("of an older version") == 1
+    with pytest.raises(OutputError, match="have changed since"):
+        run(dataclasses.replace(old, source_digest="content2"))

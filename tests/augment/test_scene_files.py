@@ -299,6 +299,11 @@ def change_document(folder: Path, change) -> None:
         (("frames", 0, "image_paths", "ahead"), "a\0b", "NUL"),
         (("frames", 0, "image_paths", "ahead"), "\ud800", "surrogates"),
         (("color_maps", "ahead"), [[1.0] * 4] * 2, "at least 3 items"),
+        # Of long lists and objects the first fault is told: every error costs a kilobyte.
+        (("frames",), [{"index": 1}] * 9, r"(frames\.0\.[^;]*; got [^;]*(; |$)){4}$"),
+        (("problems",), [1] * 9, r"problems\.0: [^;]*; got 1$"),
+        (("color_maps",), dict.fromkeys(map(str, range(10_001))), "it has 10001 keys; at most"),
+        (("frames", 0, "cameras"), dict.fromkeys(map(str, range(10_001))), "it has 10001 keys"),
         (("sky",), "latlong", "a latlong sky is one array 'image'; got"),
         (("sky",), "void", "'constant', 'latlong' or 'cubemap'; got 'void'"),
     ],

@@ -44,6 +44,7 @@ from augment.effects.style.style import parse_statistics, preset_statistics
 from augment.errors import StyleError
 from augment.semantics import SemanticClass
 from recipes.style import style_preset_names, style_preset_text
+from tests.exif import with_orientation
 
 # Nothing of the limits acts on ordinary statistics with these; the floor is far below any spread.
 FREE = Limits(floor=1e-9, max_gain=1e6, min_gain=1e-6, min_contrast=1e-6)
@@ -418,13 +419,6 @@ def png(pixels: np.ndarray, color_type: int, *extra: tuple[bytes, bytes]) -> byt
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
         for name, data in chunks
     )
-
-
-def with_orientation(jpeg: bytes, orientation: int) -> bytes:
-    """The JPEG with EXIF's tag 0x112."""
-    entry = struct.pack("<HHIHH", 0x112, 3, 1, orientation, 0)
-    exif = b"Exif\0\0" + b"II*\0" + struct.pack("<IH", 8, 1) + entry + bytes(4)
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
 
 
 def cmyk_jpeg(blocks: list[tuple[int, int, int, int]], *, adobe: bool) -> bytes:

@@ -15,7 +15,7 @@ from scenes import camera_ahead, one_gaussian, stack
 from streets import open_street
 
 from adapters.camera_files.paths import with_camera_path
-from augment.cameras import Frame
+from augment.cameras import Camera, Frame
 from augment.dataset.weather_dataset import WeatherDataset
 from augment.files.scene_file import load_scene_parts, save_scene
 from augment.jobs.blocks import SceneRecord, cut_into_blocks
@@ -49,6 +49,16 @@ def fitted(scene: Scene, scale: float = 0.25, cameras: tuple[str, ...] = ("front
 
 def without(scene: Scene, mask: torch.Tensor) -> Scene:
     return dataclasses.replace(scene, background=scene.background.select(~mask))
+
+
+def screen(x_m: float) -> Gaussians:
+    """A dark grey wall across the view of a camera that looks along +x."""
+    places = [(x_m, y, z) for y in np.arange(-24.0, 26, 2) for z in np.arange(-18.0, 19, 2)]
+    return stack(*(one_gaussian(at, (0.05, 1.5, 1.5), 0.999, (0.3,) * 3) for at in places))
+
+
+def mean_trust(scene: Scene, camera: Camera) -> float:
+    return trust_mask(scene, camera).mean() / 255
 
 
 def with_sheet(scene: Scene) -> Scene:
@@ -95,10 +105,10 @@ def test_a_hole_in_the_road_is_counted_named_and_not_trusted():
     assert 0.05 < own.views[0].ground_open < 0.8
     assert own.views[0].ground_leaks >= own.views[0].ground_open
     assert "of the ground has no surface" in own.problems[0]
-    lost = trust_mask(street, camera) & ~trust_mask(hole, camera)
+    lost = mean_trust(street, camera) - mean_trust(hole, camera)
     below = elevation_rad(camera) < 0
-    assert lost[below].mean() == pytest.approx(own.views[0].ground_open, abs=0.1)
-    assert trust_mask(hole, camera)[~below].mean() > 0.95
+    assert lost / below.mean() == pytest.approx(own.views[0].ground_open, abs=0.1)
+    assert trust_mask(hole, camera)[~below].mean() > 0.95 * 255
 
 
 def test_sky_on_a_sheet_is_found_by_the_recorded_image_and_not_trusted(tmp_path):
@@ -108,9 +118,54 @@ def test_sky_on_a_sheet_is_found_by_the_recorded_image_and_not_trusted(tmp_path)
     pane = with_sheet(drive)
     (own,) = judge_scene(pane, cameras=["front"], count=1).cameras
     assert own.views[0].sky_covered > 0.03
-    assert any("of the sky has a surface nearer than 200 m" in text for text in own.problems)
+    assert any("% of the image, has a surface nearer than 200 m" in text for text in own.problems)
     camera = pane.frames[own.views[0].frame].cameras["front"].scaled(0.25)
-    assert trust_mask(drive, camera).mean() - trust_mask(pane, camera).mean() > 0.01
+    assert mean_trust(drive, camera) - mean_trust(pane, camera) > 0.01
+
+
+def test_hardly_any_sky_is_not_judged_and_the_share_is_said(tmp_path):
+    """A pale wall is taken for sky where an image shows little of it."""
+    camera = camera_ahead(128, 96, 60.0)
+    scene = Scene(
+        "wall", "test:", screen(20.0), (), ConstantSky(torch.zeros(3)),
+        (Frame(0, 0, torch.eye(4, dtype=torch.float64), {"ahead": camera}),),
+    )  # fmt: skip
+    said = []
+    for rows in (4, 30):
+        rgb = np.full((96, 128, 3), 90, np.uint8)
+        rgb[rows:] -= np.random.default_rng(0).integers(0, 60, (96 - rows, 128, 3), np.uint8)
+        rgb[:rows] = 230
+        path = tmp_path / f"{rows}.png"
+        cv2.imwrite(str(path), rgb)
+        frame = dataclasses.replace(scene.frames[0], image_paths={"ahead": str(path)})
+        drive = dataclasses.replace(scene, frames=(frame,))
+        (own,) = judge_scene(drive, count=1).cameras
+        assert own.views[0].sky == pytest.approx(rows / 96, abs=0.03)
+        assert own.views[0].sky_covered > 0.3
+        said += [text for text in own.problems if "of the sky" in text]
+    (text,) = said
+    assert "of the sky, which is 31 % of the image, has a surface nearer than 200 m" in text
+
+
+def test_what_images_from_elsewhere_contradict_is_believed_less(tmp_path):
+    cameras = [
+        camera_ahead(64, 48, 60.0, position=(0.0, 1.5 * n, 0.0), timestamp_ns=n) for n in range(5)
+    ]
+    frames = []
+    for n, camera in enumerate(cameras):
+        path = tmp_path / f"{n}.png"
+        cv2.imwrite(str(path), np.full((48, 64, 3), 77, np.uint8))  # too dark for a sky
+        pose = torch.eye(4, dtype=torch.float64)
+        frames.append(Frame(n, n, pose, {"ahead": camera}, {"ahead": str(path)}))
+    grey = screen(20.0)
+    bar = one_gaussian((9.0, 0.0, 0.0), scale=(0.05, 0.3, 3.0), opacity=0.99, rgb=(1.0,) * 3)
+    scene = Scene("bar", "test:", stack(grey, bar), (), ConstantSky(torch.zeros(3)), tuple(frames))
+    mask = trust_mask(scene, cameras[0])
+    assert mask[24, 32] < 0.4 * 255 and (mask[:, :20] == 255).all()
+    alone = dataclasses.replace(scene, background=grey)
+    assert (trust_mask(alone, cameras[0]) == 255).all()
+    unknown = tuple(dataclasses.replace(frame, image_paths={}) for frame in frames)
+    assert (trust_mask(dataclasses.replace(scene, frames=unknown), cameras[0]) == 255).all()
 
 
 def test_sky_ends_at_lidar_returns_and_below_the_horizon():
@@ -159,9 +214,15 @@ def test_fits_of_before_there_was_a_record_tell_by_their_settings():
 def test_only_what_was_seen_from_near_enough_is_trusted():
     scene = fitted(open_street())
     cameras = scene.frames[0].cameras
-    assert trust_mask(scene, cameras["front"].scaled(0.25)).mean() > 0.98
-    assert trust_mask(scene, cameras["back"].scaled(0.25)).mean() < 0.05
-    assert trust_mask(scene, cameras["front"]).mean() < 0.05
+    # Trust falls smoothly with the logarithm of the magnification: a half at 2.
+    for scale, least, most in (
+        (0.25, 0.98, 1),
+        (0.3, 0.9, 0.98),
+        (0.5, 0.45, 0.55),
+        (1.0, 0, 0.05),
+    ):
+        assert least <= mean_trust(scene, cameras["front"].scaled(scale)) <= most
+    assert mean_trust(scene, cameras["back"].scaled(0.25)) < 0.05
     nearest = nearest_view(seen_views(scene), cameras["front"])
     assert nearest.magnification == pytest.approx(4) and nearest.magnification > MAX_MAGNIFICATION
 
@@ -177,7 +238,7 @@ def test_what_stood_behind_something_else_was_not_seen(walls, trusted):
     background = stack(*map(wall, walls))
     scene = Scene("walls", "test:", background, (), ConstantSky(torch.zeros(3)), (frame,))
     behind = camera_ahead(32, 24, 15.0, position=(7.0, 0.0, 0.0), timestamp_ns=5)
-    assert bool(trust_mask(scene, behind)[12, 16]) is trusted
+    assert trust_mask(scene, behind)[12, 16] == 255 * trusted
 
 
 def test_a_camera_path_is_judged_by_what_the_scene_was_made_from(tmp_path):
@@ -228,9 +289,9 @@ def test_a_job_writes_the_mask_and_its_share_and_the_dataset_reads_them(tmp_path
     for row, sample in zip(rows, WeatherDataset(tmp_path), strict=True):
         mask = cv2.imread(str(tmp_path / row["trust_path"]), cv2.IMREAD_UNCHANGED)
         camera = street.frame(row["frame"]).cameras["front"].scaled(0.1)
-        np.testing.assert_array_equal(mask == 255, trust_mask(street, camera))
-        assert row["trusted_fraction"] == (mask == 255).mean() > 0.9
-        np.testing.assert_array_equal(sample["trust"].numpy(), mask == 255)
+        np.testing.assert_array_equal(mask, trust_mask(street, camera))
+        assert row["trusted_fraction"] == pytest.approx(mask.mean() / 255) and mask.mean() > 0.9
+        np.testing.assert_array_equal(sample["trust"].numpy(), mask.astype(np.float32) / 255)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.png")}
     (tmp_path / rows[0]["trust_path"]).unlink()
     again = run(tmp_path, street, recipe)

@@ -94,6 +94,9 @@ def test_refusals(tmp_path: Path) -> None:
         f'def "c{n}" (instanceable = true; references = </p>) {{}}\n' for n in range(40)
     )
     rows = ", ".join(["(0, 0, 0)"] * 900)
+    prims = "\n".join(
+        f'{SPLATS} "g{n}" {{ point3f[] positions = [(0, 0, 0)]\n}}' for n in range(10_001)
+    )
     many = f'def "p" {{ {SPLATS} "a" {{ point3f[] positions = [{rows}]\n}}\n}}\n'
     cases = (
         ("no splats", 'def Xform "a" {}', "no visible ParticleField3DGaussianSplat"),
@@ -108,6 +111,7 @@ def test_refusals(tmp_path: Path) -> None:
         ("one", "float opacities = 0.5", "opacities must be .* it holds float"),
         ("not USD", "def {", "not a whole OpenUSD file"),
         ("copies", many + copies, "more than 16 times"),
+        ("prims", prims, "more than 10000 prims of Gaussians"),
     )
     for name, text, message in cases:
         is_whole = "def" in text

@@ -149,6 +149,8 @@ def test_wrong_overrides_name_the_option_and_the_nearest_field() -> None:
         with pytest.raises(RecipeError) as caught:
             load_recipe("dense-fog", read_overrides([text]))
         assert str(caught.value).startswith(f"--set {text}: ") and said in str(caught.value)
+    with pytest.raises(RecipeError, match=r"--set .*udcff=1: .* which is no character"):
+        read_overrides(["\udcff=1"])
 
 
 def test_files_in_overrides_start_at_the_working_folder(

@@ -102,6 +102,11 @@ S = "r.yaml:4: weather.smog."
         ("base_height_m: {uniform: [0, 1], choice: [1]}", "or a range: a mapping with one of"),
         ("base_height_m: {unifrom: [0, 1]}", "no range is called 'unifrom'; did you mean uniform?"),
         ("base_height_m: {}", "or a range: a mapping with one of uniform, log_uniform, normal, ch"),
+        # a word for a switch
+        ("scale_height_m: off", "or null; write null"),
+        ("overcast: off", "and <= 1; write 0"),
+        ("visibility_m: off", "or null; write null"),
+        ("model: false", "one of per_gaussian, deferred; leave it out for per_gaussian"),
     ],
 )
 def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, message: str) -> None:
@@ -309,6 +314,8 @@ def test_a_byte_order_mark_is_ignored() -> None:
         ("a: &q [*q]", "f.yaml:1: *q refers to no anchor that ends above it"),
         ("a: 1\nb: \x01", "f.yaml:2: not valid YAML: it holds the character U+0001"),
         ('a: "\\UFFFFFFFF"', "f.yaml:1: not valid YAML"),  # PyYAML lets chr() raise
+        ('a: 1\nb: "\\uD800"', "f.yaml:2: \\ud800 holds '\\ud800', which is no character"),
+        ('"\\uD800": 1', "f.yaml:1: \\ud800 holds '\\ud800', which is no character"),
         ("%YAML 9.1\n--- a", "incompatible YAML document"),
         ("[" * 40 + "]" * 40, "f.yaml:1: nested more than 32 levels deep"),
         ("a: [" + "1, " * 20_001 + "]", "more than 20000 values"),

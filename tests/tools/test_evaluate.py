@@ -225,8 +225,13 @@ def test_frames_that_are_not_consecutive_have_no_pairs(tmp_path):
     write_walls(tmp_path / "out", frames=(0, 2, 4))
     facts = measure(tmp_path / "out")
     clear = facts["recipes"][0]
+    (note,) = facts["notes"]
+    assert "1 or 7 apart, so the tables of short and long range are empty" in note
+    assert "--short 2 --long 4" in note and note in evaluation_text(facts)
     assert clear["short"] is None and clear["long"] is None and clear["cameras"]["pairs"] == 3
-    two = measure(tmp_path / "out", short=2, long=4)["recipes"][0]
+    thinned = measure(tmp_path / "out", short=2, long=4)
+    assert thinned["notes"] == []
+    two = thinned["recipes"][0]
     assert two["short"]["pairs"] + two["short"]["left_out"] == 6
     write_json(tmp_path / "f.json", facts)  # None and numbers only
 

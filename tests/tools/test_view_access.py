@@ -127,6 +127,8 @@ def test_a_connection_needs_the_token_this_machines_name_and_its_own_pages_origi
         (f"/?{token}", f"Host: 203.0.113.7:{port}\r\n"),
         (f"/?{token}", ""),
         (f"/?{token}", host + host),
+        (f"/?{token}", "Host: [:::]\r\n"),
+        (f"//[::?{token}x", host),
         # viser's page would connect to that server, or play that file.
         (f"/?{token}&websocket=wss://evil.example", host),
         (f"/?playbackPath=https://evil.example/x.viser&{token}", host),

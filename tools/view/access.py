@@ -21,14 +21,14 @@ import re
 import secrets
 from collections.abc import Callable, Iterator
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl
 
 from augment.errors import ClimateGSError
 
 TOKEN_BYTES = 24  # of the secret in the printed address
 TOKEN_FIELD = "token"  # of the address's query
 MAX_PAGES = 32  # that are open at one time
-_HOST = re.compile(r"[A-Za-z0-9._-]+(:\d{1,5})?|\[[0-9A-Fa-f:.]+\](:\d{1,5})?")  # NAME:PORT
+_HOST = re.compile(r"(?P<name>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?")
 _REFUSAL = (
     "This is climategs view. Its pages open at the address that the command has printed, with the "
     "token in it.\n"
@@ -55,15 +55,16 @@ class Access:
             port: At which the request came in, which the cookie's name has.
         """
         hosts = headers.get_all("Host")
-        if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
+        match = _HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
+        if match is None:
             return "the request names no host"
-        (host,) = hosts
-        if self.is_local and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        host = match[0]
+        if self.is_local and not is_loopback(match["name"].strip("[]").lower()):
             return f"{host} is no name of this machine for itself"
         origins = headers.get_all("Origin")
         if origins and origins not in ([f"http://{host}"], [f"https://{host}"]):
             return "the request comes from a page of another site"
-        query = parse_qsl(urlsplit(path).query, keep_blank_values=True)
+        query = parse_qsl(path.partition("?")[2], keep_blank_values=True)
         # viser's page connects to other servers, or plays files of others, if its address says so.
         if any(name != TOKEN_FIELD for name, _ in query):
             return "the address has more than a token"

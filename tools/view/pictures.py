@@ -263,9 +263,9 @@ def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
     boxes = scene.boxes(frame.index)
     placed = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
-    lines = placed.corners_m[placed.is_finite][:, EDGES].reshape(-1, 2, 3)
+    lines = placed.corners_m[placed.is_usable][:, EDGES].reshape(-1, 2, 3)
     labels = np.array([sum(map(ord, label)) for label in boxes.labels], np.uint32)
-    colors = color_numbers(labels[placed.is_finite])
+    colors = color_numbers(labels[placed.is_usable])
     return lines, np.broadcast_to(np.repeat(colors, len(EDGES), 0)[:, None], lines.shape)
 
 

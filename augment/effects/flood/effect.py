@@ -224,7 +224,7 @@ def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndar
         fraction = (level_z_m - low) / np.where(height > 0, height, 1.0)
         flat = np.where(level_z_m > low, 1.0, 0.0)
     fraction = np.where(height > 0, np.clip(fraction, 0.0, 1.0), flat)
-    return np.where(placed.is_finite, fraction, np.nan)
+    return np.where(placed.is_usable, fraction, np.nan)
 
 
 def hidden_pixels(

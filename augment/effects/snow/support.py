@@ -189,7 +189,7 @@ def support_of(
         every = every_camera(scene) if cameras is None else cameras
         key = "" if folder is None else support_key(scene, every, settings, backend=backend)
         path = None if folder is None else support_path(folder, key)
-        if path is not None and path.exists():
+        if path is not None and path.is_file():
             try:
                 return load_support(path, key)
             except SceneError as error:
