@@ -254,6 +254,17 @@ def test_a_widget_takes_only_values_that_it_can_have(url, pages, caplog):
     assert not caplog.records
 
 
+def test_a_page_moves_no_widgets_of_another(url, pages):
+    with PageClient(url) as one, PageClient(url) as other:
+        (flag,) = one.wait_for(lambda: one.widgets.get("flag"), "the page")
+        other.wait_for(lambda: other.widgets.get("file"), "the other page")
+        update = {"type": "GuiUpdateMessage", "uuid": flag["uuid"], "updates": {"value": True}}
+        other.send(update)
+        other.set("line", "from the other")
+        wait_until(lambda: pages.values)
+    assert pages.values == ["from the other"] and not flag["value"]
+
+
 def begun(name: str, size: int, parts: int) -> FileTransferStartUpload:
     return FileTransferStartUpload("button", name, f"{name}.bin", "", parts, size)
 

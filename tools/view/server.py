@@ -93,11 +93,17 @@ def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) ->
     with serve(viser, viewer, options.host, options.port) as url:
         print(f"{options.scene}: {url}   (Ctrl-C ends it)", flush=True)
         if not is_loopback(options.host):
+            port = urlsplit(url).port
+            elsewhere = (
+                "; on other machines, open it with this one's name in place of localhost"
+                if options.host in EVERY_ADDRESS
+                else ""
+            )
             print_note(
                 f"note: whoever has this address, with its token, sees what is shown here and can "
-                f"have files written to {options.out}. It goes over the network unencrypted: where "
-                f"others can listen, serve at 127.0.0.1 and use `ssh -L {urlsplit(url).port}:"
-                f"localhost:{urlsplit(url).port}`"
+                f"have files written to {options.out}{elsewhere}. It goes over the network "
+                f"unencrypted: where others can listen, serve at 127.0.0.1 and use "
+                f"`ssh -L {port}:localhost:{port}`"
             )
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
