@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from augment.boxes import NEAR_M, Occlusion, Outlines, PlacedBoxes
 from augment.cameras import Camera
@@ -231,7 +231,7 @@ class _BoxesInView:
         # crane: depth that passes it, too, is right.
         if len(on) < max(MIN_RETURNS, behind):
             return None
-        nearest = cKDTree(np.concatenate([on, before])).query(centres[free])[1]
+        _, nearest = KDTree(np.concatenate([on, before])).query(centres[free])
         shown = np.flatnonzero(free)[nearest < len(on)]
         if len(shown) <= free.sum() / 2 or len(shown) < MIN_SHOWN * outline.sum():
             return None
@@ -270,8 +270,8 @@ class _BoxesInView:
         with np.errstate(invalid="ignore"):  # NaN
             inside = (pixels >= (left, top)) & (pixels < (right, bottom))
         near = np.flatnonzero(inside.all(axis=1))
-        at = np.floor(pixels[near]).astype(int) - (left, top)
-        is_free = free[at[:, 1] * (right - left) + at[:, 0]]
+        column, row = np.floor(pixels[near]).astype(int).T
+        is_free = free[(row - top) * (right - left) + (column - left)]
         enter, leave = self._spans(number, pixels[near])
         is_on = np.isin(near, on_box)
         is_before = (enter <= leave) & (depths_m[near] < enter - CLEAR_M)

@@ -104,7 +104,8 @@ def are_usable(
     numbers: Float64[np.ndarray, "B N"], sizes_m: Float64[np.ndarray, "B 3"]
 ) -> Bool[np.ndarray, " B"]:
     """Which boxes have numbers [B, N] that are all finite, and sides longer than 0."""
-    return np.isfinite(numbers).all(axis=1) & (sizes_m > 0).all(axis=1)
+    finite = np.logical_and.reduce(np.isfinite(numbers), axis=1)
+    return finite & np.logical_and.reduce(sizes_m > 0, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -273,12 +273,34 @@ def open_colmap_model(model: Path) -> Any:
         ) from None
     check_colmap_tables(model)
     try:
-        return pycolmap.Reconstruction(str(model))
+        reconstruction = pycolmap.Reconstruction(str(model))
     except (ValueError, RuntimeError, LookupError, ArithmeticError, MemoryError) as error:
         raise AdapterError(
             f"{model}: pycolmap cannot read this COLMAP model: {error}. Expected cameras, images "
             "and points3D, all .bin or all .txt"
         ) from error
+    for number, camera in reconstruction.cameras.items():
+        _check_colmap_camera(camera, f"{model}: camera {number}")
+    return reconstruction
+
+
+def _check_colmap_camera(camera: Any, where: str) -> None:
+    """Refuse what pycolmap takes as it is; asking for a focal length that is not there ends the
+    process."""
+    if not len(camera.focal_length_idxs()):
+        raise AdapterError(
+            f"{where} is of the model {camera.model_name}, which has no focal length: its images "
+            f"are no pinhole camera's; run COLMAP with another camera model"
+        )
+    size, params = (camera.width, camera.height), np.asarray(camera.params, np.float64)
+    focals = params[list(camera.focal_length_idxs())]
+    if not (1 <= min(size) <= max(size) <= MAX_SIDE_PX):
+        raise AdapterError(f"{where} must be 1 to {MAX_SIDE_PX} pixels wide and high; got {size}")
+    if not ((np.abs(params) <= LARGEST).all() and (focals > 0).all()):
+        raise AdapterError(
+            f"{where}: its parameters must be finite, at most {LARGEST:g}, and focal lengths above "
+            f"0; got {params.tolist()}"
+        )
 
 
 def read_colmap_views(model: Path) -> ViewSet:

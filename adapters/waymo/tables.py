@@ -256,6 +256,9 @@ class Rows:
 
 
 def _is_text(kind: pa.DataType) -> bool:
+    """Return True for a column of texts, plain or by a dictionary, as categories of pandas are."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
     return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 

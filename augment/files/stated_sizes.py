@@ -186,9 +186,12 @@ def _chunk_size(path: str, leaf: Any, num_stated: int, pages: Sequence[_Page]) -
 
 
 def _read_pages(file: pa.NativeFile, chunk: Any, max_pages: int) -> list[_Page]:
-    start = chunk.data_page_offset
+    if chunk.num_values == 0:  # Arrow reads none of its pages, and writes no place of any
+        return []
+    offsets = [chunk.data_page_offset]
     if chunk.has_dictionary_page and chunk.dictionary_page_offset:
-        start = min(start, chunk.dictionary_page_offset)
+        offsets.append(chunk.dictionary_page_offset)
+    start = min(offsets)
     end = min(start + chunk.total_compressed_size, file.size())
     pages: list[_Page] = []
     while 0 <= start < end:

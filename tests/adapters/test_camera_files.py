@@ -164,6 +164,23 @@ def test_damaged_colmap_models(tmp_path: Path) -> None:
         read_views(tmp_path / "b")
 
 
+COLMAP_CAMERAS = [
+    ("1 EQUIRECTANGULAR 640 480 320 240\n", "model EQUIRECTANGULAR, which has no focal length"),
+    ("1 PINHOLE 9999999 480 500 510 321 242\n", r"1 to 65536 pixels wide and high; got \(9999999"),
+    ("1 PINHOLE 640 480 1e300 510 321 242\n", "must be finite, at most 1e"),
+    ("1 PINHOLE 640 480 -500 510 321 242\n", "focal lengths above 0"),
+]
+
+
+def test_colmap_cameras_that_are_no_pinhole_cameras_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    model = write_colmap(tmp_path / "a", "1 PINHOLE 640 480 500 510 321 242\n", ["1.jpg"])
+    for text, message in COLMAP_CAMERAS:
+        (model / "cameras.txt").write_text(text)
+        with pytest.raises(AdapterError, match=message):
+            read_views(model)
+
+
 @pytest.mark.parametrize("form", ["binary", "text"])
 def test_colmap_models_that_are_cut_short_are_named_by_table_and_entry(
     form: str, tmp_path: Path

@@ -450,6 +450,10 @@ def test_contradictions_are_refused_by_file_and_column(copy: Path) -> None:
         with pytest.raises(AdapterError, match=rf"{tag}.*cannot be read as Parquet"):
             read(copy)
         path.write_bytes(content)
+    words = pa.array(files.CAMERA_NAMES).dictionary_encode()
+    changed(
+        copy, "camera_calibration", _set("key.camera_name", words.to_pylist(), words.type), Form()
+    )
     read(copy)
 
 

@@ -329,3 +329,8 @@ def test_a_damaged_note_in_the_manifest(tmp_path: Path) -> None:
         rows = rows.replace_schema_metadata({b"climategs.parts": note})
         store.write("manifest.parquet", manifest_bytes(rows))
         assert frames_of(store) == {0: (True, "")} and parts_to_merge(store) == 1
+
+
+def test_a_manifest_without_rows_is_one() -> None:
+    """As an output has it whose only variant is being overwritten."""
+    assert parse_manifest(manifest_bytes(rows_to_table([])), "manifest").num_rows == 0

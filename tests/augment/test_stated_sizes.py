@@ -68,6 +68,14 @@ TABLES: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
+def test_tables_without_rows_are_read() -> None:
+    """They may have a dictionary and no page of data."""
+    empty = pa.table({"a": pa.array([], pa.string()), "b": pa.array([], pa.int64())})
+    sink = io.BytesIO()
+    pq.write_table(empty, sink, compression="zstd")
+    assert read_table(sink.getvalue(), "x.parquet").num_rows == 0
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_of_too_many_values_are_refused_without_the_memory(name: str) -> None:
     write, message = TABLES[name]

@@ -36,7 +36,7 @@ from augment.jobs.store import open_store
 from augment.timing import PassProgress, counted
 from augment.views import render_view
 from recipes.errors import RecipeError
-from recipes.fields import found
+from recipes.fields import found, replaced
 from recipes.load import load_recipe, preset_names
 from recipes.recipe_file import recipe_file
 from recipes.schema import SECTIONS
@@ -53,7 +53,14 @@ from tools.view.controls import (
 from tools.view.edits import Edits, free_path, save_recipe, start_of_section, without_weather
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import Wish
-from tools.view.pictures import away_sentence, free_camera, place_in_window
+from tools.view.pictures import (
+    PICTURE,
+    away_sentence,
+    draw,
+    free_camera,
+    place_in_window,
+    recipe_to_show,
+)
 from tools.view.server import Viewer, import_viser, serve
 from tools.view.status import Activity, ShownPicture, page_status
 
@@ -194,6 +201,17 @@ def test_at_rest_is_said_of_the_whole_picture_of_the_wish_alone():
     assert said(at_rest, wish, Activity(), has_failed=True) == "Not drawn"
     status = page_status(at_rest, snowy, placing, waited_s=4.2, now=9.0)
     assert status.share == pytest.approx(12 / 21) and status.is_long and not status.is_current
+
+
+def test_what_is_drawn_at_rest_has_the_bits_of_a_rendered_image_whatever_else_is_written():
+    scene = open_street()
+    camera = scene.frames[0].cameras["front"]
+    recipe = Edits("light-haze", SCALE).recipe()
+    for path, value in (("output.depth", "median"), ("output.semantic", True)):
+        recipe = replaced(recipe, path, value)
+        asked = recipe_to_show(recipe, PICTURE, with_depth=False, factor=1.0)
+        rgb = render_view(scene, camera, recipe).rgb
+        assert np.array_equal(draw(scene, camera, asked, PICTURE).rgb, rgb)
 
 
 def test_a_camera_away_from_all_recorded_images_is_told():

@@ -135,17 +135,20 @@ def what_can_be_shown() -> tuple[str, ...]:
 
 
 def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: float) -> Recipe:
-    """The recipe with what is shown in its output, at `factor` times its resolution; the picture
-    has the same bits, at factor 1.
+    """The recipe with what is shown in its output, at `factor` times its resolution.
+
+    Its own outputs stay: a picture that is drawn together with other buffers can differ from one
+    drawn alone by the last bit, and at factor 1 the bits are those that `climategs render` writes.
+    Of the trust mask no picture depends.
     """
     output = recipe.output
     depth = output.depth if output.depth != "none" else "median"
     output = output.model_copy(
         update={
-            "depth": depth if with_depth or shows == DEPTH else "none",
-            "semantic": shows == CLASSES,
-            "instance": shows == INSTANCES,
-            "labels": shows == INSTANCES,
+            "depth": depth if with_depth or shows == DEPTH else output.depth,
+            "semantic": output.semantic or shows == CLASSES,
+            "instance": output.instance or shows == INSTANCES,
+            "labels": output.labels or shows == INSTANCES,
             "trust": shows == f"mask of {TRUST}",
         }
     )
@@ -153,10 +156,13 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
     return replaced(recipe, "render.scale", recipe.render.scale * factor)
 
 
-def coarse(recipe: Recipe) -> Recipe:
-    """The recipe with the shortcuts of the rasteriser that a moving picture hides; none that has
-    anything prepared anew.
+def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
+    """The recipe with the shortcuts of the rasteriser that a moving picture hides, and without what
+    nobody looks at; none that has anything prepared anew.
     """
+    if shows == PICTURE and not with_depth:
+        alone = {"depth": "none", "semantic": False, "instance": False, "labels": False}
+        recipe = recipe.model_copy(update={"output": recipe.output.model_copy(update=alone)})
     for name, value in MOVING.items():
         value = max(value, getattr(recipe.render, name))
         recipe = replaced(recipe, f"render.{name}", value)

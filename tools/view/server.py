@@ -437,8 +437,10 @@ class Viewer:
 
         def drawn(recipe: Recipe) -> Shown:
             asked = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
-            asked = coarse(asked) if moving else asked
-            return draw(self.scene, camera, asked, wish.shows, backend=self.backend)
+            if moving:
+                asked = coarse(asked, wish.shows, with_depth=wish.needs_depth)
+            shown = draw(self.scene, camera, asked, wish.shows, backend=self.backend)
+            return shown if wish.needs_depth else replace(shown, depth_m=None)
 
         with watched(tell), contextlib.nullcontext({}) if moving else stopwatch() as seconds:
             shown = drawn(recipe)
