@@ -6,7 +6,7 @@ but promise nothing between versions.
 
 from importlib import import_module
 
-__version__ = "0.5.0"
+__version__ = "0.6.0"
 
 _PUBLIC = {
     "augment.views": ("WeatheredView", "render_buffers", "render_view", "render_views"),

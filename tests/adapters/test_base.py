@@ -23,7 +23,7 @@ from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
 from adapters.pandaset import PandaSetLabels
-from adapters.plain_files import inside, read_image_size, read_json, read_numbers, read_pose
+from adapters.plain_files import check_image, inside, read_json, read_numbers, read_pose
 from adapters.recording.adapter import read_sweep
 from adapters.safe_pickle import read_array, read_frame
 from adapters.scene_folder import storable
@@ -642,4 +642,4 @@ def test_pipes_inside_datasets_are_faults_of_theirs(tmp_path, ends_soon):
             read(path)
     picture = tmp_path / "pipe.png"
     assert read_image(picture, 1.0) is None
-    assert read_image_size(picture) == "cannot be read (a pipe or device, not a regular file)"
+    assert check_image(picture) == "cannot be read (a pipe or device, not a regular file)"
