@@ -329,10 +329,13 @@ class _File:
 
         scales = column("SCALE", "VEC3")
         is_log = bool((scales < 0).any())
+        if is_log:
+            with np.errstate(over="ignore"):  # infinite ones are left out, and reported
+                scales = np.exp(scales)
         return _Columns(
             means=column("POSITION", "VEC3"),
             quats=np.ascontiguousarray(column("ROTATION", "VEC4")[:, [3, 0, 1, 2]]),
-            scales=np.exp(scales) if is_log else scales,
+            scales=scales,
             opacities=column("OPACITY", "SCALAR")[:, 0],
             sh=np.stack([column(name, "VEC3") for name in names], axis=1),
             is_log=is_log,

@@ -139,6 +139,11 @@ def test_negative_scales_are_an_earlier_drafts_logarithms(tmp_path: Path) -> Non
     read = read_gltf(saved(tmp_path, document(logs)))
     assert read.gaussians.scales[0].tolist() == pytest.approx([0.5, 1, 2])
     assert "earlier draft" in read.problems[0]
+    for beyond in (1e4, np.inf):
+        columns = {name: np.repeat(values, 2, axis=0) for name, values in logs.items()}
+        columns["SCALE"][1] = beyond
+        read = read_gltf(saved(tmp_path, document(columns)))
+        assert len(read.gaussians) == 1 and "left out 1 of 2" in " ".join(read.problems)
 
 
 def test_nodes_place_turn_and_stretch(tmp_path: Path) -> None:
