@@ -226,7 +226,10 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
     for kept in (PARTS, VARIANTS, QUALITY):
         remove_temporaries(store.local_dir / kept)
     for path in store.list(CLAIMS_FOLDER):
-        claim = try_claim(store, path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock"))
+        name = path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock")
+        if folder_name(name) != name:  # not a claim's file: somebody else has put it there
+            continue
+        claim = try_claim(store, name)
         if claim is not None:
             claim.release()
 

@@ -30,7 +30,7 @@ from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, Workers, plan_job, run_generate
-from augment.jobs.layout import folder_name
+from augment.jobs.layout import STATE_FOLDER, folder_name
 from augment.jobs.manifest import list_parts, read_finished, read_manifest
 from augment.jobs.processes import available_cores
 from augment.jobs.render_job import RenderJob, run_job
@@ -102,6 +102,16 @@ def test_a_finished_job_renders_nothing_and_touches_nothing(finished: Path) -> N
     result = run(small_job(finished, renderer=must_not_render))
     assert (result.written, result.skipped, result.failed) == (0, 12, 0)
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()} == before
+
+
+def test_files_of_others_among_the_claims_stay(finished: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(finished, tmp_path / "out"))
+    foreign = out / STATE_FOLDER / "claims/notes.lock/x"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("not a claim")
+    result = run(small_job(out))
+    assert (result.written, result.skipped) == (0, 12)
+    assert foreign.read_text() == "not a claim"
 
 
 def test_any_file_that_was_deleted_is_made_again(finished, whole, tmp_path: Path) -> None:
