@@ -157,6 +157,7 @@ def estimate_boxes(
     *,
     on_photo: bool,
     own_car: Bool[np.ndarray, "H W"] | None = None,
+    buried_m: Float64[np.ndarray, " B"] | None = None,
 ) -> dict[int, Estimate]:
     """Return estimates of those boxes that depth does not resolve, by their places.
 
@@ -169,7 +170,9 @@ def estimate_boxes(
         evidence: reads the frame's evidence; called only where a box needs it.
         on_photo: the picture is a recorded one, which shows also what has no splats.
         own_car: pixels of the recording car, which hide what is behind them.
+        buried_m: height of the lowest part of each box that snow on the ground hides; None: 0.
     """
+    buried_m = np.zeros(len(placed)) if buried_m is None else buried_m
     areas = (outlines.xyxy[:, 2:] - outlines.xyxy[:, :2]).prod(axis=1)
     doubtful = (occlusion.shown < MIN_SHOWN * areas) & (areas >= MIN_OUTLINE_PX)
     numbers = np.flatnonzero(doubtful & outlines.in_view)
@@ -177,7 +180,7 @@ def estimate_boxes(
     estimates: dict[int, Estimate] = {}
     if known is None:
         return estimates
-    view = _BoxesInView(placed, camera, outlines, known.returns, own_car)
+    view = _BoxesInView(placed, camera, outlines, known.returns, own_car, buried_m)
     for number in numbers.tolist():
         estimate = view.estimate(number)
         if estimate is None or occlusion.shown[number] >= MIN_SHOWN * len(estimate.rows):
@@ -196,6 +199,7 @@ class _BoxesInView:
     outlines: Outlines
     returns: SortedPoints
     own_car: Bool[np.ndarray, "H W"] | None
+    buried_m: Float64[np.ndarray, " B"]
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
@@ -285,7 +289,7 @@ class _BoxesInView:
 
     def _spans(self, number: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depths [P] at which the rays of pixels [P, 2] enter a labelled box and leave it; enter is
-        the larger of rays that pass it.
+        the larger of rays that pass it. The buried part of the box does not count.
         """
         camera, rotation = self.camera, self.placed.rotations[number]
         world_from_camera = camera.world_from_camera.numpy()
@@ -294,9 +298,11 @@ class _BoxesInView:
         rays = rays @ world_from_camera[:3, :3].T @ rotation
         rays = np.where(rays == 0, 1e-300, rays)
         eye = (world_from_camera[:3, 3] - self.placed.centres_m[number]) @ rotation
-        half = self.placed.sizes_m[number] / 2
+        high = self.placed.sizes_m[number] / 2
+        low = -high
+        low[2] = min(low[2] + self.buried_m[number], high[2])
         with np.errstate(over="ignore"):  # of a ray along a side
-            a, b = (-half - eye) / rays, (half - eye) / rays
+            a, b = (low - eye) / rays, (high - eye) / rays
         enter, leave = np.minimum(a, b), np.maximum(a, b)
         near = np.maximum(np.maximum(enter[:, 0], enter[:, 1]), enter[:, 2])
         return np.maximum(near, NEAR_M), np.minimum(

@@ -195,8 +195,9 @@ def show_boxes(
     surface, outlines = _with_own_car(view.surface), outline_placed(placed, camera)
     numbers = instances.of(boxes.track_ids)
     actors = np.where(numbers <= len(instances.actors), numbers, 0)
+    grown = _grown(placed, view)
     occlusion = find_occlusion(
-        _grown(placed, view), camera, surface.depth_m, surface.actors, actors,
+        grown, camera, surface.depth_m, surface.actors, actors,
         classes=surface.classes, with_owners=masks,
     )  # fmt: skip
     estimates: Mapping[int, Estimate] = {}
@@ -204,6 +205,7 @@ def show_boxes(
         estimates = estimate_boxes(
             placed, boxes.track_ids, camera, outlines, occlusion, evidence,
             on_photo=on_photo, own_car=surface.own_car,
+            buried_m=np.maximum(grown.low_m[:, 2] - placed.low_m[:, 2], 0),
         )  # fmt: skip
     return BoxesShown(outlines, occlusion, estimates)
 

@@ -10,8 +10,8 @@ import pytest
 from batch_scenes import ORIGIN_M
 from box_views import UPRIGHT, make_boxes, make_camera
 
-from augment.box_estimates import Evidence, SortedPoints
-from augment.boxes import Instances, PlacedBoxes, outline_placed
+from augment.box_estimates import Evidence, SortedPoints, estimate_boxes
+from augment.boxes import Instances, PlacedBoxes, find_occlusion, outline_placed
 from augment.cameras import Camera
 from augment.jobs.box_tables import BOXES_2D, BoxNumbers
 from augment.jobs.files import BoxWeather, label_view
@@ -141,6 +141,22 @@ def test_nearer_boxes_and_returns_before_it_hide_an_estimated_object() -> None:
 def test_a_rendered_picture_shows_only_what_has_splats(splats: list, is_drawn: bool) -> None:
     _, flat, _ = label(100.0, ON_CAR, base="splats", splats=splats)
     assert flat["is_estimated"].tolist() == [is_drawn]
+
+
+def test_what_snow_buries_of_an_object_is_not_estimated() -> None:
+    placed = PlacedBoxes.of(make_boxes(CAR), ORIGIN_M)
+    depth_m = np.full((CAMERA.height, CAMERA.width), 100, np.float32)
+    evidence = Evidence(SortedPoints.of(np.array(ON_CAR)), NO_POINTS, frozenset())
+    bottoms = []
+    for buried_m in (0.0, 0.4):
+        estimates = estimate_boxes(
+            placed, ("car",), CAMERA, outline_placed(placed, CAMERA),
+            find_occlusion(placed, CAMERA, depth_m), lambda: evidence,
+            on_photo=True, buried_m=np.array([buried_m]),
+        )  # fmt: skip
+        bottoms.append(estimates[0].xyxy[3])
+    # 0.4 m at 28 m, seen through 600 pixels of focal length
+    assert bottoms[0] - bottoms[1] == pytest.approx(0.4 * 600 / 28, abs=1)
 
 
 def test_tables_without_the_column_are_read_as_of_depth_alone(tmp_path: Path) -> None:
