@@ -1,7 +1,7 @@
-"""What an effect's recipe model says of itself.
+"""Base classes of a recipe's sections, and how an effect declares its knobs and manifest columns.
 
-All else of recipes, manifests and reports walks the models (`recipes.schema.SECTIONS`) and knows no
-effect by name.
+Recipes, manifests and reports walk the models in `recipes.schema.SECTIONS`; they know no effect by
+name.
 """
 
 from __future__ import annotations
@@ -76,16 +76,16 @@ class Column:
         return self.name if self.over is None else f"{self.over} / {self.name}"
 
     def of(self, section: Closed | None) -> float | str | None:
-        """Its value in a row."""
+        """Return the column's value in a manifest row."""
         value: Any = self.absent if section is None else self.value(section)
         return math.nan if value is None and self.is_number else value
 
     def shown(self, numbers: Any) -> Any:
-        """The manifest's numbers, or an array of them, in `unit`."""
+        """Return a manifest number, or an array of them, in `unit`."""
         return self.factor * numbers if self.over is None else self.over / numbers
 
     def is_present(self, numbers: Any) -> Any:
-        """Whether the number, or each of an array of them, says that the effect is there."""
+        """Return True where a manifest number says that the effect is present; also for arrays."""
         return (numbers == numbers) & ((numbers != 0) | (self.shows == "all"))
 
 
@@ -113,17 +113,18 @@ class EffectModel(Section):
 
     @property
     def changes(self) -> bool:
-        """Whether it changes anything."""
+        """True if the effect changes anything with these settings."""
         return True
 
     @property
     def files(self) -> dict[str, str]:
-        """The files that it names, by field."""
-        named = {name: getattr(self, name) for name in self.file_fields}
-        return {name: path for name, path in named.items() if path is not None}
+        """Paths of the files that the section names, by field."""
+        paths = {name: getattr(self, name) for name in self.file_fields}
+        return {name: path for name, path in paths.items() if path is not None}
 
     def surface(self, shown: str) -> tuple[str, bool] | None:
-        """What of it a LiDAR beam can end on, and whether depth images show that. shown: the
-        recipe's output.surface.
+        """Return the surface on which a LiDAR beam can end, and whether depth images show it.
+
+        None if the effect has no such surface. shown: the recipe's output.surface.
         """
         return None

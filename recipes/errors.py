@@ -29,7 +29,7 @@ class RecipeError(Exception):
 
 @dataclass(frozen=True)
 class Place:
-    """Where something was written.
+    """Source, line and folder of a piece of text, for messages.
 
     source: a file, a preset or an option of the command line. line: counted from 1; None where
     there are no lines. folder: where the files lie that are named there; None: none can be.
@@ -51,13 +51,13 @@ class Problems:
     """Collects what is wrong, so that all of it is reported at once."""
 
     def __init__(self) -> None:
-        self._found: list[tuple[Place, str]] = []
+        self._entries: list[tuple[Place, str]] = []
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._entries)
 
     def add(self, place: Place, text: str) -> None:
-        self._found.append((place, text))
+        self._entries.append((place, text))
 
     def raise_if_any(self) -> None:
         """Raise every problem so far, in the order of the lines of each source.
@@ -65,9 +65,9 @@ class Problems:
         Raises:
             RecipeError: there is at least one.
         """
-        sources = list(dict.fromkeys(place.source for place, _ in self._found))
+        sources = list(dict.fromkeys(place.source for place, _ in self._entries))
         ordered = sorted(
-            self._found, key=lambda found: (sources.index(found[0].source), found[0].line or 0)
+            self._entries, key=lambda entry: (sources.index(entry[0].source), entry[0].line or 0)
         )
         lines = [f"{place}: {text}" for place, text in ordered]
         if len(lines) > MAX_SHOWN:
@@ -78,8 +78,8 @@ class Problems:
 
 def nearest_word(word: str, words: Iterable[str]) -> str | None:
     """The option that is most like `word`, if any is."""
-    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
-    return close[0] if close else None
+    matches = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
+    return matches[0] if matches else None
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
@@ -109,7 +109,8 @@ def readable(error: ValidationError) -> list[str]:
     """pydantic's problems, one line each: the field, then what is wrong."""
     lines = []
     for item in error.errors(include_url=False):
-        path, cause = dotted(item["loc"]), item.get("ctx", {}).get("error")
+        path = dotted(item["loc"])
+        cause = item.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ValueError) else item["msg"]
         lines.append(f"{path}: {text}" if path else text)
     return lines

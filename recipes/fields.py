@@ -1,5 +1,5 @@
-"""What recipe models are made of: types of fields, models that refuse unknown keys, and how fields
-are found and changed by dotted paths.
+"""Parts of recipe models: types of fields, models that refuse unknown keys, and functions that read
+and change fields by dotted path.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class OneOf:
     names: Callable[[], tuple[str, ...]]
 
     def refusal(self, name: str) -> str:
-        """What to say of a name that is none of them."""
+        """Return the message for a name that is not among `names`."""
         names = self.names()
         guess = did_you_mean(name, names)
         return f"no such {self.noun}; {guess}{self.noun}s are {', '.join(names)}"
@@ -106,7 +106,7 @@ def found(model: BaseModel, path: str) -> Any:
 
 
 def is_given(model: BaseModel, path: str) -> bool:
-    """Whether the field was set when the model was made, and does not just have its default."""
+    """Return True if the field was set when the model was made; False for a mere default."""
     value: Any = model
     for name in path.split("."):
         if value is None or name not in value.model_fields_set:
@@ -117,12 +117,12 @@ def is_given(model: BaseModel, path: str) -> bool:
 
 def replaced(model: Model, path: str, value: object) -> Model:
     """A copy with one field set, unchecked, and given; KeyError where a section is absent."""
-    name, _, rest = path.partition(".")
-    if rest:
+    name, _, inner_path = path.partition(".")
+    if inner_path:
         section = getattr(model, name)
         if section is None:
             raise KeyError(f"{name} is absent, so {path} cannot be set")
-        value = replaced(section, rest, value)
+        value = replaced(section, inner_path, value)
     return model.model_copy(update={name: value})
 
 

@@ -34,17 +34,17 @@ def with_digest(recipe: Recipe) -> Recipe:
             continue
         try:
             hashes = {name: _hash(section, name) for name in section.files}
-            recipe = replaced(recipe, f"{path}.digest", _checked(section, hashes))
+            recipe = replaced(recipe, f"{path}.digest", _checked_digest(section, hashes))
         except ValueError as error:
             raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
     return recipe
 
 
 def read_files(section: EffectModel) -> dict[str, bytes]:
-    """What the section's files hold, by field: that of which it has the digest, where it has one.
+    """Return the contents of the section's files by field, checked against its digest if any.
 
     Raises:
-        RecipeError: a file is missing, unreadable or too large, or they have changed.
+        RecipeError: a file is missing, unreadable or too large, or the files have changed.
     """
     contents = {}
     try:
@@ -52,7 +52,7 @@ def read_files(section: EffectModel) -> dict[str, bytes]:
             with _open(section, name) as file:
                 contents[name] = file.read()
         hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
-        _checked(section, hashes)
+        _checked_digest(section, hashes)
     except (ValueError, OSError) as error:
         raise RecipeError(str(error)) from None
     return contents
@@ -93,7 +93,7 @@ def file_below(folder: Path, written: str) -> Path:
     try:
         _open_checked(path).close()
     except FileNotFoundError:
-        near = _near(path)
+        near = _nearest_name(path)
         hint = f"did you mean {near}?" if near else "put the file beside the recipe or below it"
         raise ValueError(f"there is no such file in {where}; {hint}") from None
     return path
@@ -133,7 +133,7 @@ def _open_checked(path: str | Path) -> BufferedReader:
     return file
 
 
-def _shown(section: EffectModel, name: str) -> str:
+def _field_in_words(section: EffectModel, name: str) -> str:
     """A field by its dotted path, and what it says."""
     path = next(path for path, model in SECTIONS.items() if model is type(section))
     return f"{path}.{name} = {getattr(section, name)!r}"
@@ -143,9 +143,9 @@ def _open(section: EffectModel, name: str) -> BufferedReader:
     try:
         return _open_checked(section.files[name])
     except FileNotFoundError:
-        raise ValueError(f"{_shown(section, name)}: there is no such file") from None
+        raise ValueError(f"{_field_in_words(section, name)}: there is no such file") from None
     except ValueError as error:
-        raise ValueError(f"{_shown(section, name)}: {error}") from None
+        raise ValueError(f"{_field_in_words(section, name)}: {error}") from None
 
 
 def _hash(section: EffectModel, name: str) -> str:
@@ -153,24 +153,24 @@ def _hash(section: EffectModel, name: str) -> str:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            raise ValueError(f"{_shown(section, name)}: cannot be read: {error}") from None
+            raise ValueError(f"{_field_in_words(section, name)}: cannot be read: {error}") from None
 
 
-def _checked(section: EffectModel, hashes: Mapping[str, str]) -> str:
+def _checked_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
-    given: str | None = found(section, "digest")
-    if given not in (None, digest):
+    recipe_digest: str | None = found(section, "digest")
+    if recipe_digest not in (None, digest):
         paths = ", ".join(section.files.values())
         which = "the file has" if len(hashes) == 1 else "one of the files has"
         raise ValueError(
-            f"{_shown(section, 'digest')}: {which} changed since: {paths} now "
+            f"{_field_in_words(section, 'digest')}: {which} changed since: {paths} now "
             f"gives {digest}; bring back what was there, or remove the digest to take what is"
         )
     return digest
 
 
-def _near(path: Path) -> str | None:
-    """What of the folder may have been meant."""
+def _nearest_name(path: Path) -> str | None:
+    """Return the name in the folder that is most like the file's; None without one."""
     try:
         with os.scandir(path.parent) as entries:
             names = [entry.name for entry, _ in zip(entries, range(MAX_NAMES), strict=False)]
