@@ -1,4 +1,4 @@
-"""What a recipe may say of a flood."""
+"""The recipe section of a flood: its fields, knobs and manifest columns."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Waves(Closed):
 
     @property
     def is_drawn(self) -> bool:
-        """Whether waves are drawn from a spectrum."""
+        """True if waves are drawn from a spectrum."""
         return self.components is None and self.preset != "still" and self.height > 0
 
 
@@ -111,7 +111,7 @@ class Flood(EffectModel):
             (6, 12, 24),
             "waves that make up the surface",
             7,
-            works=lambda it: it.waves.is_drawn,
+            works=lambda flood: flood.waves.is_drawn,
         ),
         Knob("bed_cut", (0.03, 0.006, 0.001), "bed that hardly shows through water", 6),
         Knob(
@@ -126,7 +126,7 @@ class Flood(EffectModel):
     columns = (
         Column(
             "flood_level_m",
-            lambda it: it.level_m,
+            lambda flood: flood.level_m,
             "Water level",
             "m",
             shows="all",  # at a level of 0 too
@@ -137,14 +137,14 @@ class Flood(EffectModel):
         # NaN where the recipe gives an absorption.
         Column(
             "flood_turbidity_ntu",
-            lambda it: it.effective_turbidity_ntu,
+            lambda flood: flood.effective_turbidity_ntu,
             "Turbidity of water",
             "NTU",
         ),
         # A factor on a preset's waves, NaN where waves are listed.
         Column(
             "flood_wave_height",
-            lambda it: it.waves.height if it.waves.components is None else None,
+            lambda flood: flood.waves.height if flood.waves.components is None else None,
             "Wave height, × preset",
         ),
     )
@@ -200,7 +200,10 @@ class Flood(EffectModel):
 
     @property
     def extinction_per_m_rgb(self) -> tuple[float, float, float]:
-        """Along the way through the water: given, or pure water and grey particles."""
+        """Extinction of red, green and blue light in the water, 1/metre.
+
+        The recipe's, or that of pure water and grey particles.
+        """
         if self.absorption_per_m is not None:
             return self.absorption_per_m
         assert self.effective_turbidity_ntu is not None

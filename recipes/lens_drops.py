@@ -1,4 +1,4 @@
-"""What a recipe may say of drops of water on the glass before a camera's lens."""
+"""The recipe section of water drops on the glass before a camera's lens."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LensDrops(EffectModel):
     columns = (
         Column(
             "lens_drops_count",
-            lambda it: it.count,
+            lambda drops: drops.count,
             "Drops on the lens",
             absent=0.0,
             shows="nonzero",

@@ -1,4 +1,4 @@
-"""What a recipe may say of rain."""
+"""The recipe section of rain: its fields, knobs and manifest columns."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from recipes.fields import Angle, Colour, Flag, Number, Unit
 
 MAX_RATE_MM_H = 300.0  # the hour's record of most cities is below
 MAX_WIND_MPS = 60.0
-# By itself ground gets wet through as 1 - exp(-rate / this), and puddles come to stand on a share
-# of it that grows about as the square root of the rate.
+# Wetness of the ground grows with the rain's rate as 1 - exp(-rate / WET_THROUGH_MM_H), mm/h.
 WET_THROUGH_MM_H = 1.5
-PUDDLES_AT_1_MM_H, PUDDLES_POWER, MOST_PUDDLES = 0.03, 0.55, 0.35
+# Share of the open ground on which water stands at 1 mm/h, 0 to 1.
+PUDDLES_AT_1_MM_H = 0.03
+# Power of the rate with which that share grows, about a square root; no unit.
+PUDDLES_POWER = 0.55
+# Largest share that follows from a rate, 0 to 1.
+MOST_PUDDLES = 0.35
 
 
 class Rain(EffectModel):
@@ -41,13 +45,13 @@ class Rain(EffectModel):
             "resolution of what wet ground mirrors",
             6.5,
             tiers={"draft": 4.0},
-            works=lambda it: it.ground_wetness > 0,
+            works=lambda rain: rain.ground_wetness > 0,
         ),
     )
     columns = (
         Column(
             "rain_rate_mm_h",
-            lambda it: it.rate_mm_h,
+            lambda rain: rain.rate_mm_h,
             "Rain",
             "mm/h",
             absent=0.0,
@@ -58,7 +62,7 @@ class Rain(EffectModel):
         ),
         Column(
             "rain_wetness",
-            lambda it: it.ground_wetness,
+            lambda rain: rain.ground_wetness,
             "Wetness of the ground",
             absent=0.0,
             shows="nonzero",
@@ -98,14 +102,17 @@ class Rain(EffectModel):
 
     @property
     def ground_wetness(self) -> float:
-        """0 to 1, that of the rate where it is null."""
+        """Wetness of the ground, 0 to 1; follows from the rate where the recipe gives none."""
         if self.wetness is not None:
             return self.wetness
         return -math.expm1(-self.rate_mm_h / WET_THROUGH_MM_H)
 
     @property
     def puddle_share(self) -> float:
-        """0 to 1, that of the rate where it is null."""
+        """Share of the open ground on which water stands, 0 to 1.
+
+        Follows from the rate where the recipe gives none.
+        """
         if self.puddles is not None:
             return self.puddles
         return min(MOST_PUDDLES, PUDDLES_AT_1_MM_H * self.rate_mm_h**PUDDLES_POWER)

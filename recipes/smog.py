@@ -1,4 +1,4 @@
-"""What a recipe may say of smog."""
+"""The recipe section of smog: its fields, knobs and manifest columns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Smog(EffectModel):
     columns = (
         Column(
             "smog_extinction_per_m",
-            lambda it: it.sigma_per_m,
+            lambda smog: smog.sigma_per_m,
             "Visibility in smog",
             "m",
             absent=0.0,
@@ -40,7 +40,9 @@ class Smog(EffectModel):
             label="visibility",
             caption="visibility {smog_extinction_per_m:.0f} m",
         ),
-        Column("smog_scale_height_m", lambda it: it.scale_height_m, "Scale height of smog", "m"),
+        Column(
+            "smog_scale_height_m", lambda smog: smog.scale_height_m, "Scale height of smog", "m"
+        ),
     )
 
     visibility_m: Number | None = Field(default=None, gt=0, le=1e6)

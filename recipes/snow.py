@@ -1,4 +1,4 @@
-"""What a recipe may say of snow that lies on the ground."""
+"""The recipe section of snow that lies on the ground."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Snow(EffectModel):
     columns = (
         Column(
             "snow_depth_m",
-            lambda it: it.depth_m,
+            lambda snow: snow.depth_m,
             "Snow depth",
             "cm",
             shows="nonzero",
@@ -64,7 +64,11 @@ class Snow(EffectModel):
             caption="snow {snow_depth_m:.3g} cm",
         ),
         Column(
-            "snow_coverage", lambda it: it.coverage, "Snow coverage", shows="nonzero", linear=True
+            "snow_coverage",
+            lambda snow: snow.coverage,
+            "Snow coverage",
+            shows="nonzero",
+            linear=True,
         ),
     )
 

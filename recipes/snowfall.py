@@ -1,4 +1,4 @@
-"""What a recipe may say of falling snow."""
+"""The recipe section of falling snow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Snowfall(EffectModel):
     columns = (
         Column(
             "snowfall_rate_mm_h",
-            lambda it: it.rate_mm_h,
+            lambda snowfall: snowfall.rate_mm_h,
             "Snowfall",
             "mm/h",
             absent=0.0,

@@ -1,4 +1,4 @@
-"""What a recipe may say of style: the colour mood of a photograph, or of a preset.
+"""The recipe section of style: the colour mood of a photograph, or of a preset.
 
 The presets come with the package: statistics of colours, in YAML, and no picture.
 """
@@ -16,7 +16,7 @@ from recipes.fields import Digest, FilePath, Flag, Number, OneOf, one_of, packag
 
 
 def style_preset_names() -> tuple[str, ...]:
-    """Their names, in alphabetical order."""
+    """Return the names of the style presets, in alphabetical order."""
     return packaged("styles")
 
 
@@ -57,22 +57,22 @@ class Style(EffectModel):
             ("sh", "color"),
             "map folded into the scene or put on each colour",
             9,
-            works=lambda it: it.applied_to == "scene",
+            works=lambda style: style.applied_to == "scene",
         ),
     )
     columns = (
         Column(
             "style",
-            lambda it: it.name,
+            lambda style: style.name,
             "Style",
             absent=None,
             label="style",
             caption="{style} x {style_strength:.2g}",
         ),
-        Column("style_method", lambda it: it.method, absent=None),
+        Column("style_method", lambda style: style.method, absent=None),
         Column(
             "style_strength",
-            lambda it: it.strength,
+            lambda style: style.strength,
             "Strength of style",
             absent=0.0,
             shows="nonzero",
@@ -131,5 +131,5 @@ class Style(EffectModel):
 
     @property
     def name(self) -> str:
-        """Of the preset, or of the image's file without its folders."""
+        """Name of the preset, or of the image's file without its folders."""
         return self.preset or PurePath(self.image or "").name
