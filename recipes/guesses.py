@@ -1,4 +1,4 @@
-"""How messages show what was written in a recipe, and what they guess was meant."""
+"""Parts of messages about a recipe: a value as it was written, and a guess of what was meant."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def show(node: Node) -> str:
 
 
 def guess_value(node: Node, leaf: Leaf) -> str:
-    """What was probably meant by a refused value, as the end of a message; '' without a guess."""
+    """Return a guess at the intended value, as the end of a message; '' without a guess."""
     if isinstance(node, ListNode) and leaf.is_number and leaf.rangeable and len(node) == 2:
         return f"; a range is written {{uniform: {show(node)}}}"
     if isinstance(node, ScalarNode) and (guess := _guess_switch(node, leaf)):
@@ -63,14 +63,14 @@ def guess_value(node: Node, leaf: Leaf) -> str:
 
 
 def _switch(node: ScalarNode) -> bool | None:
-    """What a value says as a switch; None where it is none."""
+    """Return True for a word that means on, False for off or null; None for any other."""
     if node.value is None:
         return False
     return _SWITCHES.get(node.text.strip().lower())
 
 
 def _guess_switch(node: ScalarNode, leaf: Leaf) -> str:
-    """What turns a field on or off, where the refused value is a word for that."""
+    """Return the hint for a refused word such as `on` or `off`; '' without one."""
     is_on = _switch(node)
     is_number = isinstance(node.value, int | float) and not isinstance(node.value, bool)
     if is_on is None or (leaf.is_number and (is_on or is_number)):
@@ -89,7 +89,7 @@ def _guess_switch(node: ScalarNode, leaf: Leaf) -> str:
 
 
 def guess_section(node: Node, path: str) -> str:
-    """What was probably meant by a value in the place of a section. path: of the section."""
+    """Return the hint for a value in the place of the section `path`; '' without one."""
     if path not in SECTIONS or not isinstance(node, ScalarNode):
         return ""
     return "; write null to leave it out" if _switch(node) is False else ""
@@ -130,7 +130,7 @@ def why_no_range(node: MapNode, leaf: Leaf) -> str:
 
 
 def why_no_key(key: str, section: type[Section], root: type[Section]) -> str:
-    """Why `key` is refused in a section and which known one is nearest."""
+    """Return why a section refuses `key`, and the nearest field that it has."""
     if key in RANGE_KINDS:
         return "a range stands for one field, not for a whole section"
     nearest = _nearest_key(key, section, root)
@@ -154,26 +154,27 @@ def why_no_key(key: str, section: type[Section], root: type[Section]) -> str:
 
 
 def _nearest_key(key: str, section: type[Section], root: type[Section]) -> str | None:
-    known, low = tuple(section.model_fields), key.lower().replace("-", "_")
-    if low in known:
-        return low
-    bases = {_base(name): name for name in known}
-    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
-        return bases[_base(low)]
+    fields = tuple(section.model_fields)
+    name = key.lower().replace("-", "_")
+    if name in fields:
+        return name
+    bases = {_base(field): field for field in fields}
+    if _base(name) in bases:  # visibility_km, visibility: the unit is what was wrong
+        return bases[_base(name)]
     synonyms = _synonyms()
-    for meant in (synonyms.get(low), synonyms.get(_base(low))):
-        if meant in known:
-            return meant
-    if any(low in other.model_fields for other in root.walk()):
+    for field in (synonyms.get(name), synonyms.get(_base(name))):
+        if field in fields:
+            return field
+    if any(name in other.model_fields for other in root.walk()):
         return None  # spelt well, but in another place
-    near = nearest_word(_base(low), bases)
-    return nearest_word(low, known) or (bases[near] if near else None)
+    base = nearest_word(_base(name), bases)
+    return nearest_word(name, fields) or (bases[base] if base else None)
 
 
 def _synonyms() -> dict[str, str]:
-    """What a key may have been meant to be, where the section has it."""
-    meant = (pair for model in SECTIONS.values() for pair in model.meant_by)
-    return {word: key for key, words in meant for word in words.split()}
+    """Return the field that each synonym stands for, from the models' `meant_by`."""
+    pairs = (pair for model in SECTIONS.values() for pair in model.meant_by)
+    return {word: key for key, words in pairs for word in words.split()}
 
 
 def _base(name: str) -> str:

@@ -74,7 +74,7 @@ class JobRecipe(Closed):
 
 
 class Job(Closed):
-    """What a job file says."""
+    """A job file: its scenes, its recipes and how they are drawn."""
 
     version: Literal[1] = 1
     """Version of the format."""
@@ -94,16 +94,16 @@ class Job(Closed):
 
     @model_validator(mode="after")
     def _names_known_recipes(self) -> Job:
-        known = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
-        if repeated := _repeated(known):
+        names = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
+        if repeated := _repeated(names):
             raise ValueError(f"recipes are called the same: {repeated}; give one of them a name")
         for scene in self.scenes:
             for name in scene.recipes or ():
-                if name not in known:
-                    guess = did_you_mean(name, tuple(known))
+                if name not in names:
+                    guess = did_you_mean(name, tuple(names))
                     raise ValueError(
                         f"scene {scene.uri!r} names the recipe {name!r}, which the job has not; "
-                        f"{guess}it has {', '.join(known)}"
+                        f"{guess}it has {', '.join(names)}"
                     )
         return self
 
@@ -120,16 +120,16 @@ class JobRecipes:
     templates: dict[str, RecipeTemplate]
 
     def of_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
-        """The recipes in numbers that a scene is rendered under."""
-        resolved = []
+        """Return the recipes in numbers under which a scene is rendered."""
+        recipes = []
         for name in self.templates if entry.recipes is None else dict.fromkeys(entry.recipes):
             template = self.templates[name]
             if self.job.draws == "per_scene":
                 seed = seed_for_scene(template.seed, scene_name)
                 template = dataclasses.replace(template, seed=seed)
-            drawn = [template.resolve(number) for number in range(template.variants)]
-            resolved += [scaled_recipe(recipe, self.job.scale) for recipe in drawn]
-        return resolved
+            variants = [template.resolve(number) for number in range(template.variants)]
+            recipes += [scaled_recipe(recipe, self.job.scale) for recipe in variants]
+        return recipes
 
 
 def load_job(path: Path) -> Job:
@@ -138,7 +138,8 @@ def load_job(path: Path) -> Job:
     Raises:
         RecipeError: there is no such file, or it is no valid job; one line for each problem.
     """
-    missing, too_large = "no such file; a job is a YAML file", "name scenes by a pattern (*)"
+    missing = "no such file; a job is a YAML file"
+    too_large = "name scenes by a pattern (*)"
     text = read_text(path, MAX_BYTES, missing=missing, too_large=too_large)
     return parse_job(text, source=str(path), name=path.stem, folder=path.parent)
 
@@ -150,7 +151,8 @@ def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None 
     Raises:
         RecipeError: it is no valid job; one line for each problem.
     """
-    problems, place = Problems(), Place(source, folder=folder)
+    problems = Problems()
+    place = Place(source, folder=folder)
     empty = "the file is empty; a job names scenes and recipes"
     tree = read_tree(text, place, problems, empty=empty)
     if not isinstance(tree, MapNode):
@@ -220,7 +222,7 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
 
 
 def _place(tree: Node, location: tuple[int | str, ...]) -> Place:
-    """Of the location, or of the nearest thing above it that the file has."""
+    """Return the place of the location, or of the nearest node above it that the file has."""
     node: Any = tree
     for part in location:
         try:
@@ -243,8 +245,8 @@ _WORDS = {
 
 def _message(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
-        known = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
-        near = nearest_word(str(problem["loc"][-1]), known)
+        fields = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
+        near = nearest_word(str(problem["loc"][-1]), fields)
         return "unknown field" + (f"; did you mean {near}?" if near else "")
     if problem["type"] == "value_error":
         return problem["msg"].removeprefix("Value error, ")

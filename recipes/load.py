@@ -77,8 +77,9 @@ def parse_recipe(
 def read_overrides(
     texts: Iterable[str], option: str = "--set", folder: Path | None = None
 ) -> dict[str, Node]:
-    """Of a command line: `weather.smog.visibility_m=60`. Files are named from `folder`, or else the
-    working folder.
+    """Return the overrides of a command line, such as `weather.smog.visibility_m=60`.
+
+    Files are named from `folder`, or else the working folder.
 
     Raises:
         RecipeError: one is not PATH=VALUE, or its value is no YAML.
@@ -100,7 +101,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def describe_preset(name: str) -> str:
-    """What a preset is for: the first line of its comment."""
+    """Return the purpose of a preset: the first line of its comment."""
     return packaged_text("presets", name).partition("\n")[0].removeprefix("# ")
 
 
@@ -158,10 +159,10 @@ def _template(
         tree["name"] = ScalarNode(place, name, name)
         if not recipe_file().LEAVES["name"].accepts(name):
             problems.add(place, "the file's name cannot serve as the recipe's; add 'name: ...'")
-    given = read_file(_with_parents(tree, place, problems), problems)
+    fields = read_file(_with_parents(tree, place, problems), problems)
     problems.raise_if_any()
     top = {
-        key: given.pop(key).value if key in given else leaf.info.default
+        key: fields.pop(key).value if key in fields else leaf.info.default
         for key, leaf in recipe_file().LEAVES.items()
     }
     last = top["variant"] + top["variants"] - 1
@@ -174,7 +175,7 @@ def _template(
         seed=top["seed"],
         variants=top["variants"],
         first_variant=top["variant"],
-        given=given,
+        given=fields,
     )
     if template.variants > 1 and not template.describe_ranges():
         text = "%s: variants = %d, but no field has a range: all have the same numbers"
@@ -224,37 +225,39 @@ def _identity(place: Place) -> str:
 
 
 def _read_parent(parent: Node) -> tuple[str, Place]:
-    leaf, place = recipe_file().LEAVES["extends"], parent.place
-    written = parent.text if isinstance(parent, ScalarNode) else ""
-    if not leaf.accepts(written):
+    leaf = recipe_file().LEAVES["extends"]
+    place = parent.place
+    name = parent.text if isinstance(parent, ScalarNode) else ""
+    if not leaf.accepts(name):
         raise place.error(f"extends = {show(parent)}: must be {leaf.allowed()}")
     try:
-        if written in preset_names():
-            return _read(written)[:2]
+        if name in preset_names():
+            return _read(name)[:2]
         if place.folder is None:
             raise ValueError("no such preset, and this text is in no folder to look in")
-        file_below(place.folder, written)
-        return _read(place.folder / written)[:2]
+        file_below(place.folder, name)
+        return _read(place.folder / name)[:2]
     except ValueError as error:
-        guess = did_you_mean(written, preset_names())
+        guess = did_you_mean(name, preset_names())
         text = f"{error}; {guess}presets are {', '.join(preset_names())}"
         raise place.error(f"extends = {show(parent)}: {text}") from None
 
 
 def _merged(below: MapNode, above: MapNode, section: type[Section]) -> MapNode:
     """Fields of the mapping above replace those of the one below; sections merge."""
-    merged = dict(below)
+    entries = dict(below)
     for name, node in above.items():
-        inner, old = section.INNER.get(name), below.get(name)
-        if inner is not None and isinstance(old, MapNode) and isinstance(node, MapNode):
-            merged[name] = _merged(old, node, inner)
+        inner = section.INNER.get(name)
+        node_below = below.get(name)
+        if inner is not None and isinstance(node_below, MapNode) and isinstance(node, MapNode):
+            entries[name] = _merged(node_below, node, inner)
         else:
-            merged[name] = node
-    return MapNode(above.place, merged)
+            entries[name] = node
+    return MapNode(above.place, entries)
 
 
 def _override(path: str, value: object) -> MapNode:
-    """What a file would say that gives this field alone."""
+    """Return the tree of a file that gives this field alone."""
     if isinstance(value, Node):
         node = value
     else:
@@ -305,7 +308,8 @@ def dump_recipe(recipe: Recipe) -> str:
         for section in sections:
             holder = holder[section]
         del holder[name]
-    yaml, text = YAML(typ="safe", pure=True), io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    text = io.StringIO()
     yaml.Representer = _Representer
     yaml.default_flow_style = yaml.allow_unicode = False
     yaml.sort_base_mapping_type_on_output = False  # pyright: ignore[reportAttributeAccessIssue]
