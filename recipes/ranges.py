@@ -85,16 +85,20 @@ class Uniform:
     is_range = True
 
     def draw(self, draws: Draws, path: str) -> float:
-        unit, low, high, whole = draws.unit(path), self.low, self.high, isinstance(self.low, int)
+        unit = draws.unit(path)
+        low = self.low
+        high = self.high
+        is_whole = isinstance(low, int)
         if self.log:
-            top = high + 1 if whole else high  # k stands for the reals in [k, k + 1)
-            start, end = math.log(low), math.log(top)
-            drawn = math.exp(start + unit * (end - start))
-        elif whole:
-            drawn = low + unit * (high - low + 1)
+            top = high + 1 if is_whole else high  # k stands for the reals in [k, k + 1)
+            start = math.log(low)
+            end = math.log(top)
+            number = math.exp(start + unit * (end - start))
+        elif is_whole:
+            number = low + unit * (high - low + 1)
         else:
-            drawn = low + unit * (high - low)
-        return _whole(drawn, low, high) if whole else _rounded(drawn, low, high)
+            number = low + unit * (high - low)
+        return _floor(number, low, high) if is_whole else _rounded(number, low, high)
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
@@ -118,17 +122,17 @@ class Normal:
     is_range = True
 
     def draw(self, draws: Draws, path: str) -> float:
-        whole = isinstance(self.low, int)
-        margin = 0.5 if whole else 0.0  # a whole number stands for the reals that round to it
+        is_whole = isinstance(self.low, int)
+        margin = 0.5 if is_whole else 0.0  # a whole number stands for the reals that round to it
         normal = NormalDist(self.mean, self.std)
         below = normal.cdf(self.low - margin)
         inside = normal.cdf(self.high + margin) - below
         # inv_cdf takes no 0 or 1; the values it would give there are cut off to an end anyway
         probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
-        drawn = normal.inv_cdf(probability)
-        if whole:
-            return _whole(drawn + 0.5, self.low, self.high)
-        return _rounded(drawn, self.low, self.high)
+        number = normal.inv_cdf(probability)
+        if is_whole:
+            return _floor(number + 0.5, self.low, self.high)
+        return _rounded(number, self.low, self.high)
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
@@ -150,23 +154,23 @@ class Choice:
 
     def draw(self, draws: Draws, path: str) -> Plain:
         remaining = draws.unit(path) * math.fsum(self.weights)
-        chosen = -1
+        option_index = -1
         for index, weight in enumerate(self.weights):
             if weight > 0:
-                chosen = index
+                option_index = index
                 if remaining < weight:
                     break
                 remaining -= weight
-        return self.options[chosen].draw(draws, f"{path}.choice[{chosen}]")
+        return self.options[option_index].draw(draws, f"{path}.choice[{option_index}]")
 
     def probes(self) -> tuple[Plain, ...]:
         return tuple(probe for option in self.options for probe in option.probes())
 
     def describe(self) -> str:
         total = math.fsum(self.weights)
-        even = len(set(self.weights)) == 1
+        is_even = len(set(self.weights)) == 1
         parts = [
-            option.describe() + ("" if even else f" ({100 * weight / total:.3g} %)")
+            option.describe() + ("" if is_even else f" ({100 * weight / total:.3g} %)")
             for option, weight in zip(self.options, self.weights, strict=True)
         ]
         return f"one of {', '.join(parts)}"
@@ -213,16 +217,16 @@ class Channels:
 Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
 
 
-def _rounded(drawn: float, low: float, high: float) -> float:
-    return min(max(float(f"{drawn:.10g}"), low), high)
+def _rounded(number: float, low: float, high: float) -> float:
+    return min(max(float(f"{number:.10g}"), low), high)
 
 
-def _whole(drawn: float, low: float, high: float) -> int:
-    return min(max(math.floor(drawn), int(low)), int(high))
+def _floor(number: float, low: float, high: float) -> int:
+    return min(max(math.floor(number), int(low)), int(high))
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Whether this is a number; True and False are none."""
+    """Return True for a number; True and False are none."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

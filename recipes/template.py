@@ -47,15 +47,16 @@ class RecipeTemplate:
             RecipeError: variant is negative or too large, what was drawn breaks a rule, or a file
                 cannot be read or is not the one of which the recipe gives the digest.
         """
-        number, numbers = self.first_variant + variant, recipe_file().LEAVES["variant"]
-        if variant < 0 or not numbers.accepts(number):
-            allowed = numbers.allowed(number)
+        number = self.first_variant + variant
+        leaf = recipe_file().LEAVES["variant"]
+        if variant < 0 or not leaf.accepts(number):
+            allowed = leaf.allowed(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         where = f"{self.source}: variant {number}"
         names = {"version": VERSION, "name": self.name, "seed": self.seed, "variant": number}
         try:
-            drawn = _drawn(self.given, Draws(self.seed, number), "")
-            return with_digest(Recipe.model_validate(names | drawn))
+            fields = _draw(self.given, Draws(self.seed, number), "")
+            return with_digest(Recipe.model_validate(names | fields))
         except ValidationError as error:
             raise RecipeError(*(f"{where}: {text}" for text in readable(error))) from None
         except ValueError as error:  # a file that cannot be read
@@ -71,7 +72,7 @@ class RecipeTemplate:
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""
         units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.LEAVES.values()}
-        described = {
+        ranges = {
             path.removesuffix(_SHARE): f"present with probability {share.describe()}"
             for path, share in _walk(self.given)
             if path.endswith(_SHARE) and share != Fixed(1.0)
@@ -79,47 +80,47 @@ class RecipeTemplate:
         for path, value in self.values.items():
             if value.is_range:
                 unit = units.get(_INDEX.sub("[]", path))
-                described[path] = value.describe() + (f" ({unit})" if unit else "")
-        return described
+                ranges[path] = value.describe() + (f" ({unit})" if unit else "")
+        return ranges
 
     def describe_draws(self) -> str:
         """The ranges, then a line for every variant: its number, its hash and what it draws."""
         lines = [f"{path}: {text}" for path, text in self.describe_ranges().items()]
         for variant in range(self.variants):
             recipe = self.resolve(variant)
-            draws, absent = Draws(self.seed, recipe.variant), tuple[str, ...]()
-            drawn = []
+            draws = Draws(self.seed, recipe.variant)
+            absent_paths = tuple[str, ...]()
             for path, share in _walk(self.given):
                 if path.endswith(_SHARE) and draws.unit(path) >= as_number(share.draw(draws, path)):
-                    absent += (path.removesuffix("probability"),)
-            drawn = [f"{path.removesuffix('.')} absent" for path in absent]
+                    absent_paths += (path.removesuffix("probability"),)
+            parts = [f"{path.removesuffix('.')} absent" for path in absent_paths]
             for path, value in self.values.items():
-                if value.is_range and not path.startswith(absent):
-                    drawn.append(f"{path} = {words(value.draw(draws, path))}")
-            lines.append(f"{recipe.name}-{recipe.variant:03d} {recipe.hash}  {', '.join(drawn)}")
+                if value.is_range and not path.startswith(absent_paths):
+                    parts.append(f"{path} = {words(value.draw(draws, path))}")
+            lines.append(f"{recipe.name}-{recipe.variant:03d} {recipe.hash}  {', '.join(parts)}")
         return "\n".join(lines)
 
 
-def _walk(given: Any, path: str = "") -> Iterator[tuple[str, Value]]:
-    """Every value below a path."""
-    if isinstance(given, Mapping):
-        for name, below in given.items():
-            yield from _walk(below, join(path, name))
-    elif isinstance(given, list):
-        for index, item in enumerate(given):
+def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Value]]:
+    """Yield the dotted path and value of every field below a node of `given`."""
+    if isinstance(node, Mapping):
+        for name, inner_node in node.items():
+            yield from _walk(inner_node, join(path, name))
+    elif isinstance(node, list):
+        for index, item in enumerate(node):
             yield from _walk(item, f"{path}[{index}]")
     else:
-        yield path, given
+        yield path, node
 
 
-def _drawn(given: Any, draws: Draws, path: str) -> Any:
-    """What stands at a path, in numbers; None for an effect that the variant has not."""
-    if isinstance(given, list):
-        return [_drawn(item, draws, f"{path}[{index}]") for index, item in enumerate(given)]
-    if not isinstance(given, Mapping):
-        return given.draw(draws, path)
-    share = given.get("probability")
+def _draw(node: Any, draws: Draws, path: str) -> Any:
+    """Return a node of `given` in numbers; None for an effect that the variant has not."""
+    if isinstance(node, list):
+        return [_draw(item, draws, f"{path}[{index}]") for index, item in enumerate(node)]
+    if not isinstance(node, Mapping):
+        return node.draw(draws, path)
+    share = node.get("probability")
     if share is not None and draws.unit(path + _SHARE) >= share.value:
         return None
-    fields = {name: below for name, below in given.items() if name != "probability"}
-    return {name: _drawn(below, draws, join(path, name)) for name, below in fields.items()}
+    fields = {name: value for name, value in node.items() if name != "probability"}
+    return {name: _draw(value, draws, join(path, name)) for name, value in fields.items()}

@@ -61,7 +61,7 @@ class ListNode(list["Node"]):
 
 
 class MapNode(dict[str, "Node"]):
-    """What stands below a key is on the key's line."""
+    """A mapping; the value of a key has the place of that key."""
 
     def __init__(self, place: Place, entries: dict[str, Node] | None = None) -> None:
         super().__init__(entries or {})
@@ -92,7 +92,7 @@ def read_tree(text: str, place: Place, problems: Problems, *, empty: str) -> Nod
 
 
 def read_plain(text: str, *, source: str) -> PlainValue:
-    """What YAML says as mappings, lists and scalars; RecipeError as for read_tree."""
+    """Return YAML text as plain mappings, lists and scalars; RecipeError as for read_tree."""
     problems = Problems()
     tree = read_tree(text, Place(source), problems, empty="the file is empty")
     problems.raise_if_any()
@@ -109,7 +109,7 @@ def plain(node: Node) -> PlainValue:
 
 
 def plain_value(text: str) -> ScalarValue:
-    """What an unquoted scalar means in YAML 1.2's core schema."""
+    """Return the value of an unquoted scalar by YAML 1.2's core schema."""
     if text in _WORDS:
         return _WORDS[text]
     if len(text) <= MAX_DIGITS:
@@ -125,25 +125,29 @@ class _Reader:
     """Recursive, at most MAX_DEPTH deep."""
 
     def __init__(self, events: Iterator[Event], place: Place, problems: Problems) -> None:
-        self._events, self._place, self._problems = events, place, problems
+        self._events = events
+        self._place = place
+        self._problems = problems
         self._anchors: dict[str, Node] = {}
         self._count = 0
 
     def node(
         self, event: Event, *, place: Place | None = None, path: str = "", depth: int = 1
     ) -> Node:
-        """What begins with `event`. place: of the key above it, if there is one."""
-        own = _place(self._place, event)
-        place = place or own
+        """Return the node that begins with `event`. place: of the key above it, if there is one."""
+        event_place = _place(self._place, event)
+        place = place or event_place
         if isinstance(event, AliasEvent):
             if (node := self._anchors.get(event.anchor)) is None:
-                raise own.error(f"*{short(event.anchor)} refers to no anchor that ends above it")
-            self._count_nodes(node, own, depth)
+                raise event_place.error(
+                    f"*{short(event.anchor)} refers to no anchor that ends above it"
+                )
+            self._count_nodes(node, event_place, depth)
             return node
-        self._count_node(own, depth)
+        self._count_node(event_place, depth)
         assert isinstance(event, ScalarEvent | CollectionStartEvent)
         if event.tag is not None:
-            raise own.error(f"the tag {short(str(event.tag))!r}: tags are not allowed")
+            raise event_place.error(f"the tag {short(str(event.tag))!r}: tags are not allowed")
         if isinstance(event, ScalarEvent):
             check_text(event.value, place)
             value = plain_value(event.value) if event.implicit[0] else event.value
