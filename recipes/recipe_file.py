@@ -1,7 +1,7 @@
-"""What a recipe file may say: models derived from those of `schema`, each value widened to a value
-or a range. With them pydantic reads the nodes of a YAML tree and writes the JSON Schema.
+"""Models of a recipe file, derived from those of `schema`: each field takes a value or a range.
 
-Read is what the file gives, as mappings with a `ranges.Value` for each field.
+With them pydantic reads the nodes of a YAML tree and writes the JSON Schema. The result of reading
+is a mapping of the fields that the file gives, with a `ranges.Value` for each.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Leaf:
 
     @classmethod
     def of(cls, path: str, info: FieldInfo, *, rangeable: bool) -> Leaf:
-        """The one of a model's field."""
+        """Return the leaf of a model's field."""
         inner, nullable = _without_none(info.annotation)
         annotation = Annotated[inner, *info.metadata] if info.metadata else inner
         return cls(path, annotation, nullable, rangeable, info)
@@ -131,7 +131,7 @@ class Leaf:
 
     @cached_property
     def channel(self) -> Leaf | None:
-        """What each of the three numbers of a colour or rates is."""
+        """Leaf of one of the three numbers of a colour or rates; None for any other field."""
         if self.kind is not tuple:
             return None
         return Leaf(f"{self.path}[]", get_args(self.annotation)[0], rangeable=self.rangeable)
@@ -159,13 +159,13 @@ class Leaf:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What it may be besides true and false, where that can be listed."""
+        """Words that the field takes besides true and false; empty where they cannot be listed."""
         parts = (self._schema, *self._schema.get("anyOf", ()))
-        listed = [part.get("enum", [part["const"]] if "const" in part else []) for part in parts]
-        return tuple(str(word) for each in listed for word in each)
+        enums = [part.get("enum", [part["const"]] if "const" in part else []) for part in parts]
+        return tuple(str(word) for enum in enums for word in enum)
 
     def accepts(self, value: object) -> bool:
-        """Whether the recipe's model takes this value."""
+        """Return True if the recipe's model takes this value."""
         if value is None:
             return self.nullable
         try:
@@ -175,7 +175,10 @@ class Leaf:
         return True
 
     def allowed(self, value: object = None) -> str:
-        """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
+        """Return in words which values the field takes.
+
+        value: the refused value; conditions that it meets are left out.
+        """
         if self.channel is not None:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.is_number:
@@ -238,15 +241,15 @@ class Leaf:
         else:  # a name may look like a number
             value = node.text if self.kind is str and node.value is not None else node.value
         try:
-            read = handler(value)
+            checked_value = handler(value)
         except ValidationError:
             raise refusal(f"must be {self.allowed(value)}{guess_value(node, self)}") from None
-        is_file = self.annotation == FilePath and read is not None
-        return _named_file(node) if is_file else Fixed(read)  # type: ignore[arg-type]
+        is_file = self.annotation == FilePath and checked_value is not None
+        return _named_file(node) if is_file else Fixed(checked_value)  # type: ignore[arg-type]
 
 
 def refusal(text: str) -> PydanticCustomError:
-    """What pydantic is to say of a node."""
+    """Return the error with which pydantic refuses a node."""
     return PydanticCustomError("recipe", text)  # type: ignore[arg-type]
 
 
@@ -271,7 +274,7 @@ _WEIGHT = Leaf("weight", Annotated[Number, Field(ge=0, le=1e9)], rangeable=False
 
 
 def _range_schemas(leaf: Leaf, handler: GetCoreSchemaHandler) -> dict[str, CoreSchema]:
-    """Of a range of each kind that the field takes."""
+    """Return the schema of each kind of range that the field takes, by kind."""
     generate = handler.generate_schema
     options = cs.list_schema(generate(leaf.type), min_length=1)
     schemas = {
@@ -320,16 +323,16 @@ def _list_schema(schema: CoreSchema, counts: Container[int], text: str) -> CoreS
     return cs.no_info_before_validator_function(check, schema)
 
 
-def _interval(given: Given) -> Uniform:
-    ((kind, ends),) = given.items()
+def _interval(fields: Given) -> Uniform:
+    ((kind, ends),) = fields.items()
     low, high = (as_number(end.value) for end in ends)
     if low > high:
         raise refusal("the low end comes first")
     return Uniform(low, high, log=kind == "log_uniform")
 
 
-def _normal(given: Given) -> Normal:
-    parts = given["normal"]
+def _normal(fields: Given) -> Normal:
+    parts = fields["normal"]
     mean, std, low, high = (as_number(parts[name].value) for name in ("mean", "std", "min", "max"))
     if not low < high:
         raise refusal("max must be > min")
@@ -340,10 +343,10 @@ def _normal(given: Given) -> Normal:
     return Normal(mean, std, low, high)
 
 
-def _choice(given: Given) -> Choice:
-    options = tuple(given["choice"])
-    weights = [as_number(weight.value) for weight in given.get("weights", ())]
-    if "weights" in given and len(weights) != len(options):
+def _choice(fields: Given) -> Choice:
+    options = tuple(fields["choice"])
+    weights = [as_number(weight.value) for weight in fields.get("weights", ())]
+    if "weights" in fields and len(weights) != len(options):
         raise refusal(f"weights must be {len(options)} numbers, one for each option")
     # bounds keep the sum finite and every share representable
     if weights and (not any(weights) or any(0 < weight < 1e-9 for weight in weights)):
@@ -351,8 +354,8 @@ def _choice(given: Given) -> Choice:
     return Choice(options, tuple(weights) or (1.0,) * len(options))
 
 
-def _line(given: Given) -> TripleLine:
-    start, end = given["uniform"]
+def _line(fields: Given) -> TripleLine:
+    start, end = fields["uniform"]
     return TripleLine(start.value, end.value)
 
 
@@ -393,23 +396,23 @@ class Section(Closed):
             guess = guess_section(node, cls.PATH)
             raise refusal(f"must be a mapping, with {', '.join(cls.model_fields)}{guess}")
         section = handler(node)
-        read = {name: getattr(section, name) for name in section.model_fields_set}
-        given = {name: read[name] for name in cls.model_fields if read.get(name) is not None}
-        if broken := list(broken_rules(cls, given)) if cls.PATH else []:
-            raise PydanticCustomError("rule", "\n".join(broken))  # type: ignore[arg-type]
-        return given
+        values = {name: getattr(section, name) for name in section.model_fields_set}
+        fields = {name: values[name] for name in cls.model_fields if values.get(name) is not None}
+        if texts := list(broken_rules(cls, fields)) if cls.PATH else []:
+            raise PydanticCustomError("rule", "\n".join(texts))  # type: ignore[arg-type]
+        return fields
 
     @classmethod
     def __get_pydantic_json_schema__(
         cls, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        written = handler(schema)
+        json_schema = handler(schema)
         extra = cls.MODEL.model_config.get("json_schema_extra") or {}
         assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"
-        handler.resolve_ref_schema(written).update(extra)
+        handler.resolve_ref_schema(json_schema).update(extra)
         if (shorthand := getattr(cls.MODEL, "SHORTHAND", None)) is not None:
-            return {"anyOf": [written, {"enum": [*cls.LEAVES[shorthand].words]}]}
-        return written
+            return {"anyOf": [json_schema, {"enum": [*cls.LEAVES[shorthand].words]}]}
+        return json_schema
 
 
 def recipe_file() -> type[Section]:
@@ -424,7 +427,7 @@ def _recipe_file(sections: tuple[tuple[str, type[BaseModel]], ...]) -> type[Sect
 
 
 def read_file(tree: MapNode, problems: Problems) -> Given:
-    """What a tree says; all that is wrong with it is added to the problems."""
+    """Return the fields that a tree gives; add everything that is wrong with it to `problems`."""
     try:
         return recipe_file().model_validate(tree)  # type: ignore[return-value]
     except ValidationError as error:
@@ -436,11 +439,14 @@ def read_file(tree: MapNode, problems: Problems) -> Given:
 
 
 def _problem(item: ErrorDetails) -> tuple[Place, str]:
-    """Where it is, and what to say of it."""
-    kind, node, last = item["type"], item["input"], item["loc"][-1]
+    """Return the place of a problem and its text."""
+    kind = item["type"]
+    node = item["input"]
+    last = item["loc"][-1]
     above = [part for part in item["loc"][:-1] if part not in _TAGS]
     location = [*above, last] if kind == "extra_forbidden" or last not in _TAGS else above
-    path, section = dotted(location), recipe_file()
+    path = dotted(location)
+    section = recipe_file()
     for part in above:
         section = section.INNER.get(str(part), section)
     in_range = len(item["loc"]) > len(location)
@@ -456,7 +462,7 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
 
 
 class _FileFields(Closed):
-    """What a file says besides what a recipe in numbers does."""
+    """Fields of a recipe file that a recipe in numbers does not have."""
 
     variants: Whole = Field(default=1, ge=1, le=1_000_000)
     """How many recipes are drawn from this file."""
@@ -470,7 +476,7 @@ class _FileFields(Closed):
 
 
 class _EffectFields(Closed):
-    """What a file says of an effect besides."""
+    """Fields of an effect in a recipe file that its model does not have."""
 
     probability: Unit = 1.0
     """Share of the variants that have this effect."""
@@ -489,9 +495,9 @@ def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) ->
             item = inner[name] = _section(f"{below}[]", arguments[0])
             (item.MAX_ITEMS,) = (m.max_length for m in info.metadata if isinstance(m, MaxLen))
             item.LIST_DESCRIPTION = _one_line(info.description)
-            read = WrapValidator(partial(_read_list, item))
-            most = Field(max_length=item.MAX_ITEMS)
-            fields[name] = (Annotated[list[item] | None, most, read], None)
+            validator = WrapValidator(partial(_read_list, item))
+            limit = Field(max_length=item.MAX_ITEMS)
+            fields[name] = (Annotated[list[item] | None, limit, validator], None)
         elif isinstance(kind, type) and issubclass(kind, BaseModel):
             inner[name] = _section(below, kind, _EffectFields if nullable else Closed)
             fields[name] = (inner[name] | None, None)
@@ -501,9 +507,12 @@ def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) ->
             text = leaf.description + (f" [{leaf.unit}]" if leaf.unit else "")
             fields[name] = (leaf.type, Field(default=info.default, description=text))
     title = model.__name__ if path else "ClimateGS recipe"
-    made = create_model(title, __base__=Section, __doc__=_one_line(model.__doc__), **fields)
-    made.PATH, made.MODEL, made.LEAVES, made.INNER = path, model, leaves, inner
-    return made
+    section = create_model(title, __base__=Section, __doc__=_one_line(model.__doc__), **fields)
+    section.PATH = path
+    section.MODEL = model
+    section.LEAVES = leaves
+    section.INNER = inner
+    return section
 
 
 def _read_list(item: type[Section], node: Node, handler: ValidatorFunctionWrapHandler) -> Any:
@@ -529,16 +538,16 @@ def _one_line(text: str | None) -> str:
 
 def _plain(number: float) -> str:
     """A number without exponent or trailing zeros where it is short so."""
-    whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
-    return str(int(number)) if whole else repr(number)
+    is_whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
+    return str(int(number)) if is_whole else repr(number)
 
 
 # ---- Rules between the fields of a section, tried at the ends of their ranges before any draw ----
 
 
 def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
-    """What the section's model says against any combination of the ranges' ends, each text once."""
-    found: set[str] = set()
+    """Yield every error of the section's model at a combination of the ranges' ends, once."""
+    known_texts: set[str] = set()
     ends = [
         _ends(name, value, section.LEAVES.get(name))
         for name, value in given.items()
@@ -548,18 +557,20 @@ def broken_rules(section: type[Section], given: Given) -> Iterator[str]:
         try:
             section.MODEL.model_validate({name: end for name, end, _ in corner})
         except ValidationError as error:
-            drawn = ", ".join(text for _, _, text in corner if text)
+            draw = ", ".join(text for _, _, text in corner if text)
             texts = dict.fromkeys(readable(error))
-            new = [text for text in texts if text not in found]
-            yield from (f"{text} (in a draw with {drawn})" if drawn else text for text in new)
-            found.update(texts)
+            new_texts = [text for text in texts if text not in known_texts]
+            yield from (f"{text} (in a draw with {draw})" if draw else text for text in new_texts)
+            known_texts.update(texts)
 
 
 def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tuple[str, Any, str]]:
-    """What a rule between fields can depend on: the extreme numbers, null, and every word; with
-    the field's name before each, and how it is told behind, where the value is a range.
+    """Return the values of a field that a rule between fields can depend on.
 
-    A handful, for the product over a section's fields. No rule compares colours or names of files.
+    They are the extreme numbers, null, and every word. Each comes as (name of the field, value,
+    text for messages); the text is empty where all draws have the same value. They are few, since
+    broken_rules forms their product over a section's fields. No rule compares colours or names of
+    files.
     """
     if isinstance(value, list):
         low, high = (tuple(_extremes(item, end) for item in value) for end in (min, max))
@@ -569,17 +580,17 @@ def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tupl
         return [(name, low, where % "low"), (name, high, where % "high")]
     probes = value.probes()
     numbers = [p for p in probes if is_number(p)]
-    others = [p for p in probes if p is None or isinstance(p, str | bool)]
+    options = [p for p in probes if p is None or isinstance(p, str | bool)]
     if leaf is not None and leaf.kind is str:
-        others = sorted(others, key=lambda p: p is not None)[: 1 + (None in others)]
+        options = sorted(options, key=lambda p: p is not None)[: 1 + (None in options)]
     triples = [p for p in probes if isinstance(p, tuple)]
-    outer: list[Plain] = [min(numbers), max(numbers)] if numbers else []
-    ends: dict[Plain, None] = dict.fromkeys([*outer, *triples[:1], *others])
+    extremes: list[Plain] = [min(numbers), max(numbers)] if numbers else []
+    ends: dict[Plain, None] = dict.fromkeys([*extremes, *triples[:1], *options])
     return [(name, end, f"{name} = {words(end)}" if value.is_range else "") for end in ends]
 
 
-def _extremes(item: Given, of: Callable[[Any], Any]) -> dict[str, Any]:
-    """Of a list's mapping, all numbers at one end.
+def _extremes(item: Given, pick: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return a mapping of a list with all its numbers at one end. pick: min or max.
 
     Not every combination, of which there may be 2^300: no rule over a list's items trades one
     number off against another.
@@ -587,7 +598,7 @@ def _extremes(item: Given, of: Callable[[Any], Any]) -> dict[str, Any]:
     extremes = {}
     for name, value in item.items():
         numbers = [probe for probe in value.probes() if is_number(probe)]
-        extremes[name] = of(numbers) if numbers else value.probes()[0]
+        extremes[name] = pick(numbers) if numbers else value.probes()[0]
     return extremes
 
 
