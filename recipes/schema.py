@@ -1,4 +1,4 @@
-"""What a recipe may say once its ranges are resolved to numbers.
+"""Models of a recipe in numbers, after its ranges are resolved.
 
 Every model is frozen and closed: an unknown key is an error, at every level. Units are in the
 names, and numbers are strict.
@@ -67,9 +67,9 @@ class Quality(Closed):
 
     @model_validator(mode="after")
     def _one_wish(self) -> Quality:
-        given = [name for name in ("tier", *TARGETS) if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} each choose the settings: keep one of them")
+        names = [name for name in ("tier", *TARGETS) if getattr(self, name) is not None]
+        if len(names) > 1:
+            raise ValueError(f"{' and '.join(names)} each choose the settings: keep one of them")
         if self.settled and not self.has_target:
             raise ValueError("settled belongs to max_flip or budget_ms, and neither is given")
         return self
@@ -80,7 +80,7 @@ class Quality(Closed):
 
     @property
     def is_open(self) -> bool:
-        """Whether settings have still to be chosen, in view of a scene."""
+        """True while settings have still to be chosen, in view of a scene."""
         return self.has_target and not self.settled
 
     @property
@@ -107,12 +107,14 @@ class FramePattern:
     def select(self, numbers: Sequence[int], *, clip: bool = False) -> tuple[int, ...] | None:
         """The selected numbers, each once, in the order written; None for all.
 
-        numbers: those there are, to which an open range goes. clip: leave out what of a range is
-        not among them; a number on its own is kept even so, for whoever looks it up to refuse.
+        numbers: the frames that exist; an open range ends with the last of them. clip: leave out
+        numbers of a range that do not exist. A number that stands alone is never left out: the code
+        that looks it up refuses it.
         """
         if self.pieces is None:
             return None
-        there, end = set(numbers), max(numbers, default=-1) + 1
+        number_set = set(numbers)
+        end = max(numbers, default=-1) + 1
         selected: list[int] = []
         for piece in self.pieces:
             if isinstance(piece, int):
@@ -122,7 +124,7 @@ class FramePattern:
             stop = end if piece.stop is None else piece.stop
             is_open = piece.start is None or piece.stop is None
             run = range(start, min(stop, end) if clip else stop, piece.step or 1)
-            selected += [n for n in run if n in there] if clip or is_open else run
+            selected += [n for n in run if n in number_set] if clip or is_open else run
         return tuple(dict.fromkeys(selected))
 
 
@@ -289,7 +291,7 @@ class Category(Closed):
     """The category; several rows may have the same."""
 
     def takes(self, label: str) -> bool:
-        """Whether a label of the dataset is of this row."""
+        """Return True if a label of the dataset belongs to this row."""
         parts = map(re.escape, self.label.split(ANY_LABEL))
         return re.fullmatch(".*".join(parts), label, re.DOTALL) is not None
 
@@ -306,7 +308,7 @@ class Output(Section):
             "size and error of jpg files",
             12,
             chosen=False,
-            works=lambda it: it.image == "jpg",
+            works=lambda output: output.image == "jpg",
         ),
     )
 
@@ -345,7 +347,7 @@ class Output(Section):
 
     @property
     def label_formats(self) -> tuple[LabelFormat, ...]:
-        """What labels are written as besides their tables."""
+        """Formats in which labels are written, besides their tables."""
         return () if isinstance(self.labels, bool) else tuple(sorted(set(self.labels)))
 
 
@@ -376,8 +378,8 @@ class Recipe(Closed):
         """A tier stands for numbers: it is resolved once, here, and stays as a word beside them."""
         if self.quality.tier is not None:
             for path, value in tier_settings(self, self.quality.tier).items():
-                name, _, rest = path.partition(".")
-                section = replaced(getattr(self, name), rest, value)
+                name, _, inner_path = path.partition(".")
+                section = replaced(getattr(self, name), inner_path, value)
                 object.__setattr__(self, name, section)  # as yet nobody else has it
                 self.model_fields_set.add(name)
         return self
@@ -389,27 +391,32 @@ class Recipe(Closed):
         recipes without them meant, so that hashes stay; sweeps that auto passes through are those
         of `lidar: true`. Where files lie is left out: their digest says what they hold.
         """
-        data, present = self.model_dump(mode="json"), self.sections()
-        sections: dict[str, Section] = {"render": self.render, "output": self.output, **present}
-        left_out = [] if self.quality != Quality() else ["quality"]
+        data = self.model_dump(mode="json")
+        effects = self.sections()
+        sections: dict[str, Section] = {"render": self.render, "output": self.output, **effects}
+        omitted_paths = [] if self.quality != Quality() else ["quality"]
         if self.camera == Sensor():
-            left_out.append("camera")
+            omitted_paths.append("camera")
         else:
             sections["camera"] = self.camera
-        absent = (p for p, m in SECTIONS.items() if p not in present and not m.in_first_release)
-        left_out += [path for path in absent if path.partition(".")[0] not in left_out]
-        left_out += [
+        absent_paths = (
+            p for p, m in SECTIONS.items() if p not in effects and not m.in_first_release
+        )
+        omitted_paths += [
+            path for path in absent_paths if path.partition(".")[0] not in omitted_paths
+        ]
+        omitted_paths += [
             f"{path}.{name}"
             for path, section in sections.items()
             for name in section.later_fields
             if getattr(section, name) == type(section).model_fields[name].default
         ]
-        left_out += [
-            f"{p}.{name}" for p, section in present.items() for name in section.file_fields
+        omitted_paths += [
+            f"{p}.{name}" for p, section in effects.items() for name in section.file_fields
         ]
-        for path in left_out:
-            *above, name = path.split(".")
-            del functools.reduce(operator.getitem, above, data)[name]
+        for path in omitted_paths:
+            *parents, name = path.split(".")
+            del functools.reduce(operator.getitem, parents, data)[name]
         if self.output.lidar == "auto" and self.lidar == "clean":
             data["output"]["lidar"] = True
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
@@ -421,43 +428,49 @@ class Recipe(Closed):
 
     @property
     def lidar(self) -> Literal["weather", "clean"] | None:
-        """Which LiDAR sweeps are written, auto resolved: those that agree with the depth images."""
-        asked = self.output.lidar
-        if asked == "auto":
+        """Kind of the LiDAR sweeps that are written; None for none.
+
+        `auto` becomes the kind that agrees with the depth images.
+        """
+        setting = self.output.lidar
+        if setting == "auto":
             in_weather = bool(self._surfaces()) and self.output.surface != "scene"
             return "weather" if in_weather else "clean"
-        return ("clean" if asked else None) if asked != "weather" else "weather"
+        return ("clean" if setting else None) if setting != "weather" else "weather"
 
     def lidar_note(self, lidar: Literal["weather", "clean"] | None) -> str | None:
-        """Where images, depth and sweeps show different surfaces, if sweeps are such as `lidar`
-        says; None where they agree, or there are no sweeps.
+        """Return a note on the surfaces in which images, depth and sweeps differ.
+
+        None where they agree, or there are no sweeps. lidar: the kind of the sweeps.
         """
         output = self.output
         has_depth = output.depth != "none" or output.semantic or output.instance
         notes = []
-        for what, in_depth in self._surfaces().items() if lidar else ():
-            there, absent = ["images"], []
+        for surface, in_depth in self._surfaces().items() if lidar else ():
+            outputs_with = ["images"]
+            outputs_without = []
             if has_depth:
-                (there if in_depth else absent).append("depth")
-            (there if lidar == "weather" else absent).append("sweeps")
-            if absent:
-                notes.append(f"{what} in {' and '.join(there)}, not in {' or '.join(absent)}")
-        asked = str(output.lidar).lower()
-        settings = f"(output: {{lidar: {asked}, surface: {output.surface}}})"
+                (outputs_with if in_depth else outputs_without).append("depth")
+            (outputs_with if lidar == "weather" else outputs_without).append("sweeps")
+            if outputs_without:
+                names = " and ".join(outputs_with)
+                notes.append(f"{surface} in {names}, not in {' or '.join(outputs_without)}")
+        setting = str(output.lidar).lower()
+        settings = f"(output: {{lidar: {setting}, surface: {output.surface}}})"
         return f"{'; '.join(notes)} {settings}" if notes else None
 
     def _surfaces(self) -> dict[str, bool]:
-        """What of the weather a beam can end on, and whether depth images show it."""
-        shown = [section.surface(self.output.surface) for section in self.sections().values()]
-        return dict(sorted(surface for surface in shown if surface is not None))
+        """Surfaces of the weather on which a beam can end -> whether depth images show them."""
+        surfaces = [section.surface(self.output.surface) for section in self.sections().values()]
+        return dict(sorted(surface for surface in surfaces if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:
-        """Its effects, by dotted path."""
-        every = ((path, found(self, path)) for path in SECTIONS)
-        return {path: section for path, section in every if section is not None}
+        """Return the effects of the recipe, by dotted path."""
+        sections = ((path, found(self, path)) for path in SECTIONS)
+        return {path: section for path, section in sections if section is not None}
 
     def columns(self) -> dict[str, float | str | None]:
-        """What its effects say in manifests, by column."""
+        """Return the manifest values of the recipe's effects, by column."""
         return {
             column.name: column.of(found(self, path))
             for path, model in SECTIONS.items()
@@ -513,13 +526,13 @@ def _rebuild() -> None:
 
 def _collect_knobs() -> None:
     sections: dict[str, type[Section]] = {"render": Render, "output": Output, **SECTIONS}
-    every = [
+    knobs = [
         replace(knob, path=f"{path}.{knob.path}", section=path)
         for path, model in sections.items()
         for knob in model.knobs
     ]
     KNOBS.clear()
-    KNOBS.update((knob.path, knob) for knob in sorted(every, key=lambda knob: knob.rank))
+    KNOBS.update((knob.path, knob) for knob in sorted(knobs, key=lambda knob: knob.rank))
     for tier, settings in TIERS.items():
         settings.clear()
         settings.update((k.path, k.tiers[tier]) for k in KNOBS.values() if tier in k.tiers)
@@ -543,7 +556,7 @@ def knobs_of(recipe: Recipe) -> tuple[Knob, ...]:
 
 
 def free_knobs(recipe: Recipe) -> tuple[Knob, ...]:
-    """Those of them that a tier or a target may set: the recipe does not give their field."""
+    """Return the knobs that a tier or a target may set: the recipe does not give their field."""
     return tuple(k for k in knobs_of(recipe) if k.chosen and not is_given(recipe, k.path))
 
 
@@ -558,9 +571,9 @@ def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
 
 
 def tier_settings(recipe: Recipe, tier: str) -> dict[str, Value]:
-    """What a tier sets of this recipe: of its free knobs."""
-    chosen = TIERS.get(tier, {})
-    return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
+    """Return the values that a tier gives to the free knobs of this recipe, by path."""
+    values = TIERS.get(tier, {})
+    return {knob.path: values.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
 
 
 def as_reference(recipe: Recipe) -> Recipe:
