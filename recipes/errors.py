@@ -43,7 +43,7 @@ class Place:
         return self.source if self.line is None else f"{self.source}:{self.line}"
 
     def error(self, text: str) -> RecipeError:
-        """For a problem after which nothing else can be judged."""
+        """Return the error for a problem after which nothing else can be checked."""
         return RecipeError(f"{self}: {text}")
 
 
@@ -83,9 +83,9 @@ def nearest_word(word: str, words: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """The guess as a part of a message, with a space after it; '' without one."""
-    near = nearest_word(word, words)
-    return f"did you mean {near}? " if near else ""
+    """Return a guess as a part of a message, with a space after it; '' without one."""
+    guess = nearest_word(word, words)
+    return f"did you mean {guess}? " if guess else ""
 
 
 def short(text: str, limit: int = 60) -> str:

@@ -25,7 +25,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from recipes.errors import did_you_mean
 
-MAX_PER_M = 1e6  # a micrometre of it is opaque
+MAX_PER_M = 1e6  # largest extinction, 1/metre: a micrometre is opaque
 
 Number = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]
@@ -54,7 +54,7 @@ Digest = Annotated[
 
 @dataclass(frozen=True)
 class OneOf:
-    """For a text's annotation: it is one of these names. noun: what they are names of."""
+    """Annotation of a text that must be one of `names`. noun: the kind of thing that they name."""
 
     noun: str
     names: Callable[[], tuple[str, ...]]
@@ -158,6 +158,6 @@ def packaged(folder: str) -> tuple[str, ...]:
 
 
 def packaged_text(folder: str, name: str) -> str:
-    """One of these files."""
+    """Return the text of one of these files."""
     file = resources.files("recipes").joinpath(folder, f"{name}.yaml")
     return file.read_text(encoding="utf-8")

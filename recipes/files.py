@@ -18,8 +18,8 @@ from recipes.errors import RecipeError, nearest_word, short
 from recipes.fields import found, replaced
 from recipes.schema import SECTIONS, Recipe
 
-MAX_MIB = 512  # of one file
-MAX_NAMES = 1000  # of files in a folder, to guess a misspelt one from
+MAX_MIB = 512  # largest size of a file that is read, MiB
+MAX_NAMES = 1000  # most names of a folder among which a misspelt one is looked for
 
 
 def with_digest(recipe: Recipe) -> Recipe:
@@ -70,37 +70,37 @@ def file_below(folder: Path, written: str) -> Path:
     Raises:
         ValueError: it leads out of the folder, or is no file that can be read.
     """
-    where = short(str(folder.absolute()), 200)
-    aside = f"put the file beside the recipe, in {where} or below it"
+    folder_text = short(str(folder.absolute()), 200)
+    advice = f"put the file beside the recipe, in {folder_text} or below it"
     if PureWindowsPath(written).anchor:
-        raise ValueError(f"must be a path from the recipe's folder; {aside}")
+        raise ValueError(f"must be a path from the recipe's folder; {advice}")
     if "\\" in written:
         raise ValueError("must have / between folders, on every system")
     depth = 0
     for part in PurePosixPath(written).parts:
         depth += -1 if part == ".." else 1
         if depth < 0:
-            raise ValueError(f"leads out of the recipe's folder; {aside}")
+            raise ValueError(f"leads out of the recipe's folder; {advice}")
     path = folder.absolute() / written
     try:
-        real = path.resolve()
-        is_inside = real.is_relative_to(folder.resolve())
+        target_path = path.resolve()
+        is_inside = target_path.is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError) as error:  # a circle of links; no possible name
         raise ValueError(f"cannot be found: {short(str(error), 200)}") from None
     if not is_inside:
-        target = short(str(real), 200)
-        raise ValueError(f"leads through a link to {target}, out of the recipe's folder; {aside}")
+        target = short(str(target_path), 200)
+        raise ValueError(f"leads through a link to {target}, out of the recipe's folder; {advice}")
     try:
         _open_checked(path).close()
     except FileNotFoundError:
-        near = _nearest_name(path)
-        hint = f"did you mean {near}?" if near else "put the file beside the recipe or below it"
-        raise ValueError(f"there is no such file in {where}; {hint}") from None
+        name = _nearest_name(path)
+        hint = f"did you mean {name}?" if name else "put the file beside the recipe or below it"
+        raise ValueError(f"there is no such file in {folder_text}; {hint}") from None
     return path
 
 
 def open_file(path: str | Path) -> BufferedReader:
-    """A file that somebody has named, for reading.
+    """Open a file that a user has named, for reading.
 
     Raises:
         OSError: it cannot be opened, or is a folder, a pipe (might wait for ever) or a device.
@@ -134,7 +134,7 @@ def _open_checked(path: str | Path) -> BufferedReader:
 
 
 def _field_in_words(section: EffectModel, name: str) -> str:
-    """A field by its dotted path, and what it says."""
+    """Return a field as `path = value`, for messages."""
     path = next(path for path, model in SECTIONS.items() if model is type(section))
     return f"{path}.{name} = {getattr(section, name)!r}"
 
@@ -161,9 +161,9 @@ def _checked_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
     recipe_digest: str | None = found(section, "digest")
     if recipe_digest not in (None, digest):
         paths = ", ".join(section.files.values())
-        which = "the file has" if len(hashes) == 1 else "one of the files has"
+        subject = "the file has" if len(hashes) == 1 else "one of the files has"
         raise ValueError(
-            f"{_field_in_words(section, 'digest')}: {which} changed since: {paths} now "
+            f"{_field_in_words(section, 'digest')}: {subject} changed since: {paths} now "
             f"gives {digest}; bring back what was there, or remove the digest to take what is"
         )
     return digest
@@ -176,5 +176,5 @@ def _nearest_name(path: Path) -> str | None:
             names = [entry.name for entry, _ in zip(entries, range(MAX_NAMES), strict=False)]
     except OSError:
         return None
-    near = nearest_word(path.name, tuple(sorted(names)))
-    return short(near) if near else None
+    name = nearest_word(path.name, tuple(sorted(names)))
+    return short(name) if name else None

@@ -97,8 +97,8 @@ def guess_section(node: Node, path: str) -> str:
 
 def _guess_text(text: str, leaf: Leaf) -> str:
     if leaf.words:
-        near = nearest_word(text, leaf.words)
-        return f"; did you mean {near}?" if near else ""
+        word = nearest_word(text, leaf.words)
+        return f"; did you mean {word}?" if word else ""
     if leaf.is_number:
         if _DECIMAL_COMMA.fullmatch(text):
             return "; decimals take a point"
@@ -111,17 +111,17 @@ def _guess_text(text: str, leaf: Leaf) -> str:
 
 
 def why_no_range(node: MapNode, leaf: Leaf) -> str:
-    """Why a mapping in the place of a value is no range."""
+    """Return why a mapping in the place of a value is no range."""
     if not leaf.rangeable:
         return f"must be {leaf.allowed()}; it cannot be a range"
     kinds = [key for key in node if key in RANGE_KINDS]
     if len(kinds) == 1:
-        possible = "choice" if leaf.channel is None else "uniform or choice"
-        return f"{kinds[0]} is for numbers; a range here is {possible}"
+        allowed_kinds = "choice" if leaf.channel is None else "uniform or choice"
+        return f"{kinds[0]} is for numbers; a range here is {allowed_kinds}"
     for key in node:
-        near = nearest_word(key, RANGE_KINDS)
-        if near is not None and near != key:
-            return f"no range is called {short(key)!r}; did you mean {near}?"
+        kind = nearest_word(key, RANGE_KINDS)
+        if kind is not None and kind != key:
+            return f"no range is called {short(key)!r}; did you mean {kind}?"
     ranges = ", ".join(RANGE_KINDS)
     return f"must be {leaf.allowed()}, or a range: a mapping with one of {ranges}"
 
@@ -138,16 +138,17 @@ def why_no_key(key: str, section: type[Section], root: type[Section]) -> str:
         leaf = section.LEAVES.get(nearest)
         unit = f" ({leaf.unit})" if leaf and leaf.unit else ""
         return f"unknown field; did you mean {nearest}{unit}?"
-    elsewhere = [
+    other_places = [
         (other.PATH, name)
         for name in dict.fromkeys((key, _synonyms().get(key, key)))
         for other in root.walk()
         if name in other.model_fields and other is not section
     ]
-    below = [place for place in elsewhere if place[0].startswith(f"{section.PATH}.")]
-    if elsewhere:
+    places_below = [place for place in other_places if place[0].startswith(f"{section.PATH}.")]
+    if other_places:
         places = [
-            join(path, name) if path else f"{name} at the top" for path, name in below or elsewhere
+            join(path, name) if path else f"{name} at the top"
+            for path, name in places_below or other_places
         ]
         return f"unknown field here; did you mean {' or '.join(places)}?"
     return f"unknown field; known here: {', '.join(section.model_fields)}"
