@@ -19,7 +19,7 @@ from recipes.schema import Recipe, parse_frames
 from recipes.template import RecipeTemplate
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain, read_tree
 
-MAX_BYTES = 4 << 20
+MAX_BYTES = 4 << 20  # largest size of a job file, bytes
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
 Name = Annotated[str, Field(pattern=_NAME, strict=True)]
@@ -170,8 +170,8 @@ def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None 
         for problem in error.errors(include_url=False, include_context=False):
             if problem["type"] == "too_short" and problem["input"]:
                 continue  # it has items, each of them with a problem of its own
-            where = f"{dotted(problem['loc'])}: " if problem["loc"] else ""
-            problems.add(_place(tree, problem["loc"]), f"{where}{_message(problem)}")
+            prefix = f"{dotted(problem['loc'])}: " if problem["loc"] else ""
+            problems.add(_place(tree, problem["loc"]), f"{prefix}{_message(problem)}")
     problems.raise_if_any()
     raise AssertionError("pydantic found a problem and named none")
 
@@ -205,7 +205,7 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
 
 
 def seed_for_scene(seed: int, scene_name: str) -> int:
-    """A seed of the scene's own: the first 63 bits of a SHA-256 of both."""
+    """Return a seed for one scene: the first 63 bits of a SHA-256 of `seed` and its name."""
     digest = hashlib.sha256(f"climategs scene seed 1 {seed} {scene_name}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
 
@@ -217,8 +217,8 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
     try:
         return changed(recipe, {"render.scale": recipe.render.scale * scale})
     except ValidationError as error:
-        both = f"a scale of {scale} times the recipe's render.scale {recipe.render.scale}"
-        raise RecipeError(f"{both} is not possible: {error.errors()[0]['msg']}") from None
+        product = f"a scale of {scale} times the recipe's render.scale {recipe.render.scale}"
+        raise RecipeError(f"{product} is not possible: {error.errors()[0]['msg']}") from None
 
 
 def _place(tree: Node, location: tuple[int | str, ...]) -> Place:
@@ -246,8 +246,8 @@ _WORDS = {
 def _message(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         fields = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
-        near = nearest_word(str(problem["loc"][-1]), fields)
-        return "unknown field" + (f"; did you mean {near}?" if near else "")
+        field = nearest_word(str(problem["loc"][-1]), fields)
+        return "unknown field" + (f"; did you mean {field}?" if field else "")
     if problem["type"] == "value_error":
         return problem["msg"].removeprefix("Value error, ")
     if problem["type"] in _WORDS:

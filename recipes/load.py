@@ -165,8 +165,8 @@ def _template(
         key: fields.pop(key).value if key in fields else leaf.info.default
         for key, leaf in recipe_file().LEAVES.items()
     }
-    last = top["variant"] + top["variants"] - 1
-    if not recipe_file().LEAVES["variant"].accepts(last):
+    last_variant = top["variant"] + top["variants"] - 1
+    if not recipe_file().LEAVES["variant"].accepts(last_variant):
         text = f"variant = {top['variant']}: too large with variants = {top['variants']}"
         raise tree["variant"].place.error(text)
     template = RecipeTemplate(
@@ -212,10 +212,10 @@ def _with_parents(tree: MapNode, place: Place, problems: Problems) -> MapNode:
         if chain[-1] in chain[:-1]:
             circle = " -> ".join(Path(source).name for source in chain)
             raise parent.place.error(f"extends = {show(parent)}: a circle: {circle}")
-        below = _read_mapping(text, place, problems)
-        _check_version(below)
-        below.pop("name", None)
-        tree = _merged(below, tree, recipe_file())
+        parent_tree = _read_mapping(text, place, problems)
+        _check_version(parent_tree)
+        parent_tree.pop("name", None)
+        tree = _merged(parent_tree, tree, recipe_file())
     return tree
 
 
@@ -243,17 +243,21 @@ def _read_parent(parent: Node) -> tuple[str, Place]:
         raise place.error(f"extends = {show(parent)}: {text}") from None
 
 
-def _merged(below: MapNode, above: MapNode, section: type[Section]) -> MapNode:
-    """Fields of the mapping above replace those of the one below; sections merge."""
-    entries = dict(below)
-    for name, node in above.items():
-        inner = section.INNER.get(name)
-        node_below = below.get(name)
-        if inner is not None and isinstance(node_below, MapNode) and isinstance(node, MapNode):
-            entries[name] = _merged(node_below, node, inner)
+def _merged(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
+    """Return `base` with the fields of `changes` in place of its own; sections merge."""
+    entries = dict(base)
+    for name, node in changes.items():
+        inner_section = section.INNER.get(name)
+        base_node = base.get(name)
+        if (
+            inner_section is not None
+            and isinstance(base_node, MapNode)
+            and isinstance(node, MapNode)
+        ):
+            entries[name] = _merged(base_node, node, inner_section)
         else:
             entries[name] = node
-    return MapNode(above.place, entries)
+    return MapNode(changes.place, entries)
 
 
 def _override(path: str, value: object) -> MapNode:

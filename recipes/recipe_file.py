@@ -61,7 +61,7 @@ from recipes.yaml_tree import MAX_NODES, ListNode, MapNode, Node, ScalarNode
 
 MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
 
-# the end of a field's name says its unit
+# Units in words, by the end of a field's name.
 UNITS = {
     "_per_m": "1/metre",
     "_mm": "millimetres",
@@ -70,6 +70,7 @@ UNITS = {
     "_deg": "degrees",
     "_ntu": "nephelometric turbidity units",
 }
+# Signs of the limits in messages, by their keywords in JSON Schema.
 _LIMITS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 Given = dict[str, Any]  # of a section: a Value for a field, Given for a section, list of Given
@@ -98,8 +99,8 @@ class Leaf:
     @classmethod
     def of(cls, path: str, info: FieldInfo, *, rangeable: bool) -> Leaf:
         """Return the leaf of a model's field."""
-        inner, nullable = _without_none(info.annotation)
-        annotation = Annotated[inner, *info.metadata] if info.metadata else inner
+        value_type, nullable = _without_none(info.annotation)
+        annotation = Annotated[value_type, *info.metadata] if info.metadata else value_type
         return cls(path, annotation, nullable, rangeable, info)
 
     @property
@@ -215,8 +216,8 @@ class Leaf:
             kinds = [kind for kind in RANGE_KINDS if isinstance(node, MapNode) and kind in node]
             return f"<{kinds[0]}>" if len(kinds) == 1 and kinds[0] in schemas else "<value>"
 
-        tagged = {f"<{form}>": schema for form, schema in schemas.items()}
-        return cs.tagged_union_schema(tagged, form_of)
+        tagged_schemas = {f"<{form}>": schema for form, schema in schemas.items()}
+        return cs.tagged_union_schema(tagged_schemas, form_of)
 
     def _literal_schema(self, handler: GetCoreSchemaHandler) -> CoreSchema:
         if self.channel is not None:
@@ -232,8 +233,8 @@ class Leaf:
             raise refusal(why_no_range(node, self))
         if self.channel is not None and isinstance(node, ListNode) and len(node) == 3:
             channels = handler(node)
-            fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
-            return Fixed(as_triple(fixed)) if len(fixed) == 3 else Channels(channels)
+            numbers = [channel.value for channel in channels if isinstance(channel, Fixed)]
+            return Fixed(as_triple(numbers)) if len(numbers) == 3 else Channels(channels)
         if self.listed and isinstance(node, ListNode):
             value: Any = tuple(getattr(item, "value", None) for item in node)
         elif isinstance(node, ListNode):
@@ -287,8 +288,8 @@ def _range_schemas(leaf: Leaf, handler: GetCoreSchemaHandler) -> dict[str, CoreS
     end = replace(leaf, nullable=False, rangeable=False)
 
     def pair(end: Leaf, text: str = "[low, high]") -> CoreSchema:
-        both = cs.tuple_schema([generate(end.type)] * 2)
-        return _list_schema(both, [2], text)
+        pair_schema = cs.tuple_schema([generate(end.type)] * 2)
+        return _list_schema(pair_schema, [2], text)
 
     if leaf.channel is not None:
         line = pair(end, "[from, to], each [red, green, blue]")
@@ -308,8 +309,8 @@ def _mapping_schema(build: Callable[[Given], Any], **fields: CoreSchema) -> Core
         name: cs.typed_dict_field(schema, required=name != "weights")
         for name, schema in fields.items()
     }
-    typed = cs.typed_dict_schema(keys, extra_behavior="forbid")
-    return cs.no_info_after_validator_function(build, typed)
+    dict_schema = cs.typed_dict_schema(keys, extra_behavior="forbid")
+    return cs.no_info_after_validator_function(build, dict_schema)
 
 
 def _list_schema(schema: CoreSchema, counts: Container[int], text: str) -> CoreSchema:
@@ -442,19 +443,19 @@ def _problem(item: ErrorDetails) -> tuple[Place, str]:
     """Return the place of a problem and its text."""
     kind = item["type"]
     node = item["input"]
-    last = item["loc"][-1]
-    above = [part for part in item["loc"][:-1] if part not in _TAGS]
-    location = [*above, last] if kind == "extra_forbidden" or last not in _TAGS else above
+    key = item["loc"][-1]
+    parents = [part for part in item["loc"][:-1] if part not in _TAGS]
+    location = [*parents, key] if kind == "extra_forbidden" or key not in _TAGS else parents
     path = dotted(location)
     section = recipe_file()
-    for part in above:
+    for part in parents:
         section = section.INNER.get(str(part), section)
     in_range = len(item["loc"]) > len(location)
     if kind == "extra_forbidden":
-        why = why_no_key(str(last), section, recipe_file())
+        why = why_no_key(str(key), section, recipe_file())
         return node.place, f"{path}: {'no part of a range' if in_range else why}"
     if kind == "missing":
-        what = "" if in_range else f", {section.LEAVES[str(last)].allowed()}"
+        what = "" if in_range else f", {section.LEAVES[str(key)].allowed()}"
         return node.place, f"{path}: must be given{what}"
     if kind == "rule":
         return node.place, "\n".join(f"{path}: {text}" for text in item["msg"].splitlines())
@@ -488,22 +489,22 @@ def _section(path: str, model: type[BaseModel], extra: type[Closed] = Closed) ->
     inner: dict[str, type[Section]] = {}
     fields: dict[str, Any] = {}
     for name, info in {**model.model_fields, **extra.model_fields}.items():
-        below = join(path, name)
+        field_path = join(path, name)
         kind, nullable = _without_none(info.annotation)
         arguments = get_args(kind)
         if get_origin(kind) is tuple and arguments[1:] == (...,):
-            item = inner[name] = _section(f"{below}[]", arguments[0])
+            item = inner[name] = _section(f"{field_path}[]", arguments[0])
             (item.MAX_ITEMS,) = (m.max_length for m in info.metadata if isinstance(m, MaxLen))
             item.LIST_DESCRIPTION = _one_line(info.description)
             validator = WrapValidator(partial(_read_list, item))
             limit = Field(max_length=item.MAX_ITEMS)
             fields[name] = (Annotated[list[item] | None, limit, validator], None)
         elif isinstance(kind, type) and issubclass(kind, BaseModel):
-            inner[name] = _section(below, kind, _EffectFields if nullable else Closed)
+            inner[name] = _section(field_path, kind, _EffectFields if nullable else Closed)
             fields[name] = (inner[name] | None, None)
         else:
             rangeable = bool(path) and name not in extra.model_fields and kind != Digest
-            leaf = leaves[name] = Leaf.of(below, info, rangeable=rangeable)
+            leaf = leaves[name] = Leaf.of(field_path, info, rangeable=rangeable)
             text = leaf.description + (f" [{leaf.unit}]" if leaf.unit else "")
             fields[name] = (leaf.type, Field(default=info.default, description=text))
     title = model.__name__ if path else "ClimateGS recipe"
@@ -525,7 +526,7 @@ def _read_list(item: type[Section], node: Node, handler: ValidatorFunctionWrapHa
 
 
 def _without_none(annotation: Any) -> tuple[Any, bool]:
-    """The annotation without `| None`, and whether None was there."""
+    """Return the annotation without `| None`, and whether None was part of it."""
     if get_origin(annotation) not in (Union, types.UnionType):
         return annotation, False
     members = [member for member in get_args(annotation) if member is not type(None)]
@@ -576,8 +577,8 @@ def _ends(name: str, value: Value | list[Given], leaf: Leaf | None) -> list[tupl
         low, high = (tuple(_extremes(item, end) for item in value) for end in (min, max))
         if low == high:
             return [(name, low, "")]
-        where = f"all {name} at the %s ends of their ranges"
-        return [(name, low, where % "low"), (name, high, where % "high")]
+        text = f"all {name} at the %s ends of their ranges"
+        return [(name, low, text % "low"), (name, high, text % "high")]
     probes = value.probes()
     numbers = [p for p in probes if is_number(p)]
     options = [p for p in probes if p is None or isinstance(p, str | bool)]

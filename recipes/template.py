@@ -52,15 +52,15 @@ class RecipeTemplate:
         if variant < 0 or not leaf.accepts(number):
             allowed = leaf.allowed(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
-        where = f"{self.source}: variant {number}"
+        prefix = f"{self.source}: variant {number}"
         names = {"version": VERSION, "name": self.name, "seed": self.seed, "variant": number}
         try:
             fields = _draw(self.given, Draws(self.seed, number), "")
             return with_digest(Recipe.model_validate(names | fields))
         except ValidationError as error:
-            raise RecipeError(*(f"{where}: {text}" for text in readable(error))) from None
+            raise RecipeError(*(f"{prefix}: {text}" for text in readable(error))) from None
         except ValueError as error:  # a file that cannot be read
-            raise RecipeError(f"{where}: {error}") from None
+            raise RecipeError(f"{prefix}: {error}") from None
         except RecipeError as error:
             raise RecipeError(f"{self.source}: {error}") from None
 

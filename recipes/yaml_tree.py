@@ -26,7 +26,7 @@ from ruamel.yaml.reader import ReaderError
 
 from recipes.errors import Place, Problems, short
 
-MAX_DEPTH = 32
+MAX_DEPTH = 32  # most levels of nesting
 MAX_NODES = 20_000  # counted after aliases are expanded, so nested aliases cannot multiply
 MAX_DIGITS = 400  # a longer run of digits is no number that any field takes
 
@@ -155,8 +155,8 @@ class _Reader:
         elif isinstance(event, SequenceStartEvent):
             node = ListNode(place)
             while not isinstance(event_of_item := next(self._events), SequenceEndEvent):
-                below = f"{path}[{len(node)}]"
-                node.append(self.node(event_of_item, path=below, depth=depth + 1))
+                item_path = f"{path}[{len(node)}]"
+                node.append(self.node(event_of_item, path=item_path, depth=depth + 1))
         else:
             node = MapNode(place)
             while not isinstance(event_of_key := next(self._events), MappingEndEvent):
@@ -175,11 +175,11 @@ class _Reader:
         if key == "<<":
             text = "merge keys (<<) are not read; write the fields out, or use *alias as a value"
             raise place.error(text)
-        below = f"{path}.{short(key)}" if path else short(key)
-        value = self.node(next(self._events), place=place, path=below, depth=depth + 1)
+        entry_path = f"{path}.{short(key)}" if path else short(key)
+        value = self.node(next(self._events), place=place, path=entry_path, depth=depth + 1)
         if key in into:
-            first = into[key].place.line
-            self._problems.add(place, f"{below} is given twice (first on line {first})")
+            first_line = into[key].place.line
+            self._problems.add(place, f"{entry_path} is given twice (first on line {first_line})")
         else:
             into[key] = value
 
@@ -192,9 +192,9 @@ class _Reader:
 
     def _count_nodes(self, node: Node, place: Place, depth: int) -> None:
         self._count_node(place, depth)
-        inner = node.values() if isinstance(node, MapNode) else node
-        for below in () if isinstance(inner, ScalarNode) else inner:
-            self._count_nodes(below, place, depth + 1)
+        items = node.values() if isinstance(node, MapNode) else node
+        for item in () if isinstance(items, ScalarNode) else items:
+            self._count_nodes(item, place, depth + 1)
 
 
 def check_text(text: str, place: Place) -> None:
@@ -226,10 +226,10 @@ def _events(text: str, place: Place) -> Iterator[Event]:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line if mark else 0
-        what = short(" ".join(filter(None, (error.context, error.problem))), 160)
+        problem = short(" ".join(filter(None, (error.context, error.problem))), 160)
         tab = "\t" in "".join(text.splitlines()[line : line + 1])
         hint = "; the line holds a tab: indent and separate with spaces" if tab else ""
-        raise _invalid(place, line, what + hint) from None
+        raise _invalid(place, line, problem + hint) from None
     except (YAMLError, ValueError, OverflowError) as error:
         # The parser lets chr() and int() raise on escapes and directives that are out of range.
         raise _invalid(place, 0, short(str(error), 160)) from None
