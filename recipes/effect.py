@@ -20,12 +20,15 @@ Value = float | int | str | bool | None
 class Knob:
     """A field that trades speed for accuracy; `climategs bench trade` measures each value.
 
-    path: dotted, on a model from its section. values: from the fastest to the most accurate, which
-    is reference. what: of which error and which time, in a few words. rank: those that save most
-    have the lowest, and first call on an error that is allowed. chosen: whether a tier or a target
-    may set it; else it is only measured: it says what is written, or has no value that saves time.
-    tiers: what a tier sets in place of reference. works: whether it has an effect in a section.
-    section: its dotted path.
+    path: dotted path of the field; in a model, from the model's section.
+    values: from the fastest to the most accurate, which is the reference.
+    what: the setting in a few words, for tables.
+    rank: order in which knobs use up an error that is allowed; those that save most are lowest.
+    chosen: if True, a tier or a target may set the knob. If False, it is only measured: the field
+        says what is written, or none of its values saves time.
+    tiers: value by tier, where that is not the reference.
+    works: function of a section, True if the knob changes anything there.
+    section: dotted path of the section.
     """
 
     path: str
@@ -46,12 +49,16 @@ class Knob:
 class Column:
     """A column of manifests, and how people are told what it holds.
 
-    value: of a section; NaN and null are absent. absent: without the section; None makes it a
-    column of words. shows: which numbers say that the effect is there: all, or all but 0. refutes:
-    whether the others say that it is not, whatever further columns say. title,
-    unit: of the number shown, which is `factor` times the column's or `over` over it. linear: its
-    axis is not logarithmic, however far it is spread. label: before it, where an image's weather is
-    told in a few words. caption: of a contact sheet, from all shown numbers by column.
+    value: function of a section; NaN and None mean that there is no value.
+    absent: value where the recipe has no such section; None for a column of words.
+    shows: numbers that mean that the effect is present: "all", or all but 0 ("nonzero"); None if
+        the column says nothing about that.
+    refutes: if True, any other number means that the effect is absent, whatever other columns say.
+    title: title of the number on an axis.
+    unit: unit of that number, which is `factor` times the column's, or `over` divided by it.
+    linear: if True, the axis is never logarithmic.
+    label: words before the number where a few words tell an image's weather.
+    caption: template of a contact sheet's caption; takes the shown number of every column by name.
     """
 
     name: str
@@ -90,8 +97,10 @@ class Column:
 
 
 class Section(Closed):
-    """A part of a recipe. knobs: of its fields. later_fields: younger than the section; hashes
-    leave them out at their defaults.
+    """A part of a recipe.
+
+    knobs: the knobs among its fields.
+    later_fields: fields that are younger than the section. Hashes leave them out at their defaults.
     """
 
     knobs: ClassVar[tuple[Knob, ...]] = ()
@@ -101,9 +110,11 @@ class Section(Closed):
 class EffectModel(Section):
     """A section that is null where its effect is absent.
 
-    in_first_release: hashes of recipes without it say so; of a later one they say nothing.
-    file_fields: those that name files, whose contents go into the field `digest`. meant_by: keys,
-    each with the words that people write for it.
+    columns: its columns of manifests.
+    in_first_release: if True, hashes of recipes without the effect contain its null; the hashes
+        leave out later effects that are absent.
+    file_fields: fields that name files. The field `digest` covers the contents of these files.
+    meant_by: pairs of a field and its synonyms, separated by spaces.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
