@@ -44,7 +44,7 @@ Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
-    """Where the window's camera is: world_from_camera, and the size of the window in pixels."""
+    """Pose of the window's camera, world_from_camera, and the size of the window in pixels."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     position: Vector
@@ -150,7 +150,8 @@ class Uploads:
         upload.parts[part.part_index] = part.content
         upload.size_bytes += len(part.content)
         upload.last = time.monotonic()
-        start, count = upload.start, len(upload.parts)
+        start = upload.start
+        count = len(upload.parts)
         too_large = upload.size_bytes > start.size_bytes or part.part_index >= start.part_count
         if count < start.part_count and not too_large:
             return []
@@ -159,8 +160,8 @@ class Uploads:
             self._report(f"{start.filename} was not uploaded: its parts are not what was announced")
             return []
         content = b"".join(upload.parts[index] for index in range(count))
-        whole = FileTransferPart(start.source_component_uuid, start.transfer_uuid, 0, content)
-        return [msgspec.structs.replace(start, part_count=1), whole]
+        file = FileTransferPart(start.source_component_uuid, start.transfer_uuid, 0, content)
+        return [msgspec.structs.replace(start, part_count=1), file]
 
     def progress(self, message: FileTransferStartUpload | FileTransferPart) -> tuple[int, int]:
         """Bytes of the message's file so far, and of all of it; of one that has ended or was
@@ -187,8 +188,8 @@ class PageConnection(ServerConnection):
     `report` says on the page what was refused.
     """
 
-    def __init__(self, *args: Any, **own: Any) -> None:
-        super().__init__(*args, **own)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self.widget_of: Callable[[str], Any] = lambda _: None
         self.report: Callable[[str], None] = _LOG.debug
         self._uploads = Uploads(lambda text: self.report(text))
@@ -242,7 +243,7 @@ class PageConnection(ServerConnection):
         else:
             admitted = self._uploads.add(message)
         so_far, total = self._uploads.progress(message)
-        told = {
+        acknowledgement = {
             "type": "FileTransferPartAck",
             "source_component_uuid": message.source_component_uuid,
             "transfer_uuid": message.transfer_uuid,
@@ -250,7 +251,7 @@ class PageConnection(ServerConnection):
             "total_bytes": total,
         }
         if not admitted:  # else viser tells
-            await self.send(frame_of(told))
+            await self.send(frame_of(acknowledgement))
         return admitted
 
     def _forget_idle(self) -> None:

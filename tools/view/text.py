@@ -58,8 +58,8 @@ def table(
     for number, cells in enumerate(rows):
         lines.append(_row("td", cells, is_bold=number < len(bold) and bold[number]))
     body = "".join(lines)
-    own = 'border="1" bordercolor="#c8c8c8" cellpadding="4" style="border-collapse:collapse"'
-    return f'<div style="{STYLE}"><table {own}>{body}</table></div>'
+    attributes = 'border="1" bordercolor="#c8c8c8" cellpadding="4" style="border-collapse:collapse"'
+    return f'<div style="{STYLE}"><table {attributes}>{body}</table></div>'
 
 
 def _row(tag: str, cells: Iterable[object], *, is_bold: bool = False) -> str:
