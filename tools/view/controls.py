@@ -117,7 +117,7 @@ class Control:
     kind: Kind
     """The widget that it gets."""
     hint: str
-    """What the field means, and its unit."""
+    """The field's meaning, and its unit."""
     nullable: bool = False
     """Whether the field may be null."""
     default: Any = None
@@ -131,11 +131,11 @@ class Control:
     least_value: float | None = None
     """The smallest value but 0 of a logarithmic slider; None for one that follows from its ends."""
     way: Literal["linear", "log", "both sides"] = "linear"
-    """How the way along its slider stands for the values."""
+    """The scale of its slider: how a position stands for a value."""
     whole: bool = False
     """Whether it has no fractions."""
     words: tuple[str, ...] = ()
-    """What may be chosen, where that can be listed."""
+    """The values to choose from, where they can be listed."""
 
     @property
     def label(self) -> str:

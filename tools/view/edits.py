@@ -1,4 +1,4 @@
-"""What a page has changed of a recipe: texts of `--set`, so that a command line says the same."""
+"""Changes of a recipe by a page, as texts of `--set`: a command line can say the same."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Edits:
         return self
 
     def command(self, where: str) -> str:
-        """The command line that renders this. where: its scene, frames and cameras."""
+        """Return the command line that renders this. where: its scene, frames and cameras."""
         sets = " ".join(f"--set {shlex.quote(text)}" for text in self.sets())
         scale = "" if self.scale == 1 else f"--scale {self.scale:g}"
         words = ("climategs render", shlex.quote(self.source), sets, scale, "--variants 1", where)
@@ -135,7 +135,7 @@ def _short(value: Any) -> Any:
 
 
 def without_weather(recipe: Recipe) -> Recipe:
-    """The same picture before any effect, through a clean camera."""
+    """Return the recipe of the same picture without effects, through a clean camera."""
     for section in recipe.sections():
         recipe = replaced(recipe, section, None)
     return recipe.model_copy(update={"camera": Sensor()})

@@ -27,11 +27,12 @@ from websockets.asyncio.server import ServerConnection
 from augment.errors import ClimateGSError
 from tools.view.widgets import value_of
 
-MAX_MESSAGE_BYTES = 2**20  # of one message; a browser cuts files into parts of half as much
-MAX_UPLOAD_BYTES = 64 * 2**20  # of the files that a page has begun to upload
-MAX_UPLOADS = 4  # that a page has begun and not ended
-UPLOAD_S = 60.0  # without a part, after which an upload is given up
-MAX_TEXT = 65_536  # characters that a person may write into a widget
+# The largest message, bytes; a browser cuts files into parts of half as much.
+MAX_MESSAGE_BYTES = 2**20
+MAX_UPLOAD_BYTES = 64 * 2**20  # The largest sum of a page's uploads at one time, bytes.
+MAX_UPLOADS = 4  # The most uploads of a page at one time.
+UPLOAD_S = 60.0  # The time without a part after which an upload is given up, seconds.
+MAX_TEXT = 65_536  # The longest text in a widget, characters.
 _LOG = logging.getLogger(__name__)
 
 Name = Annotated[str, Meta(max_length=128)]

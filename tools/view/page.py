@@ -60,8 +60,8 @@ MAX_NAME = 64  # The longest name of an uploaded file, characters.
 MAX_TASKS = 8  # The most tasks of a page that may wait.
 MAX_ASPECT = 8.0  # The largest ratio of a window's longer side to its shorter one.
 _MAIN_NAMES = [name for names in MAIN_FIELDS.values() for name in names]
-# Names of several fields that come first, and of the preset of the whole recipe: not without their
-# section.
+# The names that are shown with their section: those of several main fields, and "preset", which is
+# also the name of the whole recipe's dropdown.
 SHARED_NAMES = {"preset", *(name for name in _MAIN_NAMES if _MAIN_NAMES.count(name) > 1)}
 BAR_FULL = 100.0  # The value of a full progress bar, percent.
 _ERROR = "color:#c92a2a"  # The CSS of an error message.

@@ -163,8 +163,8 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
 
 
 def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
-    """The recipe with the shortcuts of the rasteriser that a moving picture hides, and without what
-    nobody looks at; none that has anything prepared anew.
+    """Return the recipe of a picture while something moves: with shortcuts of the rasteriser, and
+    without outputs that the page does not show. No change makes a preparation run again.
     """
     if shows == PICTURE and not with_depth:
         changes = {"depth": "none", "semantic": False, "instance": False, "labels": False}
@@ -236,7 +236,7 @@ _CLASS_COLORS = _class_colors()
 
 
 def in_window(view: Shown, place: Place) -> Shown:
-    """The image with the window's bars around it."""
+    """Return the image with the window's bars around it."""
     height, width = view.rgb.shape[:2]
     right = place.size[0] - place.left - width
     bottom = place.size[1] - place.top - height

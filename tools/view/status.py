@@ -1,4 +1,4 @@
-"""The line that says what a page shows, what is being done for it, and how far that has got.
+"""The status line of a page: its picture, the work for the next one, and how far that has got.
 
 "At rest" is said of nothing but the whole picture of what the page asks for now.
 """
@@ -24,13 +24,13 @@ class ShownPicture:
     """The picture that a page has got last."""
 
     wish: Wish
-    """What the page asked for."""
+    """The wish of the page that it was drawn for."""
     width: int
     """Its columns, without bars."""
     height: int
     """Its rows, without bars."""
     seconds: float
-    """How long it took."""
+    """The time that it took, seconds."""
     at: float
     """When it was sent, on the monotonic clock."""
     is_rest: bool

@@ -12,10 +12,12 @@ import html
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-MAX_LENGTH = 20_000  # characters of one text; a page is not there to read a file of megabytes
+# The longest text on a page, characters: a page is not there to read a file of megabytes.
+MAX_LENGTH = 20_000
+# The CSS of all texts.
 STYLE = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
-# Categories of Unicode that are not shown but change what is: controls, formats (also those that
-# turn the direction of writing), and surrogates, which cannot be sent.
+# The Unicode categories of characters that are invisible but change the text around them: controls,
+# formats (also those that turn the direction of writing), and surrogates, which cannot be sent.
 _HIDDEN = ("Cc", "Cf", "Cs")
 
 

@@ -41,7 +41,7 @@ def value_of(widget: Any, sent: Any) -> Any:
 
 
 def _cast(sent: Any, now: Any) -> Any:
-    """The value as one of the kind that the widget has now; None where it is of another."""
+    """Return the value in the kind that the widget has now; None where it is of another."""
     if isinstance(now, bool | str):
         return sent if type(sent) is type(now) else None
     if isinstance(now, int | float):
