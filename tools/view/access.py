@@ -25,9 +25,9 @@ from urllib.parse import parse_qsl
 
 from augment.errors import ClimateGSError
 
-TOKEN_BYTES = 24  # of the secret in the printed address
-TOKEN_FIELD = "token"  # of the address's query
-MAX_PAGES = 32  # that are open at one time
+TOKEN_BYTES = 24  # The length of the secret in the printed address, bytes.
+TOKEN_FIELD = "token"  # The field of the address's query that holds the secret.
+MAX_PAGES = 32  # The most pages that are open at one time.
 _HOST = re.compile(r"(?P<name>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?")
 _REFUSAL = (
     "This is climategs view. Its pages open at the address that the command has printed, with the "
@@ -168,9 +168,12 @@ def _guarded_handshakes(
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
-    plain, guards = module.serve, list[Any]()
+    plain_serve = module.serve
+    guards = list[Any]()
 
-    def guarded(handler: Any, *args: Any, process_request: Callable[..., Any], **own: Any) -> Any:
+    def guarded_serve(
+        handler: Any, *args: Any, process_request: Callable[..., Any], **viser_options: Any
+    ) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             port = connection.local_address[1]
             if access.refusal(request.path, request.headers, port) is not None:
@@ -182,8 +185,8 @@ def _guarded_handshakes(
                 del request.headers["Accept-Encoding"]  # a script is put into the page's text
             response = process_request(connection, request)
             if response is not None:
-                own = f"<script>{script}</script></body>".encode()
-                response.body = response.body.replace(b"</body>", own)
+                script_and_end = f"<script>{script}</script></body>".encode()
+                response.body = response.body.replace(b"</body>", script_and_end)
                 headers = access.page_headers(request.headers["Host"], port)
                 for name, value in {**headers, "Content-Length": str(len(response.body))}.items():
                     if name in response.headers:
@@ -192,18 +195,19 @@ def _guarded_handshakes(
             return response
 
         guards.append(access)
-        return plain(handler, *args, process_request=answer, **{**own, **options})
+        merged = {**viser_options, **options}
+        return plain_serve(handler, *args, process_request=answer, **merged)
 
     def _text(status: http.HTTPStatus, text: str) -> Any:
         body = text.encode()
         headers = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
         return Response(status.value, status.phrase, Headers(headers), body)
 
-    module.serve = guarded
+    module.serve = guarded_serve
     try:
         yield guards
     finally:
-        module.serve = plain
+        module.serve = plain_serve
 
 
 def _cookie(port: int) -> str:

@@ -1,4 +1,4 @@
-"""What a page needs of the browser beside viser's widgets: which keys fly, and one style."""
+"""Script and style of a page beside viser's widgets: the keys that fly, and the looks."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Controls of a recipe's fields, made by walking its models: what there is to set, between which
-ends, how a slider's way stands for values that span decades, and which fields come first. Nothing
-of a page is in here.
+"""Controls of a recipe's fields, made by walking its models: the fields to set, the ends of each,
+the values along a slider that spans decades, and the order of the fields. Nothing of a page is in
+here.
 """
 
 from __future__ import annotations
@@ -20,16 +20,20 @@ from recipes.ranges import is_number
 from recipes.recipe_file import Leaf, Section, recipe_file
 from recipes.schema import SECTIONS
 
-STEPS = 400  # of a slider
-MAX_LINEAR = 10.0  # from it on a slider of numbers that are not negative is logarithmic
-DECADES = 6  # that a slider spans at most
-SEEN = 0.7  # the way along a logarithmic slider at which an effect is likely to be seen
-LEAST = 1e-3  # of a logarithmic slider; 0 lies at its left end, where it is allowed
-MAX_WORDS_WHOLE = 1000  # whole numbers in a wider range have no slider
-MAX_HINT = 180  # characters of a tooltip
-BOX_DIGITS = 3  # more of the box than a step of it has
-MAX_MARKS = 5  # along a logarithmic slider, a decade from each other
-MIN_WAY_OF_MARKS = 0.15  # between two marks: their words would run into each other
+STEPS = 400  # The number of steps of a slider.
+# The upper end from which on a slider of numbers that are not negative is logarithmic.
+MAX_LINEAR = 10.0
+DECADES = 6  # The most decades that a slider spans.
+# The position on a logarithmic slider, 0 to 1, at which an effect is likely to be visible.
+VISIBLE_POSITION = 0.7
+# The smallest value but 0 of a logarithmic slider; 0 lies at its left end, where it is allowed.
+MIN_LOG_VALUE = 1e-3
+MAX_SLIDER_INTEGERS = 1000  # The widest range of whole numbers that has a slider.
+MAX_HINT = 180  # The longest tooltip, characters.
+BOX_DIGITS = 3  # The digits of a box after those of its step.
+MAX_MARKS = 5  # The most marks along a logarithmic slider, a decade from each other.
+# The least distance of two marks, of a slider's length: else their words run into each other.
+MIN_MARK_DISTANCE = 0.15
 
 # The fields that a page shows first, by section: what a weather report or a road user would say of
 # the weather. All others, and effects without an entry, come under "more".
@@ -83,8 +87,9 @@ USEFUL_ENDS = {
     "render.radius_clip_px": (0.1, 10.0),
     "render.lod_px": (0.1, 10.0),
 }
-FULL_TURN = 360.0  # degrees: directions run from 0, though models allow -360 to 360 of them
-MAX_BOTH_SIDES = 100.0  # a slider of both signs without an entry runs no farther to either side
+# A full turn, degrees: directions run from 0, though models allow -360 to 360 of them.
+FULL_TURN = 360.0
+MAX_BOTH_SIDES = 100.0  # The largest absolute value on a slider of both signs without an entry.
 
 # By the end of a field's name, the longer end first.
 UNIT_SYMBOLS = {
@@ -112,7 +117,7 @@ class Control:
     kind: Kind
     """The widget that it gets."""
     hint: str
-    """What the field means, and its unit."""
+    """The field's meaning, and its unit."""
     nullable: bool = False
     """Whether the field may be null."""
     default: Any = None
@@ -126,11 +131,11 @@ class Control:
     least_value: float | None = None
     """The smallest value but 0 of a logarithmic slider; None for one that follows from its ends."""
     way: Literal["linear", "log", "both sides"] = "linear"
-    """How the way along its slider stands for the values."""
+    """The scale of its slider: how a position stands for a value."""
     whole: bool = False
     """Whether it has no fractions."""
     words: tuple[str, ...] = ()
-    """What may be chosen, where that can be listed."""
+    """The values to choose from, where they can be listed."""
 
     @property
     def label(self) -> str:
@@ -144,19 +149,19 @@ class Control:
     @property
     def tooltip(self) -> str:
         """The hint's first sentence, cut at a word where it is long; and the unit."""
-        said, bracket, unit = self.hint.partition(" [")
-        return shorten(said) + (bracket + unit)
+        meaning, bracket, unit = self.hint.partition(" [")
+        return shorten(meaning) + (bracket + unit)
 
     @property
     def has_box(self) -> bool:
-        """Whether the exact number has a box of its own: the slider's takes no other values than
-        the slider, and of one that is not linear it holds the place along the way.
+        """True if the exact number has a separate box. The box that belongs to a slider takes only
+        the slider's values; if the slider is not linear, it holds a position and not a value.
         """
         return self.way != "linear" or (self.low, self.high) != self.valid
 
     @property
     def step(self) -> float:
-        """Of a linear slider: a power of ten, or twice or five times one."""
+        """Step of a linear slider: a power of ten, or twice or five times one."""
         if self.whole:
             return 1
         exact = (self.high - self.low) / STEPS
@@ -165,7 +170,7 @@ class Control:
 
     @property
     def box_step(self) -> float:
-        """What an arrow beside the box adds."""
+        """Change of the box's number by an arrow beside it."""
         return self.step if self.way == "linear" else self.least
 
     @property
@@ -195,7 +200,7 @@ class Control:
             return 0.01
         if self.least_value is not None:
             return self.least_value
-        return self.low if self.low > 0 else max(self.high * 10.0**-DECADES, LEAST)
+        return self.low if self.low > 0 else max(self.high * 10.0**-DECADES, MIN_LOG_VALUE)
 
     @property
     def marks(self) -> tuple[tuple[float, str], ...]:
@@ -212,43 +217,43 @@ class Control:
         both = self.way == "both sides"
         first = 0 if both else math.ceil(math.log10(self.least) - 1e-9)
         last = math.floor(math.log10(self.high) + 1e-9)
-        every = 1 if last - first < MAX_MARKS else 2
-        values = [10.0**power for power in range(first, last + 1, every)]
+        mark_decades = 1 if last - first < MAX_MARKS else 2
+        values = [10.0**power for power in range(first, last + 1, mark_decades)]
         if both:
             values = [*(-value for value in reversed(values) if value <= -self.low), 0.0, *values]
-        elif self.low <= 0 and self.way_of(values[0]) > MIN_WAY_OF_MARKS:
+        elif self.low <= 0 and self.way_of(values[0]) > MIN_MARK_DISTANCE:
             values = [0.0, *values]
         words = [_brief(value) for value in values]
         words[-1] = f"{words[-1]} {self.unit}".strip()
         return tuple(zip(values, words, strict=True))
 
-    def value_at(self, way: float) -> float:
-        """What a slider of this field stands for so far along its way, 0 to 1: three digits."""
+    def value_at(self, position: float) -> float:
+        """Return the value at a position on the slider, 0 to 1, to three digits."""
         if self.way == "log":
-            if way <= 0 and self.low <= 0:
+            if position <= 0 and self.low <= 0:
                 return max(self.low, 0.0)
             low = math.log(self.least)
-            value = math.exp(low + way * (math.log(self.high) - low))
+            value = math.exp(low + position * (math.log(self.high) - low))
         elif self.way == "both sides":
             most = max(-self.low, self.high)
-            value = self.least * math.sinh((2 * way - 1) * math.asinh(most / self.least))
+            value = self.least * math.sinh((2 * position - 1) * math.asinh(most / self.least))
         else:
-            value = self.low + way * (self.high - self.low)
+            value = self.low + position * (self.high - self.low)
         return min(max(float(f"{value:.3g}"), self.low), self.high)
 
     def way_of(self, value: float) -> float:
-        """Where a slider stands for a value; at an end where the value lies beyond."""
+        """Return the position of a value on the slider, 0 to 1; an end if the value lies beyond."""
         if self.way == "log":
             if value <= self.least:
                 return 0.0
             low = math.log(self.least)
-            way = (math.log(value) - low) / (math.log(self.high) - low)
+            position = (math.log(value) - low) / (math.log(self.high) - low)
         elif self.way == "both sides":
             most = math.asinh(max(-self.low, self.high) / self.least)
-            way = (math.asinh(value / self.least) / most + 1) / 2
+            position = (math.asinh(value / self.least) / most + 1) / 2
         else:
-            way = (value - self.low) / (self.high - self.low)
-        return min(max(way, 0.0), 1.0)
+            position = (value - self.low) / (self.high - self.low)
+        return min(max(position, 0.0), 1.0)
 
 
 def shorten(text: str) -> str:
@@ -294,8 +299,8 @@ class Group:
     @property
     def rest(self) -> Group:
         """The group without its main controls."""
-        others = tuple(control for control in self.controls if control not in self.main)
-        return replace(self, controls=others)
+        controls = tuple(control for control in self.controls if control not in self.main)
+        return replace(self, controls=controls)
 
     def walk(self) -> Iterator[Control]:
         """Its controls, then those of the sections in it."""
@@ -326,19 +331,20 @@ def split_by_rank(groups: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Gro
 
 def _group(section: type[Section], *, optional: bool) -> Group:
     fields = section.MODEL.model_fields
-    # What a section's files hold is worked out.
-    is_effect = issubclass(section.MODEL, EffectModel) and section.MODEL.file_fields
-    left_out = {"digest"} if is_effect else set[str]()
-    leaves = [leaf for name, leaf in section.LEAVES.items() if name in fields.keys() - left_out]
+    # The digest of a section's files is computed, not set.
+    has_files = issubclass(section.MODEL, EffectModel) and section.MODEL.file_fields
+    names = fields.keys() - ({"digest"} if has_files else set[str]())
+    leaves = [leaf for name, leaf in section.LEAVES.items() if name in names]
     lists = [inner for inner in section.INNER.values() if inner.MAX_ITEMS is not None]
     sections = (inner for inner in section.INNER.values() if inner.MAX_ITEMS is None)
-    inner = [each for each in sections if each.PATH not in SECTIONS]  # effects have their own
+    # Effects have groups of their own.
+    inner_sections = [inner for inner in sections if inner.PATH not in SECTIONS]
     return Group(
         path=section.PATH,
         hint=" ".join((section.MODEL.__doc__ or "").split()),
         optional=optional,
         controls=(*map(_control, leaves), *map(_list_control, lists)),
-        groups=tuple(_group(each, optional=False) for each in inner),
+        groups=tuple(_group(inner, optional=False) for inner in inner_sections),
     )
 
 
@@ -351,59 +357,63 @@ def _control(leaf: Leaf) -> Control:
     default = None if leaf.info.is_required() else leaf.info.default
     unit = f" [{leaf.unit}]" if leaf.unit else ""
     hint = f"{leaf.description}{unit}"
-    own = {"path": leaf.path, "hint": hint, "nullable": leaf.nullable, "default": default}
+    attributes = {"path": leaf.path, "hint": hint, "nullable": leaf.nullable, "default": default}
     if leaf.kind is bool:
-        return Control(kind="flag", **own)
+        return Control(kind="flag", **attributes)
     if leaf.is_number:
-        return _numeric(leaf, own)
+        return _numeric(leaf, attributes)
     if leaf.channel is not None:
         high = dict(leaf.channel.limits).get("<=", math.inf)
-        return Control(kind="colour" if high == 1 else "rates", high=high, **own)
+        return Control(kind="colour" if high == 1 else "rates", high=high, **attributes)
     if leaf.annotation == FilePath:
-        return Control(kind="file", **own)
+        return Control(kind="file", **attributes)
     if leaf.words:
         boolean = ("true", "false") if leaf.accepts(True) else ()
-        return Control(kind="words", words=(*boolean, *leaf.words), **own)
-    return Control(kind="text", **own)
+        return Control(kind="words", words=(*boolean, *leaf.words), **attributes)
+    return Control(kind="text", **attributes)
 
 
-def _numeric(leaf: Leaf, own: dict[str, Any]) -> Control:
+def _numeric(leaf: Leaf, attributes: dict[str, Any]) -> Control:
     limits = dict(leaf.limits)
     low = limits.get(">=", limits.get(">", -math.inf))
     high = limits.get("<=", limits.get("<", math.inf))
-    whole = leaf.kind is int
-    if math.isinf(low) or math.isinf(high) or (whole and high - low > MAX_WORDS_WHOLE):
-        return Control(kind="number", low=low, high=high, valid=(low, high), whole=whole, **own)
+    is_integer = leaf.kind is int
+    ends = (low, high)
+    if any(map(math.isinf, ends)) or (is_integer and high - low > MAX_SLIDER_INTEGERS):
+        return Control(
+            kind="number", low=low, high=high, valid=ends, whole=is_integer, **attributes
+        )
     start, end = _useful_ends(leaf.path, low, high)
-    way: Literal["linear", "log", "both sides"] = "linear"
+    scale: Literal["linear", "log", "both sides"] = "linear"
     least = None
-    if not whole and "_deg" not in leaf.path:
+    if not is_integer and "_deg" not in leaf.path:
         # By what the model allows: a field that may span decades is thought of in decades.
         if low >= 0 and (high >= MAX_LINEAR or (low > 0 and high > 100 * low)):
-            way, least = "log", start or None
+            scale = "log"
+            least = start or None
             start = 0.0 if low == 0 else start
         elif start < 0 and end - start > 2 * MAX_LINEAR:
-            way = "both sides"
+            scale = "both sides"
     control = Control(
         kind="slider",
         low=start,
         high=end,
-        valid=(low, high),
+        valid=ends,
         least_value=least,
-        way=way,
-        whole=whole,
-        **own,
+        way=scale,
+        whole=is_integer,
+        **attributes,
     )
     if ">" not in limits:
         return control
     # The end itself is not allowed.
-    first = low + control.step if way == "linear" else low + min(control.least, LEAST)
-    start = control.least if way == "log" else max(start, first)
+    first = low + (control.step if scale == "linear" else min(control.least, MIN_LOG_VALUE))
+    start = control.least if scale == "log" else max(start, first)
     return replace(control, low=start, valid=(first, high))
 
 
 def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
-    """The ends of a field's slider. low, high: the ends of what the model allows."""
+    """Return the ends of a field's slider. low, high: the ends of what the model allows."""
     if path in USEFUL_ENDS:
         return USEFUL_ENDS[path]
     if path.endswith("_deg") and (low, high) == (-FULL_TURN, FULL_TURN):
@@ -414,20 +424,23 @@ def _useful_ends(path: str, low: float, high: float) -> tuple[float, float]:
 
 
 def start_of_model(section: str) -> dict[str, Any]:
-    """Values that make a valid section which changes something: the middle of what must be given,
-    and of one field more where the section's rules want one, or where it is 0.
+    """Return values of a valid section that changes something: the middle of every required field;
+    and of one field more where the section's rules want one, or where that field is 0.
     """
-    model, controls = SECTIONS[section], group_of(section).controls
+    model = SECTIONS[section]
+    controls = group_of(section).controls
     required = [c for c in controls if model.model_fields[c.label].is_required()]
-    needed = {c.label: c.value_at(SEEN) if c.way == "log" else c.start for c in required}
+    required_values = {
+        c.label: c.value_at(VISIBLE_POSITION) if c.way == "log" else c.start for c in required
+    }
     optional = [{c.label: c.start} for c in controls if c.nullable and is_number(c.start)]
     zero = [c for c in controls if c.kind == "slider" and c.default == 0 and not c.nullable]
-    some = [{c.label: (int if c.whole else float)(c.value_at(0.2))} for c in zero]
-    for more in ({}, *optional, *some):
+    small = [{c.label: (int if c.whole else float)(c.value_at(0.2))} for c in zero]
+    for extra_values in ({}, *optional, *small):
         try:
-            made = model.model_validate(needed | more)
+            effect = model.model_validate(required_values | extra_values)
         except ValidationError:
             continue
-        if made.changes:
-            return needed | more
-    return needed
+        if effect.changes:
+            return required_values | extra_values
+    return required_values

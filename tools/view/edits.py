@@ -1,4 +1,4 @@
-"""What a page has changed of a recipe: texts of `--set`, so that a command line says the same."""
+"""Changes of a recipe by a page, as texts of `--set`: a command line can say the same."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
 from tools.view.controls import start_of_model
 
-# A file system that has no hard links.
+# The error numbers of a file system that has no hard links.
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 
 
@@ -53,56 +53,56 @@ class Edits:
         return replace(self, values={**self.values, **values})
 
     def with_tier(self, tier: str | None) -> Edits:
-        """In place of whatever quality the source asks for."""
-        asked = {"tier": as_yaml(tier), "max_flip": "null", "budget_ms": "null"}
-        return self.with_values({f"quality.{name}": text for name, text in asked.items()})
+        """Return edits with a tier in place of the quality that the source asks for."""
+        quality = {"tier": as_yaml(tier), "max_flip": "null", "budget_ms": "null"}
+        return self.with_values({f"quality.{name}": text for name, text in quality.items()})
 
     def with_section(self, section: str) -> Edits:
-        """The effect is there: as it was, as the source has it, or with values to start from."""
-        there = replace(self, absent=self.absent - {section})
-        if found(replace(there, values={}).recipe(), section) is not None:
-            return there
+        """Return edits with the effect: as it was, as the source has it, or with start values."""
+        edits = replace(self, absent=self.absent - {section})
+        if found(replace(edits, values={}).recipe(), section) is not None:
+            return edits
         start = as_yaml(start_of_section(section))
-        return replace(there, added={**self.added, section: start})
+        return replace(edits, added={**self.added, section: start})
 
     def without_section(self, section: str) -> Edits:
         return replace(self, absent=self.absent | {section})
 
     def sets(self) -> list[str]:
         """FIELD=VALUE as `--set` takes them, in order."""
-        gone = tuple(f"{section}." for section in self.absent)
+        prefixes = tuple(f"{section}." for section in self.absent)
         added = {path: text for path, text in self.added.items() if path not in self.absent}
-        values = {path: text for path, text in self.values.items() if not path.startswith(gone)}
+        values = {path: text for path, text in self.values.items() if not path.startswith(prefixes)}
         absent = dict.fromkeys(sorted(self.absent), "null")
         return [f"{path}={text}" for path, text in {**added, **values, **absent}.items()]
 
     def recipe(self) -> Recipe:
-        """In numbers.
+        """Return the edited recipe, with numbers in place of ranges.
 
         Raises:
-            RecipeError: what comes out is no valid recipe.
+            RecipeError: the edits make no valid recipe.
         """
         overrides = read_overrides(self.sets(), "changed", folder=self.folder)
         return scaled_recipe(load_recipe(self.source, overrides).resolve(0), self.scale)
 
-    def giving_way(self, changed: str, others: tuple[str, ...]) -> Edits:
-        """The edits if they are valid, else without the first of the other fields that contradicts
+    def giving_way(self, changed: str, nullable_paths: tuple[str, ...]) -> Edits:
+        """Return the edits if they are valid, else without the first field of some that contradicts
         the changed one, such as the other of two densities.
         """
         try:
             self.recipe()
         except RecipeError:
-            for other in others:
-                edits = self.with_values({other: "null"})
+            for path in nullable_paths:
+                edits = self.with_values({path: "null"})
                 try:
                     edits.recipe()
                 except RecipeError:
                     continue
-                return edits if other != changed else self
+                return edits if path != changed else self
         return self
 
     def command(self, where: str) -> str:
-        """The command line that renders this. where: its scene, frames and cameras."""
+        """Return the command line that renders this. where: its scene, frames and cameras."""
         sets = " ".join(f"--set {shlex.quote(text)}" for text in self.sets())
         scale = "" if self.scale == 1 else f"--scale {self.scale:g}"
         words = ("climategs render", shlex.quote(self.source), sets, scale, "--variants 1", where)
@@ -113,20 +113,20 @@ def start_of_section(section: str) -> dict[str, Any]:
     """Values to start an effect with: those of the plainest preset that has it, or else the middle
     of what its fields allow.
     """
-    found_in = []
+    candidates = []
     for name in preset_names():
         recipe = load_recipe(name).resolve(0)
-        own = found(recipe, section)
-        if own is not None and own.changes:
-            start = own.model_dump(mode="json", exclude_defaults=True)
-            found_in.append((len(recipe.sections()), len(start), name, start))
-    if found_in:
-        return _short(min(found_in, key=lambda entry: entry[:3])[3])
+        effect = found(recipe, section)
+        if effect is not None and effect.changes:
+            start = effect.model_dump(mode="json", exclude_defaults=True)
+            candidates.append((len(recipe.sections()), len(start), name, start))
+    if candidates:
+        return _short(min(candidates, key=lambda entry: entry[:3])[3])
     return start_of_model(section)
 
 
 def _short(value: Any) -> Any:
-    """Floats of three digits: a preset's draws have ten."""
+    """Return a value with its floats to three digits: a preset's draws have ten."""
     if isinstance(value, dict):
         return {name: _short(below) for name, below in value.items()}
     if isinstance(value, list):
@@ -135,7 +135,7 @@ def _short(value: Any) -> Any:
 
 
 def without_weather(recipe: Recipe) -> Recipe:
-    """The same picture before any effect, through a clean camera."""
+    """Return the recipe of the same picture without effects, through a clean camera."""
     for section in recipe.sections():
         recipe = replaced(recipe, section, None)
     return recipe.model_copy(update={"camera": Sensor()})
@@ -164,14 +164,14 @@ def save_recipe(recipe: Recipe, path: Path) -> None:
         RecipeError: a file of the recipe cannot be read, or is not that of its digest.
         OutputError: the folder cannot be written.
     """
-    beside = path.with_suffix("")
+    files_dir = path.with_suffix("")
     portable = portable_recipe(recipe)
-    for section, own in portable.sections().items():
-        for name, file in own.files.items():
-            portable = replaced(portable, f"{section}.{name}", f"{beside.name}/{file}")
+    for section, effect in portable.sections().items():
+        for name, file in effect.files.items():
+            portable = replaced(portable, f"{section}.{name}", f"{files_dir.name}/{file}")
     write_new(path, dump_recipe(portable).encode())
     try:
-        copy_files(recipe, beside)
+        copy_files(recipe, files_dir)
     except BaseException:
         path.unlink(missing_ok=True)
         raise

@@ -12,9 +12,10 @@ from tools.view.edits import as_yaml
 if TYPE_CHECKING:
     from viser import GuiApi
 
-MAX_EXACT = 2**53 - 1  # the largest whole number that a browser tells from its neighbours
-WAY = 100.0  # the length of a slider that has places along its way, not values
-NONE = "(none)"
+MAX_EXACT = 2**53 - 1  # The largest whole number that a browser tells from its neighbours.
+# The upper end of a slider that has positions and not values, percent of its length.
+MAX_POSITION = 100.0
+NONE = "(none)"  # The word for null in a dropdown.
 
 When = Callable[..., None]
 Changed = Callable[[Control, str], None]
@@ -26,9 +27,9 @@ class Field:
 
     Args:
         label: What the page calls the field; None for its name.
-        when: Has a function told what people do to a widget.
-        changed: Hears the field's new value as YAML.
-        uploaded: Hears a file's name and content.
+        when: Is called with a widget and a function; calls the function with each new value.
+        changed: Is called with the control and the field's new value as YAML.
+        uploaded: Is called with the control and a file's name and content.
     """
 
     def __init__(
@@ -40,38 +41,40 @@ class Field:
         uploaded: Uploaded,
         label: str | None = None,
     ) -> None:
-        self.control, self._when, self._changed = control, when, changed
+        self.control = control
+        self._when = when
+        self._changed = changed
         self.label = label or control.label
-        self.place_slider: Any = None  # it has places along its way, not values
-        self._given: Any = None
+        self.place_slider: Any = None  # it has positions, not values
+        self._set_checkbox: Any = None
         self._parts: list[Any] = []
         make = getattr(self, f"_make_{control.kind}")
         if control.nullable and control.kind in ("slider", "number", "rates", "flag", "colour"):
-            self._given = gui.add_checkbox(f"set {self.label}", False, hint=control.tooltip)
-            self._hear(self._given, lambda there: control.start if there else None)
+            self._set_checkbox = gui.add_checkbox(f"set {self.label}", False, hint=control.tooltip)
+            self._hear(self._set_checkbox, lambda is_set: control.start if is_set else None)
         make(gui, control)
         if control.kind == "file":
             button = gui.add_upload_button(f"upload {self.label}")
             when(button, lambda file: uploaded(control, file.name, file.content), "on_upload")
 
     def show(self, value: Any) -> None:
-        """Stand at a value; telling nobody."""
-        if self._given is not None:
-            self._given.value = value is not None
+        """Show a value, without calling `changed`."""
+        if self._set_checkbox is not None:
+            self._set_checkbox.value = value is not None
             for part in self._parts:
                 part.visible = value is not None
         if value is None and self.control.kind not in ("words", "file", "text", "list"):
             return
-        for part, shown in zip(self._parts, self._shown(value), strict=True):
-            part.value = shown
+        for part, part_value in zip(self._parts, self._part_values(value), strict=True):
+            part.value = part_value
 
-    def _shown(self, value: Any) -> tuple[Any, ...]:
-        """The value as each of the widgets says it."""
+    def _part_values(self, value: Any) -> tuple[Any, ...]:
+        """Return the value in the form of each of the widgets."""
         control = self.control
         if control.kind in ("slider", "number"):
             kind = int if control.whole else float
             if control.kind == "slider" and control.has_box:
-                return (kind(value), WAY * control.way_of(value))
+                return (kind(value), MAX_POSITION * control.way_of(value))
             value = min(max(value, control.low), min(control.high, MAX_EXACT))
             return (kind(value),)
         if control.kind == "colour":
@@ -90,14 +93,14 @@ class Field:
         self._hear(part, value_of)
 
     def _hear(self, part: Any, value_of: Callable[[Any], Any]) -> None:
-        def heard(shown: Any) -> None:
-            value = value_of(shown)
-            if part is self._given or self.place_slider is not None:
+        def on_change(part_value: Any) -> None:
+            value = value_of(part_value)
+            if part is self._set_checkbox or self.place_slider is not None:
                 self.show(value)
             text = value if self.control.kind == "list" and value else as_yaml(value)
             self._changed(self.control, text)
 
-        self._when(part, heard)
+        self._when(part, on_change)
 
     # ---- One for every kind of control
 
@@ -115,18 +118,25 @@ class Field:
         )
         number.precision = control.box_digits
         self._add(number)
-        marks = tuple((WAY * control.way_of(value), word) for value, word in control.marks)
-        place = WAY * control.way_of(start)
+        marks = tuple((MAX_POSITION * control.way_of(value), word) for value, word in control.marks)
+        position = MAX_POSITION * control.way_of(start)
         is_linear = control.way == "linear"
         steps = (control.high - control.low) / control.step if is_linear else STEPS
         self.place_slider = gui.add_slider(
-            control.unit or " ", 0.0, WAY, WAY / steps, place, marks=marks, hint=control.tooltip
+            control.unit or " ",
+            0.0,
+            MAX_POSITION,
+            MAX_POSITION / steps,
+            position,
+            marks=marks,
+            hint=control.tooltip,
         )
-        self._add(self.place_slider, lambda place: kind(control.value_at(place / WAY)))
+        self._add(self.place_slider, lambda value: kind(control.value_at(value / MAX_POSITION)))
 
     def _make_number(self, gui: GuiApi, control: Control) -> None:
         kind = int if control.whole else float
-        low, high = kind(max(control.low, -MAX_EXACT)), kind(min(control.high, MAX_EXACT))
+        low = kind(max(control.low, -MAX_EXACT))
+        high = kind(min(control.high, MAX_EXACT))
         number = gui.add_number(
             self.label, kind(control.start), min=low, max=high, hint=control.tooltip
         )

@@ -27,11 +27,12 @@ from websockets.asyncio.server import ServerConnection
 from augment.errors import ClimateGSError
 from tools.view.widgets import value_of
 
-MAX_MESSAGE_BYTES = 2**20  # of one message; a browser cuts files into parts of half as much
-MAX_UPLOAD_BYTES = 64 * 2**20  # of the files that a page has begun to upload
-MAX_UPLOADS = 4  # that a page has begun and not ended
-UPLOAD_S = 60.0  # without a part, after which an upload is given up
-MAX_TEXT = 65_536  # characters that a person may write into a widget
+# The largest message, bytes; a browser cuts files into parts of half as much.
+MAX_MESSAGE_BYTES = 2**20
+MAX_UPLOAD_BYTES = 64 * 2**20  # The largest sum of a page's uploads at one time, bytes.
+MAX_UPLOADS = 4  # The most uploads of a page at one time.
+UPLOAD_S = 60.0  # The time without a part after which an upload is given up, seconds.
+MAX_TEXT = 65_536  # The longest text in a widget, characters.
 _LOG = logging.getLogger(__name__)
 
 Name = Annotated[str, Meta(max_length=128)]
@@ -44,7 +45,7 @@ Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type", forbid_unknown_fields=True):
-    """Where the window's camera is: world_from_camera, and the size of the window in pixels."""
+    """Pose of the window's camera, world_from_camera, and the size of the window in pixels."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     position: Vector
@@ -150,7 +151,8 @@ class Uploads:
         upload.parts[part.part_index] = part.content
         upload.size_bytes += len(part.content)
         upload.last = time.monotonic()
-        start, count = upload.start, len(upload.parts)
+        start = upload.start
+        count = len(upload.parts)
         too_large = upload.size_bytes > start.size_bytes or part.part_index >= start.part_count
         if count < start.part_count and not too_large:
             return []
@@ -159,8 +161,8 @@ class Uploads:
             self._report(f"{start.filename} was not uploaded: its parts are not what was announced")
             return []
         content = b"".join(upload.parts[index] for index in range(count))
-        whole = FileTransferPart(start.source_component_uuid, start.transfer_uuid, 0, content)
-        return [msgspec.structs.replace(start, part_count=1), whole]
+        file = FileTransferPart(start.source_component_uuid, start.transfer_uuid, 0, content)
+        return [msgspec.structs.replace(start, part_count=1), file]
 
     def progress(self, message: FileTransferStartUpload | FileTransferPart) -> tuple[int, int]:
         """Bytes of the message's file so far, and of all of it; of one that has ended or was
@@ -187,8 +189,8 @@ class PageConnection(ServerConnection):
     `report` says on the page what was refused.
     """
 
-    def __init__(self, *args: Any, **own: Any) -> None:
-        super().__init__(*args, **own)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self.widget_of: Callable[[str], Any] = lambda _: None
         self.report: Callable[[str], None] = _LOG.debug
         self._uploads = Uploads(lambda text: self.report(text))
@@ -242,7 +244,7 @@ class PageConnection(ServerConnection):
         else:
             admitted = self._uploads.add(message)
         so_far, total = self._uploads.progress(message)
-        told = {
+        acknowledgement = {
             "type": "FileTransferPartAck",
             "source_component_uuid": message.source_component_uuid,
             "transfer_uuid": message.transfer_uuid,
@@ -250,7 +252,7 @@ class PageConnection(ServerConnection):
             "total_bytes": total,
         }
         if not admitted:  # else viser tells
-            await self.send(frame_of(told))
+            await self.send(frame_of(acknowledgement))
         return admitted
 
     def _forget_idle(self) -> None:

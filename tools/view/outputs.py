@@ -26,16 +26,16 @@ from tools.view.widgets import options_of
 if TYPE_CHECKING:
     from viser import ClientHandle
 
-STEPS = 200  # of a slider of numbers
-MAX_PIXELS = 2**27  # of an image that is shown
-MAX_BYTES = 2**29  # of its file
-MIN_RANGE = 1e-30  # between the ends of a slider of numbers
-MAX_ASPECT = 8.0  # of a window, width by height or height by width
+STEPS = 200  # The number of steps of a slider of numbers.
+MAX_PIXELS = 2**27  # The most pixels of an image that is shown.
+MAX_BYTES = 2**29  # The largest file of such an image, bytes.
+MIN_RANGE = 1e-30  # The least difference between the ends of a slider of numbers.
+MAX_ASPECT = 8.0  # The largest ratio of a window's longer side to its shorter one.
 
 
 def find_output(text: str) -> Store | None:
-    """What `climategs render` or `generate` wrote at a command's scene, if it is a folder or a
-    bucket with a manifest.
+    """Return the output of `climategs render` or `generate` that a command's scene names: a folder
+    or a bucket with a manifest. None if it names no such output.
 
     Raises:
         OutputError: a bucket that cannot be read.
@@ -64,11 +64,11 @@ class OutputViewer:
 
     def values(self, column: str) -> list[Any]:
         """Return the values that a column has, sorted; NaN left out."""
-        found = {row[column] for row in self.rows}
-        return sorted(value for value in found if value is not None and value == value)
+        values = {row[column] for row in self.rows}
+        return sorted(value for value in values if value is not None and value == value)
 
     def _is_range(self, column: str) -> bool:
-        """Whether a slider can stand for a column: two numbers and more, between finite ends."""
+        """Return True if a column can have a slider: two numbers or more, between finite ends."""
         values = self.values(column)
         if len(values) < 2 or not all(isinstance(value, int | float) for value in values):
             return False
@@ -103,11 +103,11 @@ class OutputViewer:
         return color_classes(numbers) if shows == "semantic" else np.stack([numbers] * 3, -1)
 
     def _read(self, relative: str) -> bytes:
-        """The bytes of a file that the manifest names."""
-        here = self.store.local_dir
-        if here is None:
+        """Return the bytes of a file that the manifest names."""
+        local_dir = self.store.local_dir
+        if local_dir is None:
             return self.store.read(relative)
-        with open_file(resolve_inside(here, relative)) as file:  # not of a pipe, which may wait
+        with open_file(resolve_inside(local_dir, relative)) as file:  # no pipe, which may wait
             data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise ValueError(f"it has more than {MAX_BYTES // 2**20} MiB")
@@ -131,8 +131,10 @@ class OutputPage:
     """One client's page. All runs on the server's event loop: there is little to do."""
 
     def __init__(self, viewer: OutputViewer, client: ClientHandle) -> None:
-        self.viewer, self.client = viewer, client
-        rows, gui = viewer.rows, client.gui
+        self.viewer = viewer
+        self.client = client
+        rows = viewer.rows
+        gui = client.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
         gui.set_panel_label(printable(f"ClimateGS: {viewer.store.uri.rpartition('/')[2]}"))
@@ -144,8 +146,8 @@ class OutputPage:
         self._frame = gui.add_slider("frame", 0, max(len(frames) - 1, 1), 1, 0)
         self._variant = self._dropdown("variant", viewer.values("variant"))
         kinds = ("image", "depth", "semantic", "instance", *mask_names())
-        there = [k for k in kinds if any(row.get(f"{k}_path") for row in rows)]
-        self._shows = self._dropdown("shows", there)
+        row_kinds = [k for k in kinds if any(row.get(f"{k}_path") for row in rows)]
+        self._shows = self._dropdown("shows", row_kinds)
         self._other = self._dropdown("left of the line", [NONE, *viewer.values("variant")])
         self._line = gui.add_slider("line", 0.0, 1.0, 0.005, 0.5)
         self._ranges: dict[str, Any] = {}
@@ -171,13 +173,16 @@ class OutputPage:
 
     def _range(self, name: str) -> Any:
         values = self.viewer.values(name)
-        low, high = float(values[0]), float(values[-1])
+        low = float(values[0])
+        high = float(values[-1])
         step = 10.0 ** math.floor(math.log10((high - low) / STEPS))
-        low, high = math.floor(low / step) * step, math.ceil(high / step) * step
+        low = math.floor(low / step) * step
+        high = math.ceil(high / step) * step
         column = columns_of_effects().get(name)
         hint = column.title if column is not None else name
-        own = {"step": step, "initial_value": (low, high), "hint": hint}
-        part = self.client.gui.add_multi_slider(name, low, high, **own)
+        part = self.client.gui.add_multi_slider(
+            name, low, high, step=step, initial_value=(low, high), hint=hint
+        )
         self._when(part, self._narrow)
         return part
 
@@ -194,18 +199,21 @@ class OutputPage:
         self._show()
 
     def _matches(self, row: Row) -> bool:
-        """Whether its numbers lie within the page's; of a number that it lacks, the whole range."""
+        """Return True if all numbers of a row lie in the ranges of the page's sliders. A number
+        that the row lacks is in the full range only.
+        """
         for name, part in self._ranges.items():
-            (low, high), value = part.value, row[name]
-            missing = value is None or value != value
-            if missing and (low > part.min or high < part.max):
+            low, high = part.value
+            value = row[name]
+            is_missing = value is None or value != value
+            if is_missing and (low > part.min or high < part.max):
                 return False
-            if not missing and not low <= value <= high:
+            if not is_missing and not low <= value <= high:
                 return False
         return True
 
     def _narrow(self) -> None:
-        """Only variants with an image whose numbers lie within the page's."""
+        """Offer only the variants with an image whose numbers lie in the page's ranges."""
         rows = [row for row in self.viewer.rows if self._matches(row)]
         variants = sorted({row["variant"] for row in rows})
         if variants:
@@ -217,19 +225,19 @@ class OutputPage:
         matching = [row for row in self.viewer.rows if self._matches(row)]
         frame = self._frames[min(self._frame.value, len(self._frames) - 1)]
         scene, camera, shows = map(self._chosen, (self._scene, self._camera, self._shows))
-        wanted = {"scene": scene, "camera": camera, "frame": frame}
-        own = self._find(matching, wanted | {"variant": self._chosen(self._variant)})
+        view = {"scene": scene, "camera": camera, "frame": frame}
+        row = self._find(matching, view | {"variant": self._chosen(self._variant)})
         count = f"{len(matching)} of {len(self.viewer.rows)} images"
-        if own is None:
+        if row is None:
             self.show_status(f"{count}; none of this scene, camera, frame and variant")
             return
         try:
-            picture = self.viewer.picture(own, shows)
-            before = self._find(self.viewer.rows, wanted | {"variant": self._chosen(self._other)})
-            if before is not None:
-                left = self.viewer.picture(before, shows)
-                if left.shape == picture.shape:
-                    picture = split(left, picture, self._line.value)
+            picture = self.viewer.picture(row, shows)
+            left_row = self._find(self.viewer.rows, view | {"variant": self._chosen(self._other)})
+            if left_row is not None:
+                left_picture = self.viewer.picture(left_row, shows)
+                if left_picture.shape == picture.shape:
+                    picture = split(left_picture, picture, self._line.value)
         except OutputError as error:
             self.show_status(f"{count}; {error}")
             return
@@ -238,23 +246,25 @@ class OutputPage:
         shape = with_aspect(picture, min(max(aspect, 1 / MAX_ASPECT), MAX_ASPECT))
         self.client.scene.set_background_image(shape, "png")
         self.show_status(f"{picture.shape[1]} x {picture.shape[0]}; {count}")
-        self._facts.content = _facts_of(own)
+        self._facts.content = _facts_of(row)
 
-    def _find(self, rows: list[Row], wanted: Row) -> Row | None:
-        return next((row for row in rows if wanted.items() <= row.items()), None)
+    def _find(self, rows: list[Row], values: Row) -> Row | None:
+        return next((row for row in rows if values.items() <= row.items()), None)
 
 
 def with_aspect(picture: np.ndarray, aspect: float) -> np.ndarray:
     """The picture in the middle of one of another shape, which loses none of its pixels."""
     height, width = picture.shape[:2]
-    more_x, more_y = max(0, round(height * aspect) - width), max(0, round(width / aspect) - height)
-    left, top = more_x // 2, more_y // 2
-    sides = (top, more_y - top, left, more_x - left)
+    extra_width = max(0, round(height * aspect) - width)
+    extra_height = max(0, round(width / aspect) - height)
+    left = extra_width // 2
+    top = extra_height // 2
+    sides = (top, extra_height - top, left, extra_width - left)
     return cv2.copyMakeBorder(picture, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
 
 
 def _facts_of(row: Row) -> str:
-    """HTML of a table of all that the manifest says of an image."""
-    there = {n: v for n, v in row.items() if v not in (None, "") and v == v}
-    words = (f"{v:g}" if isinstance(v, float) else str(v) for v in there.values())
-    return table(("column", "value"), zip(there, words, strict=True))
+    """Return an HTML table of all that the manifest says of an image."""
+    facts = {n: v for n, v in row.items() if v not in (None, "") and v == v}
+    words = (f"{v:g}" if isinstance(v, float) else str(v) for v in facts.values())
+    return table(("column", "value"), zip(facts, words, strict=True))

@@ -45,32 +45,37 @@ if TYPE_CHECKING:
 
     from tools.view.server import Viewer
 
-REST_S = 0.15  # without a change, after which the whole picture is drawn
-PLAY_S = 0.1  # from frame to frame
-POSE_M, POSE_RAD = 0.01, 0.002  # a camera that is nearer to where it was put has not been moved
-ECHO_S = 30.0  # that a window gets at most to say that it is where it was put
-SETTLE_S = 1.0  # after which it is there
-LOOK_M = 3.0  # how far ahead the point lies that the mouse turns the camera around
-FRAME_S = 0.09  # what a picture may take while something moves
-FACTORS = (0.12, 0.5)  # of the whole resolution, while something moves
-MAX_NAME = 64
-MAX_TASKS = 8  # of a page that wait to be done
-MAX_ASPECT = 8.0  # of a window, width by height or height by width
+REST_S = 0.15  # The time without a change after which the whole picture is drawn, seconds.
+PLAY_S = 0.1  # The time from frame to frame of a drive that is played, seconds.
+# The window's camera counts as not moved within this distance of where it was put, metres.
+POSE_M = 0.01
+# The window's camera counts as not turned within this angle of where it was put, radians.
+POSE_RAD = 0.002
+ECHO_S = 30.0  # The longest time that a window gets to report where it was put, seconds.
+SETTLE_S = 1.0  # The time after that report in which no flight begins, seconds.
+LOOK_M = 3.0  # The distance from the camera to the point that the mouse turns it around, metres.
+FRAME_S = 0.09  # The longest time for a picture while something moves, seconds.
+FACTORS = (0.12, 0.5)  # The least and the largest share of the full resolution while moving.
+MAX_NAME = 64  # The longest name of an uploaded file, characters.
+MAX_TASKS = 8  # The most tasks of a page that may wait.
+MAX_ASPECT = 8.0  # The largest ratio of a window's longer side to its shorter one.
 _MAIN_NAMES = [name for names in MAIN_FIELDS.values() for name in names]
-# Names of several fields that come first, and of the preset of the whole recipe: not without their
-# section.
+# The names that are shown with their section: those of several main fields, and "preset", which is
+# also the name of the whole recipe's dropdown.
 SHARED_NAMES = {"preset", *(name for name in _MAIN_NAMES if _MAIN_NAMES.count(name) > 1)}
-BAR_FULL = 100.0  # of a progress bar
-_ERROR = "color:#c92a2a"
-# Two lines and a bar are always there: nothing below may move away from under the mouse.
+BAR_FULL = 100.0  # The value of a full progress bar, percent.
+_ERROR = "color:#c92a2a"  # The CSS of an error message.
+# The CSS of the status line. Two lines and a bar are always there: nothing below may move away from
+# under the mouse.
 _STATUS = "font-weight:bold;line-height:1.3;min-height:2.6em"
-_WAITS = "color:#a35200"  # of a status line whose picture is not what the page asks for
+_WAITS = "color:#a35200"  # The CSS of a status line while the picture is not the one asked for.
+# The CSS of a warning about the view.
 _WARNING = "background:#fff3bf;color:#5c3c00;padding:0.3em 0.7em;margin-bottom:0.5em"
 
 
 @dataclass(frozen=True)
 class FreePose:
-    """Where a flight has got to: world_from_camera."""
+    """Pose of the window's camera in a flight: world_from_camera."""
 
     wxyz: tuple[float, ...]
     position: tuple[float, ...]
@@ -79,8 +84,10 @@ class FreePose:
 
 @dataclass(frozen=True)
 class Wish:
-    """What a page asks to see. frame: a position in the scene's frames. pose: None for the recorded
-    camera's. share: where the line of a split picture stands.
+    """The view that a page asks for.
+
+    frame: a position in the scene's frames. pose: None for the recorded camera's. share: where the
+    line of a split picture stands, 0 to 1 from the left.
     """
 
     edits: Edits
@@ -98,21 +105,25 @@ class Wish:
 
     @property
     def needs_depth(self) -> bool:
-        """Whether something is drawn over the picture that it can hide."""
+        """True if things are drawn over the picture that its surfaces can hide."""
         return self.boxes or self.lidar or self.frustums
 
 
 @dataclass
 class Progress:
-    """What has been drawn of a page's wishes, which count up. last: when the last one came, or was
-    given up. asked: when it came. due: when a drive that is played goes on.
+    """Progress of the drawing of one page's wishes, which are numbered from 1. Times are on the
+    monotonic clock, in seconds.
+
+    wish_number: the latest wish. drawn_number: the last wish that was drawn. rest_number: the last
+    wish that was drawn at rest. last: when the latest wish came, or was given up. wish_time: when
+    it came. due: when a drive that is played goes on.
     """
 
-    wished: int = 1
-    drawn: int = 0
-    rested: int = 0
+    wish_number: int = 1
+    drawn_number: int = 0
+    rest_number: int = 0
     last: float = 0.0
-    asked: float = field(default_factory=time.monotonic)
+    wish_time: float = field(default_factory=time.monotonic)
     due: float = 0.0
     factor: float = FACTORS[1]
     tasks: deque[Callable[[], None]] = field(default_factory=deque)
@@ -124,22 +135,25 @@ class Page:
     """
 
     def __init__(self, viewer: Viewer, client: ClientHandle) -> None:
-        self.viewer, self.client, self.gui = viewer, client, client.gui
-        self.progress, self.is_closed = Progress(), False
+        self.viewer = viewer
+        self.client = client
+        self.gui = client.gui
+        self.progress = Progress()
+        self.is_closed = False
         self.wish = Wish(viewer.edits, 0, first_camera(viewer.scene, viewer.frames[0]))
         self.before: tuple[Any, np.ndarray] | None = None  # the picture without weather, by view
         self._picture: ShownPicture | None = None
-        self._failed: Wish | None = None  # could not be drawn
-        self._telling = threading.Lock()  # three threads say what is being done
+        self._failed_wish: Wish | None = None  # could not be drawn
+        self._status_lock = threading.Lock()  # three threads say what is being done
         self.groups = (*effect_groups(), group_of("camera"), group_of("render"))
         self._poses: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=30)
         self._window = (0, 0)
-        self._reported: FreePose | None = None  # where the window says it is
+        self._reported_pose: FreePose | None = None  # where the window says it is
         self._quiet_until = 0.0  # the window is on its way to where it was put
         self.overlaid: Any = None  # what is drawn over the picture
         self._overlays: dict[str, Any] = {}
-        self._good: Recipe | None = None
-        self._resolved: tuple[Edits, Recipe | RecipeError] | None = None
+        self._last_valid_recipe: Recipe | None = None
+        self._recipe_result: tuple[Edits, Recipe | RecipeError] | None = None
         self._fields: dict[str, Field] = {}
         self._effects: dict[str, tuple[Any, Any]] = {}
         self._build()
@@ -154,27 +168,32 @@ class Page:
     # ---- The recipe ------------------------------------------------------------------------------
 
     def recipe(self, edits: Edits) -> Recipe:
-        """In numbers; RecipeError where the edits make none."""
-        known = self._resolved  # two threads come here
-        if known is None or known[0] is not edits:
+        """Return the edited recipe, with numbers in place of ranges.
+
+        Raises:
+            RecipeError: the edits make no valid recipe.
+        """
+        result = self._recipe_result  # two threads come here
+        if result is None or result[0] is not edits:
             try:
-                known = (edits, edits.recipe())
+                result = (edits, edits.recipe())
             except RecipeError as error:
-                known = (edits, error)
-            self._resolved = known
-        if isinstance(known[1], RecipeError):
-            raise known[1]
-        self._good = known[1]
-        return known[1]
+                result = (edits, error)
+            self._recipe_result = result
+        if isinstance(result[1], RecipeError):
+            raise result[1]
+        self._last_valid_recipe = result[1]
+        return result[1]
 
     @property
     def good_recipe(self) -> Recipe | None:
-        """The last one that was valid."""
-        return self._good
+        """The last recipe that was valid; None before the first."""
+        return self._last_valid_recipe
 
     def camera_of(self, wish: Wish) -> Camera:
-        """Before the recipe's scale."""
-        recorded, pose = self.recorded_camera(wish), wish.pose
+        """Return the camera of a wish, before the recipe's scale."""
+        recorded = self.recorded_camera(wish)
+        pose = wish.pose
         if pose is None:
             return recorded
         return free_camera(recorded, pose.wxyz, pose.position, pose.fov_rad, self.aspect)
@@ -202,8 +221,8 @@ class Page:
         """Wish for something else; the viewer's thread draws the latest wish."""
         with self.viewer.changed:
             self.wish = replace(self.wish, **changes)
-            self.progress.wished += 1
-            self.progress.last = self.progress.asked = time.monotonic()
+            self.progress.wish_number += 1
+            self.progress.last = self.progress.wish_time = time.monotonic()
             self.viewer.changed.notify()
         self.update_status()
 
@@ -227,28 +246,29 @@ class Page:
             return
         section = control.path.rpartition(".")[0]
         siblings = (f for path, f in self._fields.items() if path.rpartition(".")[0] == section)
-        others = tuple(
+        nullable_paths = tuple(
             f.control.path for f in siblings if f.control.nullable and f.control != control
         )
-        given = edits.giving_way(control.path, others)
-        self.edit(given, show=given != edits)
+        valid_edits = edits.giving_way(control.path, nullable_paths)
+        self.edit(valid_edits, show=valid_edits != edits)
 
     def _on_upload(self, control: Control, name: str, content: bytes) -> None:
         safe = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).name)[-MAX_NAME:].lstrip(".") or "file"
         path = create_file(self.viewer.out / "uploads", Path(safe).stem, Path(safe).suffix, content)
         relative = str(path.relative_to(self.viewer.out))
         edits = self.wish.edits.with_values({control.path: as_yaml(relative)})
-        others = tuple(c.path for g in self.groups for c in g.walk() if c.nullable and c != control)
+        controls = (control for group in self.groups for control in group.walk())
+        paths = tuple(c.path for c in controls if c.nullable and c != control)
         section = control.path.rpartition(".")[0]
-        others = tuple(path for path in others if path.rpartition(".")[0] == section)
-        self.edit(edits.giving_way(control.path, others), show=True)
+        nullable_paths = tuple(path for path in paths if path.rpartition(".")[0] == section)
+        self.edit(edits.giving_way(control.path, nullable_paths), show=True)
 
     def _on_open(self, name: str, content: bytes) -> None:
         stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(name).stem)[:MAX_NAME].lstrip(".") or "recipe"
         self._take(str(create_file(self.viewer.out / "opened", stem, ".yaml", content)))
 
     def _take(self, source: str) -> None:
-        """Another recipe, without changes."""
+        """Open another recipe, without changes to it."""
         edits = Edits(source, self.wish.edits.scale, folder=self.viewer.out)
         self.edit(edits, show=True)
 
@@ -258,16 +278,17 @@ class Page:
         """Put the window where the recorded camera was."""
         camera = self.recorded_camera(self.wish)
         pose = camera.world_from_camera.numpy()
-        own, position = self.client.camera, pose[:3, 3]
+        window_camera = self.client.camera
+        position = pose[:3, 3]
         target = (position, pose[:3, :3])
         self._poses.append(target)
         pause_s = SETTLE_S if self._is_at(target) else ECHO_S
         self._quiet_until = time.monotonic() + pause_s
         with self.client.atomic():
-            own.position = position
-            own.look_at = position + LOOK_M * pose[:3, 2]
-            own.up_direction = -pose[:3, 1]
-            own.fov = place_in_window(camera, self.aspect).fov_rad
+            window_camera.position = position
+            window_camera.look_at = position + LOOK_M * pose[:3, 2]
+            window_camera.up_direction = -pose[:3, 1]
+            window_camera.fov = place_in_window(camera, self.aspect).fov_rad
 
     def _land(self, camera: str) -> None:
         """End a flight at a recorded camera."""
@@ -276,8 +297,9 @@ class Page:
 
     async def _on_camera(self, camera: Any) -> None:
         is_resized = self._resize(camera.image_width, camera.image_height)
-        position, wxyz = (tuple(map(float, each)) for each in (camera.position, camera.wxyz))
-        self._reported = FreePose(wxyz, position, float(camera.fov))
+        position = tuple(map(float, camera.position))
+        wxyz = tuple(map(float, camera.wxyz))
+        self._reported_pose = FreePose(wxyz, position, float(camera.fov))
         now = time.monotonic()
         if self.wish.pose is None and self._is_put:
             self._quiet_until = min(self._quiet_until, now + SETTLE_S)
@@ -287,25 +309,27 @@ class Page:
         elif now < self._quiet_until:  # it may be from before, or half way
             pause_s = self._quiet_until - now
             asyncio.get_running_loop().call_later(pause_s, self._fly_where_the_window_is)
-        elif self._reported != self.wish.pose or is_resized:
+        elif self._reported_pose != self.wish.pose or is_resized:
             self._fly_where_the_window_is()
 
     def _fly_where_the_window_is(self) -> None:
         if time.monotonic() >= self._quiet_until and not self.is_closed and not self._is_put:
-            self.ask(pose=self._reported)
+            self.ask(pose=self._reported_pose)
 
     @property
     def _is_put(self) -> bool:
-        """Whether the window shows a recorded camera's view that it was lately put at."""
+        """True if the window stands at a recorded camera where the page has lately put it."""
         return self.wish.pose is None and any(map(self._is_at, self._poses))
 
     def _is_at(self, target: tuple[np.ndarray, np.ndarray]) -> bool:
-        own = self._reported
-        return own is not None and _is_near(np.array(own.wxyz), np.array(own.position), *target)
+        pose = self._reported_pose
+        if pose is None:
+            return False
+        return _is_near(np.array(pose.wxyz), np.array(pose.position), *target)
 
     def _resize(self, width: int, height: int) -> bool:
-        """Whether the window has another shape, or more pixels than ever in this shape: a browser
-        that is slow takes fewer for a while.
+        """Take over the window's size. Return True if its shape is new, or if it has more pixels
+        than ever in this shape: a slow browser reports fewer for a while.
         """
         old_width, old_height = self._window
         same_shape = abs(width * old_height - height * old_width) <= 2 * max(width, old_width)
@@ -328,11 +352,11 @@ class Page:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Weather"):
             self._build_recipe()
-            main, others = split_by_rank(self.groups[:-2])
-            for group in main:
+            main_groups, other_groups = split_by_rank(self.groups[:-2])
+            for group in main_groups:
                 self._build_main_effect(group)
             with gui.add_folder("more effects", expand_by_default=False):
-                for group in others:
+                for group in other_groups:
                     self._build_group(group)
             self._build_draws()
         with tabs.add_tab("View"):
@@ -345,26 +369,27 @@ class Page:
             self._plan = gui.add_html("")
         with tabs.add_tab("Save"):
             self._build_save()
-        sliders = [own.place_slider for own in self._fields.values() if own.place_slider]
-        gui.add_html(page_style(sliders, [self._effects[group.path][0] for group in main]))
+        sliders = [f.place_slider for f in self._fields.values() if f.place_slider]
+        gui.add_html(page_style(sliders, [self._effects[group.path][0] for group in main_groups]))
 
     def _build_recipe(self) -> None:
-        gui, names = self.gui, preset_names()
+        gui = self.gui
+        names = preset_names()
         source = self.wish.edits.source
         sources = options_of(names if source in names else (source, *names))
         word = next(word for word, name in sources.items() if name == source)
         hint = "A weather that comes with the package. All changes below are undone."
         preset = gui.add_dropdown("preset", tuple(sources), initial_value=word, hint=hint)
         self._about = gui.add_html("")
-        opened = gui.add_upload_button("Open a recipe", mime_type=".yaml,.yml")
+        upload = gui.add_upload_button("Open a recipe", mime_type=".yaml,.yml")
         undo = gui.add_button("Undo all changes")
 
         self._when(preset, lambda word: self._take(sources[word]))
         self._when(undo, lambda _: self._take(self.wish.edits.source), "on_click")
-        self._when(opened, lambda file: self._on_open(file.name, file.content), "on_upload")
+        self._when(upload, lambda file: self._on_open(file.name, file.content), "on_upload")
 
     def _build_draws(self) -> None:
-        """What chooses among the draws from a recipe's ranges."""
+        """Add the seed and the variant, which choose the draw from a recipe's ranges."""
         gui = self.gui
         with gui.add_folder("seed and variant", expand_by_default=False):
             hint = "What all random numbers follow from: drops, flakes, drifts, waves."
@@ -376,14 +401,14 @@ class Page:
         self._when(self._variant, lambda number: self._set("variant", int(number)))
 
     def _set(self, path: str, value: Any) -> None:
-        """A field that others may follow."""
+        """Set a field whose change may change other fields."""
         self.edit(self.wish.edits.with_values({path: as_yaml(value)}), show=True)
 
     def _build_main_effect(self, group: Group) -> None:
-        """A switch; below it, while it is on, its main fields, and a folder of all others."""
+        """Add a switch; below it, while it is on, the main fields and a folder of all others."""
         gui = self.gui
         switch = gui.add_checkbox(group.title, False, hint=group.tooltip)
-        self._when(switch, lambda there: self._switch(group.path, there))
+        self._when(switch, lambda is_on: self._switch(group.path, is_on))
         with gui.add_folder(None, visible=False) as below:
             self._build_controls(group.main, section=group.label)
             with gui.add_folder(f"more of {group.label}", expand_by_default=False):
@@ -391,14 +416,14 @@ class Page:
         self._effects[group.path] = (switch, below)
 
     def _build_group(self, group: Group) -> None:
-        """A folder; of an effect with a switch, below which its fields are while it is on."""
+        """Add a folder of fields. An effect's fields are below a switch, while it is on."""
         gui = self.gui
         with gui.add_folder(group.label, expand_by_default=False):
             if not group.optional:
                 self._build_fields(group)
                 return
             switch = gui.add_checkbox("on", False, hint=group.tooltip)
-            self._when(switch, lambda there: self._switch(group.path, there))
+            self._when(switch, lambda is_on: self._switch(group.path, is_on))
             with gui.add_folder(None, visible=False) as below:
                 self._build_fields(group)
             self._effects[group.path] = (switch, below)
@@ -409,21 +434,23 @@ class Page:
             self._build_group(inner)
 
     def _build_controls(self, controls: Iterable[Control], section: str = "") -> None:
-        """Fields by their names; section: stands before a name that several fields have."""
+        """Add fields. section: the word before a name that several fields have."""
         for control in controls:
             label = (
                 f"{section}.{control.label}" if section and control.label in SHARED_NAMES else None
             )
-            heard = (self._when, self._on_change, self._on_upload)
-            self._fields[control.path] = Field(self.gui, control, *heard, label=label)
+            self._fields[control.path] = Field(
+                self.gui, control, self._when, self._on_change, self._on_upload, label=label
+            )
 
-    def _switch(self, section: str, there: bool) -> None:
+    def _switch(self, section: str, is_on: bool) -> None:
         edits = self.wish.edits
-        change = edits.with_section if there else edits.without_section
+        change = edits.with_section if is_on else edits.without_section
         self.edit(change(section), show=True)
 
     def _build_view(self) -> None:
-        gui, frames = self.gui, self.viewer.frames
+        gui = self.gui
+        frames = self.viewer.frames
         last = max(len(frames) - 1, 1)
         hint = "Which frame of the drive, counted from 0."
         self._time = gui.add_slider("frame", 0, last, 1, 0, hint=hint, disabled=len(frames) == 1)
@@ -466,9 +493,9 @@ class Page:
         self._when(part, lambda value: self.ask(**{name: value}))
 
     def _when(self, part: Any, act: Callable[[Any], None], kind: str = "on_update") -> None:
-        """Have `act` told what people do to a widget. What it raises is said on the page."""
+        """Call `act` with the value that people give a widget. The page says what it raises."""
 
-        async def heard(event: Any) -> None:
+        async def on_event(event: Any) -> None:
             if event.client is None:  # not people, but `_show_values`
                 return
             try:
@@ -476,7 +503,7 @@ class Page:
             except Exception as error:
                 self.viewer.report(self, error)
 
-        getattr(part, kind)(heard)
+        getattr(part, kind)(on_event)
 
     def _build_quality(self) -> None:
         gui = self.gui
@@ -500,7 +527,7 @@ class Page:
         recipe = gui.add_button("Save recipe")
         picture = gui.add_button("Save picture")
         gui.add_html(paragraph(f"Into the folder {self.viewer.out}. Nothing is replaced."))
-        self._saved = gui.add_html("")
+        self._save_report = gui.add_html("")
         self._command = gui.add_html("")
 
         self._when(recipe, lambda _: self._save(with_picture=False), "on_click")
@@ -509,11 +536,13 @@ class Page:
     def _save(self, *, with_picture: bool) -> None:
         name = self._name.value
         self._do_said(
-            self._saved, "saving", lambda: self.viewer.save(self, name, with_picture=with_picture)
+            self._save_report,
+            "saving",
+            lambda: self.viewer.save(self, name, with_picture=with_picture),
         )
 
     def _do_said(self, part: Any, word: str, task: Callable[[], None]) -> None:
-        """Have the viewer's thread do something, which a part of the page says until it is done."""
+        """Have the viewer's thread do a task. A part of the page shows a word until it is done."""
 
         def act() -> None:
             try:
@@ -539,9 +568,9 @@ class Page:
             return
         for path, (switch, below) in self._effects.items():
             switch.value = below.visible = found(recipe, path) is not None
-        for path, own in self._fields.items():
+        for path, recipe_field in self._fields.items():
             if found(recipe, path.rpartition(".")[0]) is not None:
-                own.show(found(recipe, path))
+                recipe_field.show(found(recipe, path))
         source = self.wish.edits.source
         about = describe_preset(source) if source in preset_names() else "Your recipe."
         self._about.content = paragraph(about, style="padding-bottom:0.6em")
@@ -552,30 +581,32 @@ class Page:
     # ---- Shown by the viewer's thread ------------------------------------------------------------
 
     def show_progress(self, picture: ShownPicture) -> None:
-        """A picture has been sent."""
-        self._picture, self._failed = picture, None
+        """Take note that a picture has been sent."""
+        self._picture = picture
+        self._failed_wish = None
         self.update_status()
 
     def show_failure(self, wish: Wish) -> None:
-        """A wish could not be drawn."""
-        self._failed = wish
+        """Take note that a wish could not be drawn."""
+        self._failed_wish = wish
         self.update_status()
 
     def update_status(self) -> None:
-        """Say what the picture is of, and what is being done for one that is not there yet. Any
-        thread may call it.
+        """Say what the picture shows, and what is being done for the next one. Any thread may call
+        it.
         """
         if self.is_closed:
             return
-        with self._telling:
-            now, wish = time.monotonic(), self.wish
+        with self._status_lock:
+            now = time.monotonic()
+            wish = self.wish
             status = page_status(
                 self._picture,
                 wish,
                 self.viewer.activity_for(self),
-                waited_s=now - self.progress.asked,
+                waited_s=now - self.progress.wish_time,
                 now=now,
-                has_failed=self._failed is wish,
+                has_failed=self._failed_wish is wish,
             )
             color = "" if status.is_current else _WAITS
             content = paragraph(status.text, style=f"{_STATUS};{color}")
@@ -584,7 +615,7 @@ class Page:
             self._show_bar(status)
 
     def _show_bar(self, status: Status) -> None:
-        """The share that is done; a bar that only moves where that is not known."""
+        """Show the finished share as a bar; where it is not known, the bar only moves."""
         is_known = status.share is not None or not status.is_long
         value = round(BAR_FULL * (status.share or 0.0), 1) if is_known else BAR_FULL
         if self._bar.value != value:
@@ -593,14 +624,14 @@ class Page:
             self._bar.animated = not is_known
 
     def show_warning(self, text: str | None) -> None:
-        """What to know of the view; None where there is nothing."""
+        """Show a warning about the view; None takes it away."""
         content = "" if text is None else paragraph(text, style=_WARNING)
         if self._warning.content != content:
             self._warning.content = content
             self._warning.visible = text is not None
 
     def show_error(self, text: str | None) -> None:
-        """None: there is none any more."""
+        """Show an error; None takes it away."""
         if text is None and not self._error.visible:
             return
         self._error.content = paragraph(text or "", style=_ERROR)
@@ -616,7 +647,7 @@ class Page:
         self._tiers.content = content
 
     def show_saved(self, text: str, command: str) -> None:
-        self._saved.content = paragraph(text)
+        self._save_report.content = paragraph(text)
         self.show_command(command)
 
     def show_command(self, command: str) -> None:
@@ -631,14 +662,15 @@ class Page:
             self._command.content = content
 
     def show_picture(self, rgb: np.ndarray, depth_m: np.ndarray | None, *, moving: bool) -> None:
-        """Lossless at rest."""
+        """Send a picture: as PNG at rest, as JPEG while something moves."""
         depth = None if depth_m is None else depth_of_page(depth_m)
         kind = "jpeg" if moving else "png"
         self.client.scene.set_background_image(rgb, kind, jpeg_quality=80, depth=depth)
 
     def show_overlays(self, wish: Wish, points: tuple[np.ndarray, np.ndarray] | None) -> None:
-        """Boxes, cameras and LiDAR returns over the picture, or none of them."""
-        scene, frame = self.viewer.scene, self.frame_of(wish)
+        """Draw the boxes, cameras and LiDAR returns that the wish asks for over the picture."""
+        scene = self.viewer.scene
+        frame = self.frame_of(wish)
         for handle in self._overlays.values():
             handle.remove()
         self._overlays = {}
@@ -646,11 +678,13 @@ class Page:
         if wish.boxes:
             lines, colors = box_lines(scene, frame)
             if len(lines):
-                own = {"thickness": 2.0, "thickness_units": "screen"}
-                self._overlays["boxes"] = api.add_line_segments("/boxes", lines, colors, **own)
+                self._overlays["boxes"] = api.add_line_segments(
+                    "/boxes", lines, colors, thickness=2.0, thickness_units="screen"
+                )
         if points is not None:
-            own = {"point_size": 0.02, "precision": "float32", "point_shading": "flat"}
-            self._overlays["lidar"] = api.add_point_cloud("/lidar", *points, **own)
+            self._overlays["lidar"] = api.add_point_cloud(
+                "/lidar", *points, point_size=0.02, precision="float32", point_shading="flat"
+            )
         for name, camera in frame.cameras.items() if wish.frustums else ():
             if wish.pose is None and camera is self.recorded_camera(wish):
                 continue  # the window looks out of it
@@ -667,22 +701,24 @@ class Page:
             )
 
     def advance(self) -> None:
-        """To the next frame of a drive that is played."""
+        """Go to the next frame of a drive that is played."""
         number = (self.wish.frame + 1) % len(self.viewer.frames)
         self._time.value = number
         self.go_to_frame(number)
 
 
 def first_camera(scene: Scene, frame: Frame) -> str:
-    """The one that looks ahead, of those that the scene was made from."""
-    left_out = unfitted_cameras(scene)
-    names = [name for name in frame.cameras if name not in left_out] or list(frame.cameras)
+    """Return a camera that looks ahead, if possible one that the scene was made from."""
+    unfitted_names = unfitted_cameras(scene)
+    names = [name for name in frame.cameras if name not in unfitted_names] or list(frame.cameras)
     return min(names, key=lambda name: ("front" not in name, len(name)))
 
 
-def _is_near(wxyz: np.ndarray, position: np.ndarray, put_at: np.ndarray, put: np.ndarray) -> bool:
-    """Whether a pose is within POSE_M and POSE_RAD of one that the window was put at."""
+def _is_near(
+    wxyz: np.ndarray, position: np.ndarray, target_position: np.ndarray, target_rotation: np.ndarray
+) -> bool:
+    """Return True if a pose is within POSE_M and POSE_RAD of one that the window was put at."""
     w, x, y, z = wxyz
     ahead = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    turned = float(np.linalg.norm(ahead - put[:, 2]))
-    return float(np.linalg.norm(position - put_at)) < POSE_M and turned < POSE_RAD
+    turn_rad = float(np.linalg.norm(ahead - target_rotation[:, 2]))
+    return float(np.linalg.norm(position - target_position)) < POSE_M and turn_rad < POSE_RAD

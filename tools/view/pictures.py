@@ -1,4 +1,4 @@
-"""What a page shows: the camera behind a window, pictures of a view, and what lies over them."""
+"""Pictures for a page: the camera behind a window, pictures of a view, and overlays."""
 
 from __future__ import annotations
 
@@ -28,21 +28,27 @@ from augment.views import render_buffers, render_view
 from recipes.fields import replaced
 from recipes.schema import Recipe
 
-FAR_M = 167.0  # the most that the page's depth can say
-BAR, BAR_M = 24, 0.05  # of what a recorded camera does not show: its grey; it hides all beyond
-MAX_DEPTH_M = 100.0  # the end of the colours of depth
-PICTURE, DEPTH, CLASSES, INSTANCES, SPLATS = (
-    "picture", "depth", "classes", "instances", "splat ids",
-)  # fmt: skip
-MOVING = {"transmittance_stop": 0.01, "radius_clip_px": 1.0}  # at least, while something moves
+FAR_M = 167.0  # The largest depth that the page can be sent, metres.
+BAR = 24  # The grey of the bars where a recorded camera shows nothing, 0 to 255.
+BAR_M = 0.05  # The depth of those bars, metres: they hide all that is drawn beyond.
+MAX_DEPTH_M = 100.0  # The depth at the end of the colours of depth, metres.
+PICTURE = "picture"  # The word for the rendered image.
+DEPTH = "depth"  # The word for its depth in colours.
+CLASSES = "classes"  # The word for its semantic classes in colours.
+INSTANCES = "instances"  # The word for its instances in colours.
+SPLATS = "splat ids"  # The word for the splats that its pixels show, in colours.
+# The least values of the rasteriser's fields while something moves.
+MOVING = {"transmittance_stop": 0.01, "radius_clip_px": 1.0}
 
 
 # ---- Which camera is behind the window -----------------------------------------------------------
 
 
 class Place(NamedTuple):
-    """Where a camera's image lies in a window. fov_rad: the window's, vertical. size: of the window
-    in pixels of the image, width first. left, top: of the image in it.
+    """Place of a camera's image in a window.
+
+    fov_rad: the window's vertical field of view. size: the window's, in pixels of the image, width
+    first. left, top: the image's first column and row in it.
     """
 
     fov_rad: float
@@ -97,11 +103,11 @@ def free_camera(
 
 
 def away_sentence(scene: Scene, camera: Camera) -> str | None:
-    """What to know of a picture from where no recorded image was taken.
+    """Return a warning about a picture that is far from where any image was recorded.
 
     Returns:
-        None where some image that the scene was made from is near enough, and where distances or
-        those images are not known.
+        A sentence for the page; None if an image that the scene was made from is near enough, or
+        if distances or those images are not known.
     """
     nearest = nearest_view(seen_views(scene), camera)
     if nearest is None or not scene.has_metric_scale:
@@ -157,12 +163,12 @@ def recipe_to_show(recipe: Recipe, shows: str, *, with_depth: bool, factor: floa
 
 
 def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
-    """The recipe with the shortcuts of the rasteriser that a moving picture hides, and without what
-    nobody looks at; none that has anything prepared anew.
+    """Return the recipe of a picture while something moves: with shortcuts of the rasteriser, and
+    without outputs that the page does not show. No change makes a preparation run again.
     """
     if shows == PICTURE and not with_depth:
-        alone = {"depth": "none", "semantic": False, "instance": False, "labels": False}
-        recipe = recipe.model_copy(update={"output": recipe.output.model_copy(update=alone)})
+        changes = {"depth": "none", "semantic": False, "instance": False, "labels": False}
+        recipe = recipe.model_copy(update={"output": recipe.output.model_copy(update=changes)})
     for name, value in MOVING.items():
         value = max(value, getattr(recipe.render, name))
         recipe = replaced(recipe, f"render.{name}", value)
@@ -170,7 +176,7 @@ def coarse(recipe: Recipe, shows: str, *, with_depth: bool) -> Recipe:
 
 
 def draw(scene: Scene, camera: Camera, recipe: Recipe, shows: str, *, backend: str = AUTO) -> Shown:
-    """camera: before recipe.render.scale. recipe: of recipe_to_show."""
+    """Return what a page shows. camera: before recipe.render.scale. recipe: of recipe_to_show."""
     if shows == SPLATS:
         return _draw_splat_ids(scene, camera, recipe, backend)
     view = render_view(scene, camera, recipe, backend=backend)
@@ -217,7 +223,7 @@ def color_classes(classes: np.ndarray) -> np.ndarray:
 
 
 def _class_colors() -> np.ndarray:
-    """[256, 3]: of every class its own hue; grey where it is not known."""
+    """Return the colour of every class, uint8 [256, 3]: a hue each; grey for unknown numbers."""
     colors = np.full((256, 3), 90)
     for number, kind in enumerate(kinds := list(SemanticClass)[1:]):
         hue = number / len(kinds)
@@ -229,31 +235,32 @@ def _class_colors() -> np.ndarray:
 _CLASS_COLORS = _class_colors()
 
 
-def in_window(shown: Shown, place: Place) -> Shown:
-    """The image with the window's bars around it."""
-    height, width = shown.rgb.shape[:2]
-    right, bottom = place.size[0] - place.left - width, place.size[1] - place.top - height
+def in_window(view: Shown, place: Place) -> Shown:
+    """Return the image with the window's bars around it."""
+    height, width = view.rgb.shape[:2]
+    right = place.size[0] - place.left - width
+    bottom = place.size[1] - place.top - height
     sides = (place.top, bottom, place.left, right)
     if not any(sides):
-        return shown
-    rgb = cv2.copyMakeBorder(shown.rgb, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
-    depth = shown.depth_m
+        return view
+    rgb = cv2.copyMakeBorder(view.rgb, *sides, cv2.BORDER_CONSTANT, value=(BAR, BAR, BAR))
+    depth = view.depth_m
     if depth is not None:
         depth = cv2.copyMakeBorder(depth, *sides, cv2.BORDER_CONSTANT, value=BAR_M)
     return Shown(rgb, depth)
 
 
 def split(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
-    """The one picture to the left of a line and the other to its right."""
-    at = round(share * after.shape[1])
-    both = after.copy()
-    both[:, :at] = before[:, :at]
-    both[:, max(at - 1, 0) : at + 1] = 255
-    return both
+    """Return one picture to the left of a white line and the other to its right."""
+    column = round(share * after.shape[1])
+    picture = after.copy()
+    picture[:, :column] = before[:, :column]
+    picture[:, max(column - 1, 0) : column + 1] = 255
+    return picture
 
 
 def depth_of_page(depth_m: np.ndarray) -> np.ndarray:
-    """Where there is no surface there is nothing that hides."""
+    """Return the depth that the page is sent: FAR_M at most, and where there is no surface."""
     return np.where(depth_m > 0, np.minimum(depth_m, FAR_M), FAR_M)
 
 
@@ -268,10 +275,10 @@ _CODE_COLORS = np.array(
 def box_lines(scene: Scene, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the frame's labelled boxes in the scene's world, [N, 2, 3], and their colours."""
     boxes = scene.boxes(frame.index)
-    placed = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
-    lines = placed.corners_m[placed.is_usable][:, EDGES].reshape(-1, 2, 3)
+    world_boxes = PlacedBoxes.of(boxes, np.asarray(scene.world_origin_m))
+    lines = world_boxes.corners_m[world_boxes.is_usable][:, EDGES].reshape(-1, 2, 3)
     labels = np.array([sum(map(ord, label)) for label in boxes.labels], np.uint32)
-    colors = color_numbers(labels[placed.is_usable])
+    colors = color_numbers(labels[world_boxes.is_usable])
     return lines, np.broadcast_to(np.repeat(colors, len(EDGES), 0)[:, None], lines.shape)
 
 

@@ -67,21 +67,22 @@ if TYPE_CHECKING:
     from tools.cli import ViewOptions
 
 _LOG = logging.getLogger(__name__)
-EVERY_ADDRESS = ("0.0.0.0", "::", "")  # that a server may be told to listen at
-MAX_PIXELS = 2**25  # of a picture that is drawn for a page: as many as 8K video has
-JOIN_S = 10.0  # that the picture being drawn gets when the server ends
-TICK_S = 0.25  # from one look at what is being done to the next, for the lines that tell it
+EVERY_ADDRESS = ("0.0.0.0", "::", "")  # The hosts that mean all addresses of this machine.
+# The most pixels of a picture that is drawn for a page: as many as 8K video has.
+MAX_PIXELS = 2**25
+JOIN_S = 10.0  # The time that the picture at hand gets when the server ends, seconds.
+TICK_S = 0.25  # The time between two updates of the pages' status lines, seconds.
 
 
 def view_scene(options: ViewOptions) -> int:
-    """Serves pages until it is interrupted. Returns the exit code."""
+    """Serve pages until the user interrupts. Return the exit code."""
     viser = import_viser()
     if (output := find_output(options.scene)) is not None:
         return _serve_until_interrupted(viser, OutputViewer(output), options)
     scene = open_scene(options.scene)
     check_frames(scene)
-    given = (text.partition("=") for text in options.overrides)
-    values = {path.strip(): value for path, _, value in given}
+    overrides = (text.partition("=") for text in options.overrides)
+    values = {path.strip(): value for path, _, value in overrides}
     edits = Edits(options.recipe, options.scale, values, folder=options.out)
     make_plan(edits.recipe(), scene)  # refuse before a page opens
     backend = choose_backend(options.backend, scene)
@@ -111,24 +112,24 @@ def _serve_until_interrupted(viser: Any, viewer: Pages, options: ViewOptions) ->
 
 
 class Pages(Protocol):
-    """What is served."""
+    """A set of pages that a server shows."""
 
     def start(self) -> None: ...
 
     def stop(self) -> None: ...
 
     def open_page(self, client: ClientHandle) -> Callable[[str], None]:
-        """Return what says on the page what the server has refused."""
+        """Open a page. Return the function that shows there what the server has refused."""
         ...
 
     def close_page(self, client: ClientHandle) -> None: ...
 
 
 def import_viser() -> Any:
-    """The module.
+    """Return the module viser.
 
     Raises:
-        ClimateGSError: it is not installed.
+        ClimateGSError: viser is not installed.
     """
     try:
         with warnings.catch_warnings():  # of what it imports
@@ -224,13 +225,16 @@ class Viewer:
     """A scene, its pages, and the thread that draws for them."""
 
     def __init__(self, scene: Scene, uri: str, edits: Edits, out: Path, backend: str) -> None:
-        self.scene, self.uri, self.edits, self.out = scene, uri, edits, out
+        self.scene = scene
+        self.uri = uri
+        self.edits = edits
+        self.out = out
         self.backend = backend
         self.frames = tuple(frame for frame in scene.frames if frame.cameras)
         self.changed = threading.Condition()
         self.pages: list[Page] = []
         self._is_ending = False
-        self._known: set[tuple[str, ...]] = set()  # kernels that have run
+        self._compiled_sections: set[tuple[str, ...]] = set()  # their kernels have run
         self._activity: tuple[Page, Activity] | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
         self._end = threading.Event()
@@ -249,19 +253,19 @@ class Viewer:
         self._ticker.join(JOIN_S)
 
     def activity_for(self, page: Page) -> Activity | None:
-        """What the thread does for a page, or is about to; None while it draws for another."""
+        """Return what the thread does for a page, or is about to; None while it serves another."""
         current = self._activity
         if current is None:
             return Activity()
         return current[1] if current[0] is page else None
 
     def _note(self, progress: PassProgress) -> None:
-        """The thread has got to a pass, or to a step of one."""
+        """Take note that the thread has got to a pass, or to a step of one."""
         if self._activity is not None:
             self._activity[1].progress = progress
 
     def _tell(self) -> None:
-        """Has pages that wait for a picture say what is being done."""
+        """Have all pages say what is being done, again and again until the server ends."""
         while not self._end.wait(TICK_S):
             for page in tuple(self.pages):
                 page.update_status()
@@ -280,7 +284,7 @@ class Viewer:
             self.pages = [page for page in self.pages if not page.is_closed]
 
     def report(self, page: Page, error: Exception) -> None:
-        """Says on the page what went wrong; of a defect, in the log where."""
+        """Say on the page what went wrong; log the traceback of a defect."""
         if page.is_closed:
             return
         if not isinstance(error, ClimateGSError | RecipeError):
@@ -290,11 +294,11 @@ class Viewer:
     # ---- The thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        with _compiling_told(self._count_compiling):
+        with _compilations_counted(self._count_compiling):
             self._serve_pages()
 
     def _count_compiling(self, change: int) -> None:
-        """A kernel begins to be compiled (1), or is compiled (-1)."""
+        """Count a kernel that begins to be compiled (1), or that is compiled (-1)."""
         if self._activity is not None:
             activity = self._activity[1]
             activity.compiling = max(0, activity.compiling + change)
@@ -310,7 +314,7 @@ class Viewer:
                 if self._is_ending:
                     return
                 # The others come first next time.
-                self.pages.sort(key=lambda other: other is page)
+                self.pages.sort(key=lambda entry: entry is page)
             assert page is not None
             self._activity = (page, Activity())
             try:
@@ -321,26 +325,29 @@ class Viewer:
                 self._activity = None
 
     def _next(self) -> tuple[Page | None, Any]:
-        """The page that waits for longest and what to do for it; or None, and how long there is
-        nothing to do.
+        """Return the page that has waited longest and its work; or None, and the seconds until
+        there is work (None: until something changes).
         """
-        now, pause = time.monotonic(), None
+        now = time.monotonic()
+        pause = None
         for page in self.pages:
             if page.progress.tasks:
                 return page, page.progress.tasks.popleft()
         for page in self.pages:
-            own = page.progress
-            if own.drawn < own.wished and (now - own.last < REST_S or page.wish.is_playing):
+            progress = page.progress
+            is_moving = now - progress.last < REST_S or page.wish.is_playing
+            if progress.drawn_number < progress.wish_number and is_moving:
                 return page, "moving"
         for page in self.pages:
-            own, playing = page.progress, page.wish.is_playing
-            if not playing and own.rested == own.wished:
+            progress = page.progress
+            is_playing = page.wish.is_playing
+            if not is_playing and progress.rest_number == progress.wish_number:
                 continue
-            left = (own.due if playing else own.last + REST_S) - now
-            if left <= 0:
-                return page, "advance" if playing else "rest"
-            if left < math.inf:
-                pause = left if pause is None else min(pause, left)
+            wait_s = (progress.due if is_playing else progress.last + REST_S) - now
+            if wait_s <= 0:
+                return page, "advance" if is_playing else "rest"
+            if wait_s < math.inf:
+                pause = wait_s if pause is None else min(pause, wait_s)
         return None, pause
 
     def _work(self, page: Page, work: Any) -> None:
@@ -351,23 +358,25 @@ class Viewer:
             page.advance()
             return
         with self.changed:
-            wish, wished = page.wish, page.progress.wished
+            wish = page.wish
+            wish_number = page.progress.wish_number
         moving = work == "moving"
-        own = page.progress
-        own.due = math.inf
+        progress = page.progress
+        progress.due = math.inf
         due = time.monotonic() + PLAY_S
         try:
             self._draw(page, wish, moving=moving)
-            own.due = due
+            progress.due = due
         except _Outdated:
-            own.last = time.monotonic()  # a small picture comes first, however long the pass took
+            # A small picture comes first, however long the pass took.
+            progress.last = time.monotonic()
         except Exception:
             page.show_failure(wish)
             raise
         finally:  # what failed is not tried again before something changes
-            own.drawn = wished
+            progress.drawn_number = wish_number
             if not moving:
-                own.rested = wished
+                progress.rest_number = wish_number
 
     # ---- One picture -----------------------------------------------------------------------------
 
@@ -376,31 +385,32 @@ class Viewer:
         try:
             recipe = page.recipe(wish.edits)
         except RecipeError as error:
-            refusal, recipe = str(error), page.good_recipe
+            refusal = str(error)
+            recipe = page.good_recipe
             if recipe is None:
                 raise
         camera = page.camera_of(wish)
         factor = self._factor(page, wish, recipe, camera)
         if moving:
             factor *= page.progress.factor
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         with self._kernels(recipe):
-            shown, seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
-            height, width = shown.rgb.shape[:2]
+            view, pass_seconds = self._picture(page, wish, recipe, camera, factor, moving=moving)
+            height, width = view.rgb.shape[:2]
             if wish.pose is None:
                 place = place_in_window(camera.resized(width, height), page.aspect)
-                shown = in_window(shown, place)
-            took = time.perf_counter() - started
+                view = in_window(view, place)
+            draw_s = time.perf_counter() - start_s
             if page.is_closed:
                 return
-            page.show_picture(shown.rgb, shown.depth_m, moving=moving)
+            page.show_picture(view.rgb, view.depth_m, moving=moving)
             if moving:
-                page.progress.factor = _paced(page.progress.factor, took)
+                page.progress.factor = _paced(page.progress.factor, draw_s)
             picture = ShownPicture(
                 wish=wish,
                 width=width,
                 height=height,
-                seconds=took,
+                seconds=draw_s,
                 at=time.monotonic(),
                 is_rest=not moving,
                 is_complete=not wish.lidar,
@@ -410,20 +420,20 @@ class Viewer:
             page.show_warning(away_sentence(self.scene, camera))
             page.show_error(refusal)
             if not moving:
-                self._finish(page, wish, recipe, camera, seconds)
+                self._finish(page, wish, recipe, camera, pass_seconds)
                 page.show_progress(replace(picture, is_complete=True))
 
     def _picture(
         self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, factor: float, *, moving: bool
     ) -> tuple[Shown, dict[str, float]]:
-        """The picture without bars; seconds of its passes.
+        """Return the picture without bars, and the seconds of its passes by their names.
 
         Raises:
             _Outdated: at rest, before a pass: the page is closed or wishes for something else.
                 Within a preparation: the page is closed, or an effect has been taken out.
         """
 
-        def tell(progress: PassProgress) -> None:
+        def check_wish(progress: PassProgress) -> None:
             self._note(progress)
             if page.is_closed:
                 raise _Outdated
@@ -435,33 +445,35 @@ class Viewer:
             elif not moving:
                 raise _Outdated
 
-        def drawn(recipe: Recipe) -> Shown:
-            asked = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
+        def draw_recipe(recipe: Recipe) -> Shown:
+            recipe = recipe_to_show(recipe, wish.shows, with_depth=wish.needs_depth, factor=factor)
             if moving:
-                asked = coarse(asked, wish.shows, with_depth=wish.needs_depth)
-            shown = draw(self.scene, camera, asked, wish.shows, backend=self.backend)
-            return shown if wish.needs_depth else replace(shown, depth_m=None)
+                recipe = coarse(recipe, wish.shows, with_depth=wish.needs_depth)
+            view = draw(self.scene, camera, recipe, wish.shows, backend=self.backend)
+            return view if wish.needs_depth else replace(view, depth_m=None)
 
-        with watched(tell), contextlib.nullcontext({}) if moving else stopwatch() as seconds:
-            shown = drawn(recipe)
+        timer = contextlib.nullcontext({}) if moving else stopwatch()
+        with watched(check_wish), timer as pass_seconds:
+            view = draw_recipe(recipe)
         if wish.is_split:
             clear = without_weather(recipe)
-            size = shown.rgb.shape
+            size = view.rgb.shape
             key = (wish.frame, wish.camera, wish.pose, wish.shows, size, moving, clear.render)
             if page.before is None or page.before[0] != key:
-                with watched(tell):
-                    page.before = (key, drawn(clear).rgb)
-            shown = Shown(split(page.before[1], shown.rgb, wish.share), shown.depth_m)
-        return shown, seconds
+                with watched(check_wish):
+                    page.before = (key, draw_recipe(clear).rgb)
+            view = Shown(split(page.before[1], view.rgb, wish.share), view.depth_m)
+        return view, pass_seconds
 
     def _factor(self, page: Page, wish: Wish, recipe: Recipe, camera: Camera) -> float:
-        """How much smaller than the recipe's picture the window is.
+        """Return the resolution that the window needs, relative to the recipe's: 1 or less.
 
         Raises:
             ClimateGSError: every pixel is asked for, and there are too many.
         """
         scale = recipe.render.scale
-        width, height = camera.width, camera.height
+        width = camera.width
+        height = camera.height
         if wish.pose is None:
             width, height = place_in_window(camera, page.aspect).size
         if wish.every_pixel:
@@ -471,26 +483,26 @@ class Viewer:
         return min(1.0, page.window_height / (height * scale), fitting)
 
     def _finish(
-        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, seconds: dict[str, float]
+        self, page: Page, wish: Wish, recipe: Recipe, camera: Camera, pass_seconds: dict[str, float]
     ) -> None:
-        """What follows the picture at rest."""
+        """Show what follows a picture at rest: overlays, the plan and the command line."""
         points = None
         if wish.lidar:
             self._note(PassProgress("LiDAR returns"))
             points = lidar_points(self.scene, page.frame_of(wish), recipe)
-        own = wish.frustums and (wish.camera if wish.pose is None else "flight")
-        key = (wish.frame, wish.boxes, own, wish.lidar and recipe)
+        viewpoint = wish.frustums and (wish.camera if wish.pose is None else "flight")
+        key = (wish.frame, wish.boxes, viewpoint, wish.lidar and recipe)
         if page.overlaid != key:
             page.show_overlays(wish, points)
             page.overlaid = key
         steps = plan_view(make_plan(recipe, self.scene), self.scene, camera).steps
-        rows = [(step.name, _milliseconds(seconds.get(step.name)), step.why) for step in steps]
+        rows = [(step.name, _milliseconds(pass_seconds.get(step.name)), step.why) for step in steps]
         page.show_plan(table(("pass", "ms", "why, or why not"), rows, [s.runs for s in steps]))
         page.show_command(self._command(page, wish))
 
     @contextlib.contextmanager
     def _kernels(self, recipe: Recipe) -> Iterator[None]:
-        """Has the kernels of effects that are new compiled on all cores, to the end of the list."""
+        """Compile the kernels of new effects on all cores, while the block runs."""
         if not self._is_new(recipe):
             yield
             return
@@ -498,15 +510,15 @@ class Viewer:
             yield
             self._count_compiling(1)  # processes beside this one may compile on
         self._count_compiling(-1)
-        self._known.add(tuple(recipe.sections()))
+        self._compiled_sections.add(tuple(recipe.sections()))
 
     def _is_new(self, recipe: Recipe) -> bool:
-        return tuple(recipe.sections()) not in self._known
+        return tuple(recipe.sections()) not in self._compiled_sections
 
     # ---- What pages have done --------------------------------------------------------------------
 
     def measure_tiers(self, page: Page) -> None:
-        """The time of the view at rest in each tier, and how far it is from reference."""
+        """Show the time of the view at rest in each tier, and its difference from the reference."""
         wish = page.wish
         camera = page.camera_of(wish)
         scale = page.recipe(wish.edits).render.scale
@@ -518,54 +530,56 @@ class Viewer:
             rgb = render_view(self.scene, camera, recipe, backend=self.backend).rgb
             times = []  # without what is prepared once
             for _ in range(2):
-                started = time.perf_counter()
+                start_s = time.perf_counter()
                 render_view(self.scene, camera, recipe, backend=self.backend)
-                times.append(time.perf_counter() - started)
+                times.append(time.perf_counter() - start_s)
             pictures[tier] = (min(times), rgb)
         best = pictures["reference"][1].astype(float)
         rows = []
         for tier, (seconds, rgb) in pictures.items():
             height, width = rgb.shape[:2]
             enlarged = cv2.resize(rgb, best.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-            off = f"{np.abs(enlarged - best).mean():.2f}"
-            rows.append((tier, f"{width} x {height}", f"{1000 * seconds:.0f}", off))
+            difference = f"{np.abs(enlarged - best).mean():.2f}"
+            rows.append((tier, f"{width} x {height}", f"{1000 * seconds:.0f}", difference))
         page.show_tiers(table(("tier", "size", "ms", "mean difference, of 255"), rows))
 
     def save(self, page: Page, name: str, *, with_picture: bool) -> None:
-        """The recipe, with a picture where asked for; and, of a flight, its camera."""
+        """Save the recipe; with it the picture, if asked for, and the camera of a flight."""
         wish = page.wish
-        named = renamed(page.recipe(wish.edits), name)
+        recipe = renamed(page.recipe(wish.edits), name)
         if with_picture:
-            camera, scale = page.camera_of(wish), named.render.scale
+            camera = page.camera_of(wish)
+            scale = recipe.render.scale
             check_size(camera.width * scale, camera.height * scale)
-        endings = (".yaml", ".camera.json", f".{named.output.image}")
+        endings = (".yaml", ".camera.json", f".{recipe.output.image}")
         path = None
         while path is None:
             path = free_path(self.out, name, *endings)
             try:
-                save_recipe(named, path.with_name(path.name + ".yaml"))
+                save_recipe(recipe, path.with_name(path.name + ".yaml"))
             except FileExistsError:  # since we looked
                 path = None
-        written = [path.name + ".yaml"]
-        camera, where = page.recorded_camera(wish), self._where(wish, camera_path=None)
+        file_names = [path.name + ".yaml"]
+        camera = page.recorded_camera(wish)
+        view_words = self._where(wish, camera_path=None)
         if wish.pose is not None:
             camera_path = path.with_name(path.name + ".camera.json")
             self._write_path(page.camera_of(wish), camera_path)
             # As the file says it, to the bit.
             (frame,) = frames_from_path_file(camera_path, self.scene)
             camera = frame.cameras[camera.name]
-            written.append(camera_path.name)
-            where = self._where(wish, camera_path=camera_path)
+            file_names.append(camera_path.name)
+            view_words = self._where(wish, camera_path=camera_path)
         if with_picture:
-            view = render_view(self.scene, camera, named, backend=self.backend)
-            picture = path.with_name(f"{path.name}.{named.output.image}")
-            write_new(picture, encode_image(view.rgb, named.output))
-            written.append(picture.name)
+            view = render_view(self.scene, camera, recipe, backend=self.backend)
+            picture = path.with_name(f"{path.name}.{recipe.output.image}")
+            write_new(picture, encode_image(view.rgb, recipe.output))
+            file_names.append(picture.name)
         source = shlex.quote(str(path.with_name(path.name + ".yaml")))
         out = shlex.quote(str(path.with_name(path.name + "-images")))
         page.show_saved(
-            f"Saved {', '.join(written)} in {self.out}",
-            f"climategs render {source} {where} --out {out}",
+            f"Saved {', '.join(file_names)} in {self.out}",
+            f"climategs render {source} {view_words} --out {out}",
         )
 
     def _write_path(self, camera: Camera, path: Path) -> None:
@@ -583,7 +597,7 @@ class Viewer:
         write_new(path, (json.dumps({**sizes, "frames": [frame]}, indent=1) + "\n").encode())
 
     def _where(self, wish: Wish, camera_path: Path | None) -> str:
-        """The scene and the view in words of the command line."""
+        """Return the scene and the view in words of the command line."""
         scene = f"--scene {shlex.quote(self.uri)}"
         if camera_path is not None:
             return f"{scene} --camera-path {shlex.quote(str(camera_path))}"
@@ -592,7 +606,7 @@ class Viewer:
         )
 
     def _command(self, page: Page, wish: Wish) -> str:
-        """What renders the view without anything saved; says so where that is not possible."""
+        """Return the command line of the view as it is; a note where files must be saved first."""
         files = any(path.endswith(("image", "mask", "checkpoint")) for path in wish.edits.values)
         if files or wish.pose is not None:
             what = "a flight" if wish.pose is not None else "an uploaded file"
@@ -615,18 +629,18 @@ def check_size(width: float, height: float) -> None:
 
 
 @contextlib.contextmanager
-def _compiling_told(tell: Callable[[int], None]) -> Iterator[None]:
-    """Has a function told when numba begins (1) and ends (-1) to compile a kernel; not of those
-    that lie in its cache.
+def _compilations_counted(count: Callable[[int], None]) -> Iterator[None]:
+    """Call a function when numba begins (1) and ends (-1) to compile a kernel; not for kernels that
+    lie in its cache.
     """
     from numba.core.event import Event, Listener, install_listener
 
     class Counter(Listener):
         def on_start(self, event: Event) -> None:
-            tell(1)
+            count(1)
 
         def on_end(self, event: Event) -> None:
-            tell(-1)
+            count(-1)
 
     with install_listener("numba:compile", Counter()):
         yield
@@ -637,16 +651,16 @@ class _Outdated(Exception):
 
 
 def _lacks_effect_of(page: Page, recipe: Recipe) -> bool:
-    """Whether the page asks for a recipe without an effect that another one has."""
+    """Return True if the page asks for a recipe without an effect that another one has."""
     try:
-        asked = page.recipe(page.wish.edits)
+        page_recipe = page.recipe(page.wish.edits)
     except RecipeError:
         return False
-    return not recipe.sections().keys() <= asked.sections().keys()
+    return not recipe.sections().keys() <= page_recipe.sections().keys()
 
 
 def _paced(factor: float, seconds: float) -> float:
-    """The resolution of the next picture while something moves."""
+    """Return the resolution of the next picture while something moves, relative to the recipe's."""
     if seconds > FRAME_S:
         factor *= max(0.7, FRAME_S / seconds)
     elif seconds < FRAME_S / 2:

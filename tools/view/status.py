@@ -1,4 +1,4 @@
-"""The line that says what a page shows, what is being done for it, and how far that has got.
+"""The status line of a page: its picture, the work for the next one, and how far that has got.
 
 "At rest" is said of nothing but the whole picture of what the page asks for now.
 """
@@ -13,9 +13,9 @@ from augment.timing import PassProgress
 if TYPE_CHECKING:
     from tools.view.page import Wish
 
-MOVING_S = 0.4  # a picture that was drawn while something moves is news for so long
-BUSY_S = 0.5  # a wait that is longer gets a bar, and from a second on its seconds are told
-# Passes that draw nothing yet: effects find out there what they put into the scene.
+MOVING_S = 0.4  # The time for which the status line speaks of a moving picture, seconds.
+BUSY_S = 0.5  # The shortest wait that gets a bar, seconds.
+# The passes that draw nothing yet: effects find out there what they put into the scene.
 _PREPARATIONS = ("plan", "view plan", "parts", "prune")
 
 
@@ -24,13 +24,13 @@ class ShownPicture:
     """The picture that a page has got last."""
 
     wish: Wish
-    """What the page asked for."""
+    """The wish of the page that it was drawn for."""
     width: int
     """Its columns, without bars."""
     height: int
     """Its rows, without bars."""
     seconds: float
-    """How long it took."""
+    """The time that it took, seconds."""
     at: float
     """When it was sent, on the monotonic clock."""
     is_rest: bool
@@ -43,7 +43,7 @@ class ShownPicture:
 
 @dataclass
 class Activity:
-    """What the thread that draws is doing. It writes, other threads read."""
+    """The work at hand of the thread that draws. It writes, other threads read."""
 
     progress: PassProgress | None = None
     """The pass that runs; None before the first."""
@@ -55,7 +55,7 @@ class Activity:
 
 @dataclass(frozen=True)
 class Status:
-    """What a page says."""
+    """The status line of a page."""
 
     text: str
     """One sentence."""
@@ -68,7 +68,7 @@ class Status:
 
 
 def describe_activity(activity: Activity | None) -> str:
-    """What the thread is doing, in words. activity: None while it draws for another page."""
+    """Return the thread's work in words. activity: None while it draws for another page."""
     if activity is None:
         return "waiting for the picture of another page"
     progress = activity.progress
@@ -91,7 +91,7 @@ def page_status(
     now: float,
     has_failed: bool = False,
 ) -> Status:
-    """What a page says of its picture.
+    """Return the status line of a page: its picture, and the work for the next one.
 
     Args:
         picture: The last picture; None before the first.
@@ -111,19 +111,19 @@ def page_status(
             return Status(f"{size} at rest, {1000 * picture.seconds:.0f} ms{recipe}", True)
         if not picture.is_rest and now - picture.at < MOVING_S:
             return Status(f"{size} while moving, {1000 * picture.seconds:.0f} ms", is_current)
-    doing = describe_activity(activity)
+    work = describe_activity(activity)
     if waited_s >= 1:
-        doing += f", {waited_s:.0f} s"
+        work += f", {waited_s:.0f} s"
     share = None
     if activity is not None and activity.progress is not None and not activity.compiling:
         total = activity.progress.total
         share = activity.progress.done / total if total else None
-    text = f"{_what_is_shown(picture, wish)}: {doing}"
+    text = f"{_what_is_shown(picture, wish)}: {work}"
     return Status(text, is_current, share, waited_s >= BUSY_S)
 
 
 def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
-    """How the picture differs from the wish, in words."""
+    """Return in words how the picture differs from the wish."""
     if picture is None:
         return "First picture"
     if picture.wish is wish:
@@ -131,7 +131,7 @@ def _what_is_shown(picture: ShownPicture | None, wish: Wish) -> str:
         return f"{'Picture' if picture.is_rest else 'Rough picture'}, {follows} follows"
     if picture.wish.edits != wish.edits:
         return "Picture not of this recipe yet"
-    views = ((own.frame, own.camera, own.pose) for own in (picture.wish, wish))
+    views = ((w.frame, w.camera, w.pose) for w in (picture.wish, wish))
     if len(set(views)) > 1:
         return "Picture not of this view yet"
     return "Picture not up to date yet"

@@ -12,10 +12,12 @@ import html
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-MAX_LENGTH = 20_000  # characters of one text; a page is not there to read a file of megabytes
+# The longest text on a page, characters: a page is not there to read a file of megabytes.
+MAX_LENGTH = 20_000
+# The CSS of all texts.
 STYLE = "font-size:0.875em;overflow-wrap:anywhere;padding:0 0.7em"
-# Categories of Unicode that are not shown but change what is: controls, formats (also those that
-# turn the direction of writing), and surrogates, which cannot be sent.
+# The Unicode categories of characters that are invisible but change the text around them: controls,
+# formats (also those that turn the direction of writing), and surrogates, which cannot be sent.
 _HIDDEN = ("Cc", "Cf", "Cs")
 
 
@@ -58,8 +60,8 @@ def table(
     for number, cells in enumerate(rows):
         lines.append(_row("td", cells, is_bold=number < len(bold) and bold[number]))
     body = "".join(lines)
-    own = 'border="1" bordercolor="#c8c8c8" cellpadding="4" style="border-collapse:collapse"'
-    return f'<div style="{STYLE}"><table {own}>{body}</table></div>'
+    attributes = 'border="1" bordercolor="#c8c8c8" cellpadding="4" style="border-collapse:collapse"'
+    return f'<div style="{STYLE}"><table {attributes}>{body}</table></div>'
 
 
 def _row(tag: str, cells: Iterable[object], *, is_bold: bool = False) -> str:

@@ -24,9 +24,10 @@ def value_of(widget: Any, sent: Any) -> Any:
     value = _cast(sent, widget.value)
     options = getattr(widget, "options", None)
     if value is None or (options is not None and value not in options):
-        wanted = "a value of its kind" if options is None else "one of its options"
-        raise ClimateGSError(f"{widget.label}: expected {wanted}; got {short(repr(sent))}")
-    low, high = getattr(widget, "min", None), getattr(widget, "max", None)
+        expected_value = "a value of its kind" if options is None else "one of its options"
+        raise ClimateGSError(f"{widget.label}: expected {expected_value}; got {short(repr(sent))}")
+    low = getattr(widget, "min", None)
+    high = getattr(widget, "max", None)
     numbers = value if isinstance(value, tuple) else (value,)
     for number, least, most in zip(numbers, _ends(low, numbers), _ends(high, numbers), strict=True):
         # A browser rounds to a slider's steps.
@@ -40,7 +41,7 @@ def value_of(widget: Any, sent: Any) -> Any:
 
 
 def _cast(sent: Any, now: Any) -> Any:
-    """The value as one of the kind that the widget has now; None where it is of another."""
+    """Return the value in the kind that the widget has now; None where it is of another."""
     if isinstance(now, bool | str):
         return sent if type(sent) is type(now) else None
     if isinstance(now, int | float):
