@@ -46,13 +46,13 @@ MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatev
 _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
-_MAX_COLOUR_IMAGES = 150  # of a whole drive: an image every few metres shows all there is
+_MAX_COLOUR_IMAGES = 150  # images that colour a drive: one every few metres shows all there is
 _MAX_DECODED = 600  # images of a drive that are decoded to check them, some 5 ms each
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
 _MAX_FAULTS = 3  # sentences about one camera's images; more become one
 _MAX_NAMED = 3  # frames that a message lists
-_NO_FILE = "has no image"
-_STILL_M = 1e-4  # a return that is no further from its record has not moved
+_NO_FILE = "has no image"  # fault of a picture without a path
+_STILL_M = 1e-4  # largest distance from its record of a return that has not moved
 
 
 # ---- Which frames --------------------------------------------------------------------------------

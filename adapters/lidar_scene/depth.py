@@ -12,8 +12,9 @@ from augment.errors import AdapterError
 from augment.labels import EGO_VEHICLE, ClassifiesLidar, LidarSweep
 from augment.scene import Scene
 
-_NEAR_M = 0.1
-_SAME_DRIVE_NS = 10_000_000_000  # times further from the frame's count from some other start
+_NEAR_M = 0.1  # smallest depth of a return that a camera sees
+# Difference from the frame's time beyond which a sweep's times count from some other start.
+_SAME_DRIVE_NS = 10_000_000_000
 
 
 def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:

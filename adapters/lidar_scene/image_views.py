@@ -23,10 +23,10 @@ from augment.jobs.processes import available_cores
 
 DEPTH_WIDTH = 480  # columns of the z-buffers
 DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap
-_LEVELS = 5
+_LEVELS = 5  # sizes of an image in its pyramid
 _KEEP_SCORE = 0.5  # part of a camera's best score from which its observations count
-_CAMERA_POWER = 2.0  # of that best score, as the camera's weight
-_COVER_MARGIN_M = 0.15
+_CAMERA_POWER = 2.0  # power of that best score that is the camera's weight
+_COVER_MARGIN_M = 0.15  # growth of a moving object's box to all sides, where it covers the world
 _AHEAD = 2  # images that are decoded before their turn
 _REDUCED = {
     1.0: cv2.IMREAD_COLOR,
@@ -237,7 +237,7 @@ def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64) / 2
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-_CLIP_M = 0.05
+_CLIP_M = 0.05  # depth of the plane that a box's edges are clipped at
 
 
 def draw_cover(

@@ -47,13 +47,13 @@ logger = logging.getLogger(__name__)
 # under and behind what hides it, up to so many metres.
 _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
-_MASK_SCALE = 0.25  # of images in which the recording car is looked for
-_MEASURED_PART = 0.9  # of max_gaussians, at most, is for what was measured; the rest closes it
-_MIN_POINTS = 8  # that surfaces are sought in
-_TRIAL = 3.0  # voxels of the trial in units of those asked for
-_REACHES_M = (8.0, 16.0)
-_MIN_RETURNS = 200
-_LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
+_MASK_SCALE = 0.25  # scale of the images in which the recording car is looked for
+_MEASURED_PART = 0.9  # largest part of max_gaussians for measured points; the rest closes holes
+_MIN_POINTS = 8  # fewest points that surfaces are sought in
+_TRIAL = 3.0  # edge of the trial's voxels over that of the finest voxels
+_REACHES_M = (8.0, 16.0)  # radii around the car in which its low height is sought, in turn
+_MIN_RETURNS = 200  # fewest returns in such a radius that are trusted
+_LOW_QUANTILE = 0.02  # quantile of heights that is low, yet not decided by a single stray return
 
 
 def views_of(

@@ -30,7 +30,7 @@ NEAR_M = 6.0  # voxels have their given size up to this distance from the path
 # still resolves what is far ahead.
 GROWTH = 0.7
 _STEP = 0.5  # octaves of distance that share a size, so that points near each other share a grid
-_MAX_LEVEL = 15
+_MAX_LEVEL = 15  # largest level: its 4 bits in a voxel's key hold no more
 NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
 _COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
 _STRETCH = 2.0  # widest gap that a splat closes, in edges
@@ -39,7 +39,7 @@ _UPRIGHT = (Class.BUILDING, Class.BARRIER, Class.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 _GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
 _THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
-_MIN_THICKNESS_M = 0.005
+_MIN_THICKNESS_M = 0.005  # smallest standard deviation along the normal
 
 
 def thin_points(
@@ -378,12 +378,13 @@ _MAX_GAP_M = {
     Class.VEHICLE: 0.4,
     Class.UNKNOWN: 0.4,
 }
-_MAX_OTHER_GAP_M = 0.25
-CELL_M = 0.25
+_MAX_OTHER_GAP_M = 0.25  # widest gap that is bridged on any other class
+CELL_M = 0.25  # side of a cell of the map of the ground's heights
 CLOSE_M = 3.0  # holes up to twice this wide are filled
-BESIDE_M = 8.0  # from the path: filled whatever is around
-REACH_M = 60.0  # from the path
-_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3  # to settle across half the widest hole
+BESIDE_M = 8.0  # distance from the path up to which every hole is filled
+REACH_M = 60.0  # distance from the path up to which ground is filled
+# Steps of relaxation: enough to settle across half the widest hole.
+_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3
 _STEEP = 0.35  # height over distance that ground can have from one cell to the next
 
 
