@@ -126,13 +126,13 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
     each with the entry's query, frames, cameras and recipes. folder: where relative paths start."""
     scenes: dict[str, JobScene] = {}
     for entry in entries:
-        found = _expanded(entry, folder)
-        if entry.name is not None and len(found) > 1:
+        entry_scenes = _expanded(entry, folder)
+        if entry.name is not None and len(entry_scenes) > 1:
             raise AdapterError(
-                f"{entry.uri!r} stands for {len(found)} scenes, which cannot all be called "
+                f"{entry.uri!r} stands for {len(entry_scenes)} scenes, which cannot all be called "
                 f"{entry.name!r}; leave the name out, or list them one by one"
             )
-        for scene in found:
+        for scene in entry_scenes:
             if scene.uri in scenes:
                 raise AdapterError(
                     f"the job names the scene {scene.uri!r} twice (by {entry.uri!r}); give its "
@@ -144,24 +144,26 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
 
 def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     scheme, path, query = parse_uri(entry.uri)
-    known = SCHEMES.get(scheme) if scheme is not None else None
+    scheme_entry = SCHEMES.get(scheme) if scheme is not None else None
     query = {
         key: value if key in _NAME_KEYS else _from(folder, value) for key, value in query.items()
     }
-    if scheme is not None and known is None:
+    if scheme is not None and scheme_entry is None:
         return [entry]  # refused where it is opened
-    if scheme is not None and known is not None and path in known.builtin:
+    if scheme is not None and scheme_entry is not None and path in scheme_entry.builtin:
         return [entry.model_copy(update={"uri": format_uri(scheme, path, query)})]
-    whole = folder.absolute() / path
-    matches = [str(whole)]
-    if glob.has_magic(path) and not whole.exists():
+    full_path = folder.absolute() / path
+    matches = [str(full_path)]
+    if glob.has_magic(path) and not full_path.exists():
         # The job's own folder may be called [x] too.
-        top, parts = folder.absolute(), Path(path).parts
+        top = folder.absolute()
+        parts = Path(path).parts
         if Path(path).is_absolute():
-            top, parts = Path("/"), parts[1:]
+            top = Path("/")
+            parts = parts[1:]
         matches = _matches(top, parts, entry.uri)
     if not matches:
-        raise AdapterError(f"{entry.uri!r}: nothing matches {whole}")
+        raise AdapterError(f"{entry.uri!r}: nothing matches {full_path}")
     return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]
 
 

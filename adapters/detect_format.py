@@ -50,9 +50,9 @@ def source_tree(scene: Scene) -> SourceTree:
             f"{path}, which the scene was made from, is not there; where it has moved, say so in "
             f"the scene's URI (data=URI)"
         )
-    found = find(Path(os.path.abspath(path)), query)
-    entries = None if found.entries is None else tuple(sorted(found.entries))
-    return SourceTree(uri, found.root, found.images, entries, found.sweeps)
+    tree = find(Path(os.path.abspath(path)), query)
+    entries = None if tree.entries is None else tuple(sorted(tree.entries))
+    return SourceTree(uri, tree.root, tree.images, entries, tree.sweeps)
 
 
 _NONE = r"(?!)"  # matches nothing
@@ -79,7 +79,8 @@ def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
     if calibrated == folder:
         return _Found(folder, _KITTI_CAMERA, _KITTI_SWEEP)
     calibration = (path.name for path in calibrated.glob("calib_*.txt"))
-    images, sweeps = rf"[^/]+/{_KITTI_CAMERA}", rf"[^/]+/{_KITTI_SWEEP}"
+    images = rf"[^/]+/{_KITTI_CAMERA}"
+    sweeps = rf"[^/]+/{_KITTI_SWEEP}"
     return _Found(calibrated, images, sweeps, (folder.name, *calibration))
 
 
@@ -180,13 +181,14 @@ _PARTS: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
         ("images/<camera>/000000.jpg", ("images/*/*[0-9].jpg", "images/*/*[0-9].png")),
     ),
 }
-_IMAGES, _VIDEOS = (".jpg", ".jpeg", ".png"), (".mp4", ".mov", ".avi", ".mkv")
+_IMAGES = (".jpg", ".jpeg", ".png")  # suffixes of images
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv")  # suffixes of videos
 _MAX_SEEN = 20_000  # files of an unknown folder that are counted
 _MOST_KINDS = 6  # that are named
 
 
 def _advice(folder: Path) -> str:
-    """What an unknown folder holds, what it nearly is, and what would make it a recording."""
+    """Say what an unknown folder holds, what it nearly is, and how to make it a recording."""
     from adapters.camera_files.camera_files import find_colmap_model
 
     places: dict[str, Counter[str]] = {}
@@ -203,12 +205,14 @@ def _advice(folder: Path) -> str:
     more = f" and {len(kinds) - _MOST_KINDS} more kinds" if len(kinds) > _MOST_KINDS else ""
     said = [f"It holds {', '.join(counts) or 'no files'}{more}"]
     for what, parts in _PARTS.items():
-        there = [n for n, patterns in parts if any(any(folder.glob(p)) for p in patterns)]
-        missing = [name for name, _ in parts if name not in there]
-        if missing and len(there) > len(parts) // 5:  # of many, one alone is anybody's name
-            is_are = "is" if len(there) == 1 else "are"
+        existing_parts = [n for n, patterns in parts if any(any(folder.glob(p)) for p in patterns)]
+        missing = [name for name, _ in parts if name not in existing_parts]
+        # Of many parts, one alone is anybody's name.
+        if missing and len(existing_parts) > len(parts) // 5:
+            is_are = "is" if len(existing_parts) == 1 else "are"
             said.append(
-                f"It is nearly {what}: {', '.join(there)} {is_are} there, {', '.join(missing)} not"
+                f"It is nearly {what}: {', '.join(existing_parts)} {is_are} there, "
+                f"{', '.join(missing)} not"
             )
     guide = "docs/reconstruction.md, A drive of your own"
     if (model := find_colmap_model(folder)) is not None:

@@ -148,7 +148,8 @@ def _best_offset(pair: _Pair) -> float | None:
     if not len(pair.first) or not len(pair.second):
         return None
     corner = np.median(pair.first[:, :2], axis=0) - _REACH_M
-    first, second = _upright_cells(pair.first, corner), _upright_cells(pair.second, corner)
+    first = _upright_cells(pair.first, corner)
+    second = _upright_cells(pair.second, corner)
     if min(first.sum(), second.sum()) < _MIN_UPRIGHT_CELLS:
         return None
     reach = int(np.ceil((pair.step_m * (1 + _TOLERANCE) + _TOLERANCE_M) / _CELL_M))
@@ -156,8 +157,9 @@ def _best_offset(pair: _Pair) -> float | None:
     hits = cv2.matchTemplate(padded.astype(np.float32), second.astype(np.float32), cv2.TM_CCORR)
     overlap = hits / second.sum()
     row, column = np.unravel_index(int(overlap.argmax()), overlap.shape)
-    best, here = float(overlap[row, column]), float(overlap[reach, reach])
-    if best < _MIN_OVERLAP or best < _MIN_GAIN * here:
+    best = float(overlap[row, column])
+    overlap_as_placed = float(overlap[reach, reach])
+    if best < _MIN_OVERLAP or best < _MIN_GAIN * overlap_as_placed:
         return None
     return float(np.hypot(row - reach, column - reach)) * _CELL_M
 
@@ -169,7 +171,8 @@ def _upright_cells(points: np.ndarray, corner: np.ndarray) -> np.ndarray:
     inside = ((cells >= 0) & (cells < side)).all(axis=1)
     index = cells[inside].astype(np.int64) @ [side, 1]
     heights = points[inside, 2]
-    low, high = np.full(side * side, np.inf), np.full(side * side, -np.inf)
+    low = np.full(side * side, np.inf)
+    high = np.full(side * side, -np.inf)
     np.minimum.at(low, index, heights)
     np.maximum.at(high, index, heights)
     with np.errstate(invalid="ignore"):

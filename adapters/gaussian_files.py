@@ -72,7 +72,7 @@ def _names(text: str) -> Sequence[str]:
 
 
 class GaussianOptions(UriOptions):
-    """What may be asked of a splat file in its URI."""
+    """Options of a splat file in its URI."""
 
     up: str | None = Field(
         None,
@@ -138,9 +138,12 @@ CAMERAS_ABOVE_GROUND_M = 1.6
 _METRIC_HEIGHTS_M = (1.0, 2.6)  # cameras this high are on a car or a head, and the unit is a metre
 _HEIGHTS_SPREAD = 0.5  # interquartile range over median, of cameras that were driven or carried
 _STEEPEST_LOOK_DEG = 30.0  # drones look down
-_WIDE_M, _TALL_M, _SPLAT_M = (10.0, 2000.0), (2.0, 150.0), (0.003, 0.6)  # of a street
+_WIDE_M = (10.0, 2000.0)  # least and largest diagonal of a street in plan
+_TALL_M = (2.0, 150.0)  # least and largest height of a street
+_SPLAT_M = (0.003, 0.6)  # least and largest median of a street's splats' longest scales
 
-_VOXELS, _FINER_STEPS = 5000, 16  # wanted, and how often they may shrink for it
+_VOXELS = 5000  # occupied voxels that are wanted
+_FINER_STEPS = 16  # times that voxels may shrink to become so many
 _NEIGHBOURS = 12  # of a voxel, that its surface is fitted to
 _FLAT = 0.5  # thickness of that surface over its width, at most
 _TRIES = 400
@@ -148,7 +151,8 @@ _SAME_WAY = math.cos(math.radians(25.0))  # of surface and plane
 _OTHER_WAY = math.cos(math.radians(30.0))  # of planes that would make another up
 _MUCH_BELOW = 0.05  # of the surface under a plane: it is not the ground
 _COUNTERPART = 1.25  # above 1: of two facades that face each other one has more gaps
-_MIN_SHARE, _MIN_LEAD = 0.05, 4.0
+_MIN_SHARE = 0.05  # least lead of a clear ground's share over that of any plane above it
+_MIN_LEAD = 4.0  # least ratio of its score to that of the best plane of another direction
 _SNAP_DEG = 3.0  # a road's slope; a world that is turned at random rarely comes this close
 _MIN_POINTS = 100
 
@@ -192,18 +196,19 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
         return None
     flat = np.flatnonzero(surface.is_flat)
     rng = rng_for(seed=0, scene="", effect="adapters.gaussian_files")
-    chosen = rng.permutation(flat)[:_TRIES]
-    ups = np.concatenate([surface.normals[chosen], -surface.normals[chosen]])
-    places = np.tile(surface.places[chosen], (2, 1))
+    samples = rng.permutation(flat)[:_TRIES]
+    ups = np.concatenate([surface.normals[samples], -surface.normals[samples]])
+    places = np.tile(surface.places[samples], (2, 1))
     if near is not None:
-        able = ups @ near > math.cos(math.radians(45.0))
-        ups, places = ups[able], places[able]
+        is_near = ups @ near > math.cos(math.radians(45.0))
+        ups = ups[is_near]
+        places = places[is_near]
     if len(ups) == 0:
         return None
     scores = np.array([surface.score(up, at) for up, at in zip(ups, places, strict=True)])
     best = int(scores.argmax())
-    others = scores[ups @ ups[best] < _OTHER_WAY]
-    rival = max(float(others.max(initial=0.0)), 1e-6)
+    other_scores = scores[ups @ ups[best] < _OTHER_WAY]
+    rival = max(float(other_scores.max(initial=0.0)), 1e-6)
     up, at = surface.refined(ups[best], places[best])
     return GroundFound(_snapped(up), *surface.judge(up, at), float(scores[best]) / rival)
 
@@ -213,7 +218,8 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
     None where they do not stand as on a car or in a hand.
 
     points: [N, 3], and poses: world_from_camera [C, 4, 4], in a world whose +z is up."""
-    eyes, looks = poses[:, :3, 3], poses[:, 2, 2]
+    eyes = poses[:, :3, 3]
+    looks = poses[:, 2, 2]
     if np.median(np.abs(looks)) > math.sin(math.radians(_STEEPEST_LOOK_DEG)):
         return None
     radius = 0.25 * float(np.linalg.norm(np.ptp(eyes[:, :2], axis=0)))
@@ -339,8 +345,9 @@ _UP_TOLERANCE_DEG = 30.0
 _LEVEL_TOLERANCE_DEG = 15.0  # cameras on a car lean less; this vouches for an axis, not for degrees
 _NAMED_FILES = 8  # of one scene, that a sentence names
 _ITERATION = re.compile(r"iteration_(\d+)")
-_SAMPLED_VIEWS, _SAMPLED_POINTS = 16, 20_000
-_MIN_SEEN = 0.001
+_SAMPLED_VIEWS = 16  # most cameras that are checked
+_SAMPLED_POINTS = 20_000  # most points that each of them is checked with
+_MIN_SEEN = 0.001  # least part of the points that the median camera must see
 
 
 def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
@@ -357,9 +364,9 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     file = files[0]
     splats = _read_parts(files, options)
     problems = list(splats.problems)
-    found = _find_views(file, Path(path), options)
-    views = found.views if found else ()
-    problems += found.problems if found else ()
+    view_set = _find_views(file, Path(path), options)
+    views = view_set.views if view_set else ()
+    problems += view_set.problems if view_set else ()
     world = _find_world(file, splats, views, options)
     change = world.change
     gaussians = change.gaussians(splats.gaussians, splats.origin)
@@ -429,10 +436,10 @@ def _listed_files(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:
         raise AdapterError(f"{folder}: files lists names in a folder; this is a file")
     for name in names:
         if "/" in name or name in (".", "..") or not (folder / name).is_file():
-            there = ", ".join(file.name for file in splat_files_of(folder)[:8]) or "none"
+            file_names = ", ".join(file.name for file in splat_files_of(folder)[:8]) or "none"
             raise AdapterError(
                 f"{folder}: files names {name!r:.100}, which is no file of this folder; its splat "
-                f"files: {there}"
+                f"files: {file_names}"
             )
     return tuple(folder / name for name in names)
 
@@ -446,16 +453,17 @@ def _read_parts(files: Sequence[Path], options: GaussianOptions) -> SplatFile:
     if len(parts) == 1:
         return parts[0]
     notes = parts[0].notes
-    for key, given in (("up", options.up), ("unit", options.scale)):
+    for key, option in (("up", options.up), ("unit", options.scale)):
         said = {part.notes.get(key) for part in parts}
-        if len(said) > 1 and (given is None or len(said - {None}) > 1):
-            each = ", ".join(
+        if len(said) > 1 and (option is None or len(said - {None}) > 1):
+            statements = ", ".join(
                 f"{file.name} says {part.notes.get(key) or 'nothing'}"
                 for file, part in zip(files[:8], parts, strict=False)
             )
             raise AdapterError(
-                f"{files[0].parent}: its splat files differ in {key!r}: {each}. Parts of one scene "
-                f"must have the same axes and unit: export them alike, or open them one by one"
+                f"{files[0].parent}: its splat files differ in {key!r}: {statements}. "
+                f"Parts of one scene must have the same axes and unit: export them alike, or open "
+                f"them one by one"
             )
     origin = next((part.origin for part in parts if part.origin.any()), parts[0].origin)
     moved = []
@@ -489,7 +497,7 @@ def _stand_in_sky(path: Path) -> tuple[float, float, float]:
     return COLOURS["overcast"]
 
 
-def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | None:
+def _find_views(file: Path, path: Path, options: GaussianOptions) -> ViewSet | None:
     if options.cameras == "none":
         return None
     if options.cameras is not None:
@@ -497,12 +505,12 @@ def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | 
     folders = [file.parent]
     if _ITERATION.fullmatch(file.parent.name) and file.parent.parent.name == "point_cloud":
         folders.append(file.parent.parent.parent)
-    if given.is_dir():
-        folders.append(given)
+    if path.is_dir():
+        folders.append(path)
     for folder in folders:
-        if found := find_camera_file(folder):
+        if camera_file := find_camera_file(folder):
             try:
-                return read_views(found)
+                return read_views(camera_file)
             except AdapterError as error:
                 raise AdapterError(
                     f"{error}. (Found beside {file}; give cameras=FILE for others or cameras=none "
@@ -528,7 +536,9 @@ def _find_world(
 ) -> _World:
     up, knows_up, about_up = _find_up(splats, views, options)
     turned = WorldChange(rotation_to_z_up(up))
-    scale, is_metric, about_scale = 1.0, False, "to estimate it, up has to be known"
+    scale = 1.0
+    is_metric = False
+    about_scale = "to estimate it, up has to be known"
     if knows_up or options.scale is not None:
         scale, is_metric, about_scale = _find_scale(splats, views, options, turned)
     if not is_metric:
@@ -537,7 +547,7 @@ def _find_world(
             f"Give scale=METRES_PER_UNIT (scale=1 if it is in metres); {about_scale}"
         )
     facts = ((knows_up, "which way is up"), (is_metric, "how long a unit is"))
-    lacking = " and ".join(what for known, what in facts if not known)
+    lacking = " and ".join(what for is_known, what in facts if not is_known)
     problems = [f"{file}: {sentence}" for sentence in (about_scale, about_up) if sentence]
     means = splats.gaussians.means
     sample = means[:: 1 + len(means) // 100_000].double().numpy() + splats.origin
@@ -577,11 +587,11 @@ def _find_up(
         return up, True, ""
     why = ""
     if stated is None and (cameras_up is None or lean_deg >= _LEVEL_TOLERANCE_DEG):
-        found = find_ground(splats.gaussians, near=cameras_up)
-        if found is not None and found.is_clear:
-            return found.up, True, f"up is estimated to be {found.sentence}. Give up=AXIS if not"
+        ground = find_ground(splats.gaussians, near=cameras_up)
+        if ground is not None and ground.is_clear:
+            return ground.up, True, f"up is estimated to be {ground.sentence}. Give up=AXIS if not"
         why = "which way is up is not clear; " + (
-            f"the best guess is {found.sentence}" if found else "nothing in the file is flat"
+            f"the best guess is {ground.sentence}" if ground else "nothing in the file is flat"
         )
     if cameras_up is not None and lean_deg > _UP_TOLERANCE_DEG:
         why = (
@@ -602,7 +612,8 @@ def _find_scale(
     if splats.notes.get("unit") in ("metre", "metres", "m"):
         return 1.0, True, ""
     points = turned.points(solid_points(splats.gaussians) + splats.origin)
-    scale, reason = 1.0, "nothing says otherwise, and it can be a street in metres"
+    scale = 1.0
+    reason = "nothing says otherwise, and it can be a street in metres"
     if views:
         poses = np.stack([turned.pose(view.world_from_camera) for view in views])
         by_cameras = scale_from_cameras(points, poses)
@@ -619,7 +630,8 @@ def _find_scale(
 def _frames_and_ground(
     gaussians: Gaussians, views: tuple[PosedView, ...], world: _World, options: GaussianOptions
 ) -> tuple[tuple[Frame, ...], float | None, list[str]]:
-    change, is_metric = world.change, world.is_metric
+    change = world.change
+    is_metric = world.is_metric
     if not views:
         if options.path == "auto" and world.lacking:
             note = (
@@ -628,9 +640,9 @@ def _frames_and_ground(
                 "path=orbit to circle it as it lies, or camera_path=FILE"
             )
             return (), None, [note]
-        made = make_default_path(gaussians, is_metric=is_metric, kind=options.path)
-        frames, problems = frames_from_views(made.views, WorldChange())
-        return frames, made.ground_z_m, [made.note, *problems]
+        default_path = make_default_path(gaussians, is_metric=is_metric, kind=options.path)
+        frames, problems = frames_from_views(default_path.views, WorldChange())
+        return frames, default_path.ground_z_m, [default_path.note, *problems]
     frames, problems = frames_from_views(views, change)
     points = solid_points(gaussians)
     positions = np.stack([change.pose(view.world_from_camera)[:3, 3] for view in views])
@@ -651,8 +663,8 @@ def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]
         ahead = z > 0
         u = camera.fx * x[ahead] / z[ahead] + camera.cx
         v = camera.fy * y[ahead] / z[ahead] + camera.cy
-        seen = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        shares.append(seen.sum() / len(points))
+        in_image = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        shares.append(in_image.sum() / len(points))
     if np.median(shares) >= _MIN_SEEN:
         return []
     return [
@@ -662,15 +674,15 @@ def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]
     ]
 
 
-def _scene_name(files: Sequence[Path], given: Path) -> str:
+def _scene_name(files: Sequence[Path], path: Path) -> str:
     """The folder's name for several files, and for a trained model or a streamed scene, whose files
     are always called the same."""
     file = files[0]
     if len(files) > 1 or file.name == LOD_META:
         return file.parent.resolve().name or file.stem
-    if file == given and file.name != "point_cloud.ply":
+    if file == path and file.name != "point_cloud.ply":
         return file.stem
-    folder = given if given.is_dir() else given.parent
+    folder = path if path.is_dir() else path.parent
     while _ITERATION.fullmatch(folder.name) or folder.name == "point_cloud":
         folder = folder.parent
     return folder.resolve().name or file.stem

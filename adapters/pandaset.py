@@ -315,7 +315,9 @@ def read_sweeps(
     meaning = class_meanings(root)
     cuboids = {frame.index: read_cuboids(root, frame.index) for frame in frames}
     moving = _moving_boxes(root, frames, cuboids, origin)
-    sweeps, boxes, problems = [], [], []
+    sweeps = []
+    boxes = []
+    problems = []
     for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
         n = frame.index
         lidar = read_lidar(root, n)
@@ -349,8 +351,8 @@ def read_sweeps(
         elif lidar is None:
             boxes += moving[n]
         else:
-            own = sensors_of(table)
-            boxes += [_when_seen(b, own[b.row], sweep, sensor, frame) for b in moving[n]]
+            box_sensors = sensors_of(table)
+            boxes += [_when_seen(b, box_sensors[b.row], sweep, sensor, frame) for b in moving[n]]
     return tuple(sweeps), tuple(boxes), tuple(problems)
 
 
@@ -365,38 +367,40 @@ def _moving_boxes(
 
     def timed(frame: Frame, table: pd.DataFrame) -> TimedBoxes:
         boxes = boxes_of_cuboids(table)
-        known = tuple(names[uuid] for uuid in boxes.track_ids)
+        object_names = tuple(names[uuid] for uuid in boxes.track_ids)
         moves = ~table["stationary"].to_numpy().astype(bool)
-        boxes = replace(boxes, track_ids=known, attributes={})
+        boxes = replace(boxes, track_ids=object_names, attributes={})
         return TimedBoxes(frame.index, boxes, frame.timestamp_ns, moves)
 
     tables = ((frame, cuboids[frame.index]) for frame in frames)
-    found = find_objects(
+    objects = find_objects(
         (timed(frame, table) for frame, table in tables if table is not None), origin, several=True
     )
     by_frame: dict[int, list[BoxSample]] = defaultdict(list)
-    for box in found.moving:
+    for box in objects.moving:
         by_frame[box.frame].append(box)
     return by_frame
 
 
 def _when_seen(
-    box: BoxSample, own: int, sweep: Sweep, sensor: np.ndarray, frame: Frame
+    box: BoxSample, sensor_number: int, sweep: Sweep, sensor: np.ndarray, frame: Frame
 ) -> BoxSample:
     """The box at the time when its own sensor saw it, as boxes were drawn around returns of 0.1 s:
     the median time of its returns in the box, else the time of the return of nearest bearing from
     the car. sensor: [N], that of each of the sweep's returns."""
-    points, times = sweep.points, sweep.timestamps_ns
-    pose, reach = box.world_from_box, float(np.linalg.norm(box.size_m))
+    points = sweep.points
+    times = sweep.timestamps_ns
+    pose = box.world_from_box
+    reach = float(np.linalg.norm(box.size_m))
     near = indices_between(points, pose[:3, 3] - reach, pose[:3, 3] + reach)
-    if own >= 0:
-        near = near[sensor[near] == own]
+    if sensor_number >= 0:
+        near = near[sensor[near] == sensor_number]
     local = (points[near] - pose[:3, 3]) @ pose[:3, :3]
     inside = near[inside_box(local, box.size_m, _TIMING_MARGIN_M)]
     if len(inside):
         return replace(box, timestamp_ns=int(np.sort(times[inside])[len(inside) // 2]))
     finite = np.isfinite(points[:, 0])
-    ofs = finite & (sensor == own) if (sensor == own).any() else finite
+    ofs = finite & (sensor == sensor_number) if (sensor == sensor_number).any() else finite
     if not ofs.any():
         return box
     origin = frame.world_from_ego.numpy()[:2, 3]
@@ -498,7 +502,7 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
     then, without a partner, by overlap: boxes of one class and both sensors that share MIN_OVERLAP
     on average. No tie makes two boxes of one sensor in one frame the same object."""
     boxes = _Boxes(defaultdict(set), {}, {})
-    named: dict[tuple[str, str], None] = {}
+    uuid_pairs: dict[tuple[str, str], None] = {}
     for frame, table in tables.items():
         siblings = table.get("cuboids.sibling_id", table["uuid"])
         rows = zip(
@@ -509,9 +513,9 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
             boxes.sensors.setdefault(uuid, sensor)
             kind = class_of_label(str(label))
             boxes.kinds.setdefault(uuid, kind.name if kind else str(label))
-            named[uuid, sibling] = None
-    links = [pair for pair in named if pair[0] != pair[1] and pair[1] in boxes.frames]
-    links.sort(key=lambda pair: pair[::-1] not in named)
+            uuid_pairs[uuid, sibling] = None
+    links = [pair for pair in uuid_pairs if pair[0] != pair[1] and pair[1] in boxes.frames]
+    links.sort(key=lambda pair: pair[::-1] not in uuid_pairs)
     total: Counter[tuple[str, str]] = Counter()
     for table in tables.values():
         total.update(dict(_overlaps(table, boxes)))
@@ -529,21 +533,21 @@ def tie_boxes(tables: Mapping[int, pd.DataFrame]) -> Objects:
 
 
 class _Boxes(NamedTuple):
-    """What the tables say of each uuid, in order of first appearance: its frames, its sensor, and
-    its class, or where that is not known its label."""
+    """Facts of the tables about each uuid, in order of first appearance: its frames, its sensor,
+    and its class, or where that is not known its label."""
 
     frames: dict[str, set[int]]
     sensors: dict[str, int]
     kinds: dict[str, str]
 
     def are_one(self, a: list[str], b: list[str], tie: tuple[str, str]) -> bool:
-        """Whether all these uuids can be one object, two of them being tied: it has a box of each
-        sensor in a frame at most."""
+        """True if all these uuids, two of which are tied, can be one object: an object has at most
+        one box of each sensor in a frame."""
         return all(
-            self.frames[one].isdisjoint(self.frames[other])
-            or ((one, other) == tie and not self.same_sensor(one, other))
-            for one in a
-            for other in b
+            self.frames[first].isdisjoint(self.frames[second])
+            or ((first, second) == tie and not self.same_sensor(first, second))
+            for first in a
+            for second in b
         )
 
     def same_sensor(self, a: str, b: str) -> bool:
@@ -555,22 +559,25 @@ def _overlaps(table: pd.DataFrame, boxes: _Boxes) -> Iterator[tuple[tuple[str, s
     uuids = [str(uuid) for uuid in table["uuid"]]
     columns = [f"{name}.{axis}" for name in ("position", "dimensions") for axis in "xyz"]
     values = table[[*columns, "yaw"]].to_numpy(dtype=np.float64)
-    places, sizes, yaws = values[:, :3], values[:, 3:6], np.degrees(values[:, 6])
+    places = values[:, :3]
+    sizes = values[:, 3:6]
+    yaws = np.degrees(values[:, 6])
     usable = np.isfinite(values).all(axis=1) & (sizes > 0).all(axis=1)
     if "cuboids.sensor_id" in table:
         usable &= np.array(sensors_of(table)) != _NO_SENSOR
-    chosen = np.flatnonzero(usable)
-    for place, i in enumerate(chosen):
-        others = chosen[place + 1 :]
-        offsets, reach = places[others] - places[i], (sizes[others] + sizes[i]) / 2
+    usable_boxes = np.flatnonzero(usable)
+    for place, i in enumerate(usable_boxes):
+        later_boxes = usable_boxes[place + 1 :]
+        offsets = places[later_boxes] - places[i]
+        reach = (sizes[later_boxes] + sizes[i]) / 2
         near = np.hypot(*offsets[:, :2].T) < np.hypot(*reach[:, :2].T)
         near &= np.abs(offsets[:, 2]) < reach[:, 2]
-        for j in others[near]:
+        for j in later_boxes[near]:
             a, b = sorted((uuids[i], uuids[j]))
             if boxes.kinds[a] == boxes.kinds[b] and not boxes.same_sensor(a, b):
-                own = ([0.0, 0.0], sizes[i, :2].tolist(), yaws[i])
-                other = ((places[j] - places[i])[:2].tolist(), sizes[j, :2].tolist(), yaws[j])
-                yield (a, b), _intersection_over_union(own, other)
+                rectangle_i = ([0.0, 0.0], sizes[i, :2].tolist(), yaws[i])
+                rectangle_j = ((places[j] - places[i])[:2].tolist(), sizes[j, :2].tolist(), yaws[j])
+                yield (a, b), _intersection_over_union(rectangle_i, rectangle_j)
 
 
 def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
@@ -630,8 +637,8 @@ class PandaSetLabels:
         return None if numbers is None else world_classes(numbers, class_meanings(self.root))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Where each return's own sensor was at its own time: the car on a straight line between
-        its poses at the ends of the sweeps, and turned as at the end of this one."""
+        """Position of each return's sensor at the return's time: the car is on a straight line
+        between its poses at the ends of the sweeps, and turned as at the end of this one."""
         world_from_ego, times_ns = read_ego_track(self.root)
         if not 0 <= frame_index < len(times_ns):
             return None

@@ -120,17 +120,19 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def validated(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
-    """What a file holds as a model, or as another type of pydantic's. where: file and place in it.
-    hint: what to do where it is not such; both for messages."""
+    """Content of a file as a pydantic model, or as another type that pydantic validates.
+
+    where: file and place in it. hint: what to do where the content is invalid; both for messages.
+    """
     try:
         return _adapter(kind).validate_python(content)
     except ValidationError as error:
-        found = error.errors(include_url=False, include_context=False)[0]
-    names = ".".join(map(str, found["loc"]))
-    said = re.sub(r"^(Value error, |\w+ should )", "", str(found["msg"]))
+        fault = error.errors(include_url=False, include_context=False)[0]
+    names = ".".join(map(str, fault["loc"]))
+    said = re.sub(r"^(Value error, |\w+ should )", "", str(fault["msg"]))
     said = said if said.startswith("must ") else f"must {said}"
-    got = reprlib.repr(found["input"])  # of a file's every entry it would be as large as the file
-    said = "is missing" if found["type"] == "missing" else f"{said}; got {got}"
+    got = reprlib.repr(fault["input"])  # of a file's every entry it would be as large as the file
+    said = "is missing" if fault["type"] == "missing" else f"{said}; got {got}"
     raise AdapterError(f"{where}: {names}{' ' if names else ''}{said}. {hint}")
 
 

@@ -60,7 +60,8 @@ def open_procedural(query: Mapping[str, str]) -> Scene:
     Raises:
         AdapterError: unknown keys or values outside their limits.
     """
-    parameters, begun = parse_parameters(query), time.perf_counter()
+    parameters = parse_parameters(query)
+    start_s = time.perf_counter()
     street = build_street(parameters)
     eyes, times = _eyes(parameters)
     static = plan_splats(street.static, eyes)
@@ -87,13 +88,14 @@ def open_procedural(query: Mapping[str, str]) -> Scene:
         ground_z_m=float(ego_pose(parameters, times_ns)[0][:, 2].min()),  # lowest under the path
     )
     count = len(scene.background) + sum(len(a.gaussians) for a in actors)
-    logger.info("%s: %d Gaussians in %.1f s", scene.name, count, time.perf_counter() - begun)
+    logger.info("%s: %d Gaussians in %.1f s", scene.name, count, time.perf_counter() - start_s)
     return scene
 
 
 def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
     """Places [E, 3] of the cameras along the drive, and the times [E] they are there."""
-    first, last = frame_time_ns(0), frame_time_ns(parameters.frames - 1)
+    first = frame_time_ns(0)
+    last = frame_time_ns(parameters.frames - 1)
     length = parameters.speed_mps * (last - first) * 1e-9
     count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MAX_EYES))
     times = np.linspace(0, last - first, count).round().astype(np.int64) + first
@@ -109,10 +111,12 @@ def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
 
 
 class RayHits(NamedTuple):
-    """What N rays see. distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards
-    the ray's origin; zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's
-    index. rgb [N, 3]: display-encoded, with baked light, zero for sky; None unless asked for.
-    shape [N]: of the body that was hit, -1 for sky.
+    """Surfaces that N rays hit.
+
+    distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards the ray's origin;
+    zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's index. rgb [N, 3]:
+    display-encoded, with baked light, zero for sky; None unless asked for. shape [N]: of the body
+    that was hit, -1 for sky.
     """
 
     distance: np.ndarray
@@ -157,7 +161,8 @@ class StreetTruth:
         with_rgb: bool = True,
     ) -> RayHits:
         """Follow rays [N, 3] (origins may be [3]) at a time, or at each ray's own time [N]."""
-        rays, unit = len(directions), unit_vectors(directions)
+        rays = len(directions)
+        unit = unit_vectors(directions)
         origins = np.ascontiguousarray(np.broadcast_to(origins, unit.shape), np.float64)
         times = np.broadcast_to(np.asarray(timestamp_ns, np.int64), (rays,))
         distance, shape, local = self.street.static.tree.cast(origins, unit)
@@ -170,11 +175,11 @@ class StreetTruth:
             passing = (relative**2).sum(1) - along**2 < reach**2
             index = np.flatnonzero(present & passing)
             turn = _turn(mover.motion.yaw)
-            met = mover.body.tree.cast(relative[index] @ turn, unit[index] @ turn)
-            nearer = met.distance < distance[index]
+            actor_hits = mover.body.tree.cast(relative[index] @ turn, unit[index] @ turn)
+            nearer = actor_hits.distance < distance[index]
             index = index[nearer]
-            for values, own in zip((distance, shape, local), met, strict=True):
-                values[index] = own[nearer]
+            for values, actor_values in zip((distance, shape, local), actor_hits, strict=True):
+                values[index] = actor_values[nearer]
             instance[index] = number
         normal = np.zeros((rays, 3))
         semantic = np.full(rays, SemanticClass.SKY, np.int16)
@@ -183,20 +188,21 @@ class StreetTruth:
         bodies += [(mover.body, _turn(mover.motion.yaw)) for mover in self.street.movers]
         for number in np.unique(instance):
             index = np.flatnonzero((instance == number) & (shape >= 0))
-            (body, turn), chosen = bodies[number], shape[index]
-            normal[index] = body.shapes.normals(chosen, local[index]) @ turn.T
-            semantic[index] = body.shapes.semantic[chosen]
+            body, turn = bodies[number]
+            hit_shapes = shape[index]
+            normal[index] = body.shapes.normals(hit_shapes, local[index]) @ turn.T
+            semantic[index] = body.shapes.semantic[hit_shapes]
             if rgb is not None:
-                rgb[index] = body.colors(chosen, local[index][None])
+                rgb[index] = body.colors(hit_shapes, local[index][None])
         normal[(normal * unit).sum(1) > 0] *= -1
         if rgb is not None:
-            seen = np.flatnonzero((instance == 0) & (shape >= 0))
-            points = origins[seen] + distance[seen, None] * unit[seen]
+            surface_rays = np.flatnonzero((instance == 0) & (shape >= 0))
+            points = origins[surface_rays] + distance[surface_rays, None] * unit[surface_rays]
             for mover, shadow in zip(self.street.movers, self._shadows, strict=True):
-                centres, present = mover.motion.at(times[seen])
+                centres, present = mover.motion.at(times[surface_rays])
                 relative = (points - centres) @ _turn(mover.motion.yaw)
                 cover = shadow.cover(relative) * present
-                rgb[seen] += cover[:, None] * (SHADOW_RGB - rgb[seen])
+                rgb[surface_rays] += cover[:, None] * (SHADOW_RGB - rgb[surface_rays])
         return RayHits(distance, normal, semantic, instance, shape, rgb)
 
     def render(self, camera: Camera) -> TrueView:
@@ -220,7 +226,8 @@ class StreetTruth:
 
 def _turn(yaw: float) -> np.ndarray:
     """world_from_actor rotation; `world @ turn` takes row vectors into the actor's frame."""
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -236,7 +243,8 @@ def open_truth(query: Mapping[str, str]) -> StreetTruth:
 # ---- A spinning LiDAR on the ego car's roof; things stand where they are at each ray's own time --
 
 SENSOR_M = (0.6, 0.0, 1.95)  # forward, left, up from the ego origin
-LOWEST_DEG, HIGHEST_DEG = -24.0, 14.0
+LOWEST_DEG = -24.0  # elevation of ring 0
+HIGHEST_DEG = 14.0  # elevation of the last ring
 REACH_M = (1.5, 120.0)
 # Share of the beam that comes back from a surface met head on.
 REFLECTIVITY = {
@@ -263,7 +271,8 @@ def lidar_rays(
     The beam starts behind the car half a frame early, turns clockwise, and looks ahead at the
     frame's time. Ring 0 is the lowest.
     """
-    columns, rings = parameters.lidar_columns, parameters.lidar_rings
+    columns = parameters.lidar_columns
+    rings = parameters.lidar_rings
     turn = (np.arange(columns) + 0.5) / columns - 0.5
     times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
     azimuth = (ego_pose(parameters, times)[1] - 2 * np.pi * turn)[:, None]
@@ -274,10 +283,11 @@ def lidar_rays(
 
 
 def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
-    """Where the sensor is at times [N], float64 [N, 3]."""
+    """Positions of the sensor at times [N], float64 [N, 3]."""
     positions, yaws = ego_pose(parameters, timestamps_ns)
     forward, left, up = SENSOR_M
-    c, s = np.cos(yaws), np.sin(yaws)
+    c = np.cos(yaws)
+    s = np.sin(yaws)
     return positions + xyz(c * forward - s * left, s * forward + c * left, up)
 
 
@@ -320,22 +330,27 @@ class StreetLabels:
         self._time_ns(frame_index)
         origins, directions, times = lidar_rays(self.parameters, frame_index)
         rings = directions.shape[1]
-        origin, time = np.repeat(origins, rings, axis=0), np.repeat(times, rings)
+        origin = np.repeat(origins, rings, axis=0)
+        time = np.repeat(times, rings)
         direction = directions.reshape(-1, 3)
         truth = StreetTruth(build_street(self.parameters))
         hits = truth.cast(origin, direction, time, with_rgb=False)
-        kept = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
-        distance, semantic = hits.distance[kept], hits.semantic[kept]
-        x, y, z = (origin[kept] + distance[:, None] * direction[kept]).T
+        returns = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
+        distance = hits.distance[returns]
+        semantic = hits.semantic[returns]
+        x, y, z = (origin[returns] + distance[:, None] * direction[returns]).T
         reflectivity = np.array([REFLECTIVITY.get(value, 0.0) for value in SemanticClass])
-        incidence = np.abs((hits.normal[kept] * direction[kept]).sum(1))
+        incidence = np.abs((hits.normal[returns] * direction[returns]).sum(1))
         intensity = reflectivity[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
         return LidarSweep({
-            "x": x, "y": y, "z": z, "intensity": intensity.astype(np.float32),
-            "timestamp_ns": time[kept],
-            "ring": np.tile(np.arange(rings), len(times))[kept].astype(np.uint8),
+            "x": x,
+            "y": y,
+            "z": z,
+            "intensity": intensity.astype(np.float32),
+            "timestamp_ns": time[returns],
+            "ring": np.tile(np.arange(rings), len(times))[returns].astype(np.uint8),
             "semantic": semantic.astype(np.uint8),
-            "instance": hits.instance[kept].astype(np.uint16),
+            "instance": hits.instance[returns].astype(np.uint16),
         })  # fmt: skip
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
@@ -343,7 +358,7 @@ class StreetLabels:
         return np.asarray(sweep.columns["semantic"], np.int16)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray:
-        """Where the sensor was at each return's own time, exactly."""
+        """Exact position of the sensor at the time of each return."""
         self._time_ns(frame_index)
         return sensor_origins(self.parameters, np.asarray(sweep.columns["timestamp_ns"], np.int64))
 

@@ -46,13 +46,13 @@ MOVED_M = 1.0  # an object whose boxes lie further apart than this moves, whatev
 _STATIONARY = ("stationary", "is_parked")
 _SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
 FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
-_MAX_COLOUR_IMAGES = 150  # of a whole drive: an image every few metres shows all there is
+_MAX_COLOUR_IMAGES = 150  # images that colour a drive: one every few metres shows all there is
 _MAX_DECODED = 600  # images of a drive that are decoded to check them, some 5 ms each
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
 _MAX_FAULTS = 3  # sentences about one camera's images; more become one
 _MAX_NAMED = 3  # frames that a message lists
-_NO_FILE = "has no image"
-_STILL_M = 1e-4  # a return that is no further from its record has not moved
+_NO_FILE = "has no image"  # fault of a picture without a path
+_STILL_M = 1e-4  # largest distance from its record of a return that has not moved
 
 
 # ---- Which frames --------------------------------------------------------------------------------
@@ -79,10 +79,10 @@ def _frame_range(text: object, max_parts: int) -> range:
     if not 2 <= len(parts) <= max_parts:
         raise ValueError(text)
     first, stop, step = (int(part) if part else None for part in (*parts, "")[:3])
-    found = range(first or 0, sys.maxsize if stop is None else stop, 1 if step is None else step)
-    if found.start < 0 or found.step < 1 or found.stop <= found.start:
+    frames = range(first or 0, sys.maxsize if stop is None else stop, 1 if step is None else step)
+    if frames.start < 0 or frames.step < 1 or frames.stop <= frames.start:
         raise ValueError(text)
-    return found
+    return frames
 
 
 def _shown(frames: range) -> str:
@@ -118,35 +118,36 @@ class DriveOptions(UriOptions):
     )
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
-        """Which of the dataset's frames, ascending, the scene has. where: for messages."""
-        kept = tuple(number for number in numbers if number in self.frames)
-        if not kept:
+        """The scene's frames out of the dataset's, which ascend. where: for messages."""
+        selection = tuple(number for number in numbers if number in self.frames)
+        if not selection:
             raise AdapterError(
                 f"{where}: frames={_shown(self.frames)} selects none of the {len(numbers)} "
                 f"frames ({numbers[0]} to {numbers[-1]})"
             )
         if self.held_out is None:
-            return DriveFrames(kept, frozenset())
-        held = frozenset(number for number in kept if number in self.held_out)
+            return DriveFrames(selection, frozenset())
+        held_out = frozenset(number for number in selection if number in self.held_out)
         stated = f"held_out={_shown(self.held_out)}:{self.held_out.step} holds out"
-        if len(held) == len(kept):
+        if len(held_out) == len(selection):
             raise AdapterError(
-                f"{where}: {stated} all {len(kept)} frames ({kept[0]} to {kept[-1]}); leave some "
-                f"to build the scene from, as 1::2 does"
+                f"{where}: {stated} all {len(selection)} frames "
+                f"({selection[0]} to {selection[-1]}); leave some to build the scene from, "
+                f"as 1::2 does"
             )
-        problem = f"{stated} none of frames {kept[0]} to {kept[-1]}"
-        return DriveFrames(kept, held, () if held else (problem,))
+        problem = f"{stated} none of frames {selection[0]} to {selection[-1]}"
+        return DriveFrames(selection, held_out, () if held_out else (problem,))
 
 
 def some(numbers: Sequence[int]) -> str:
     """How many frames and the first of them, for messages."""
-    named = ", ".join(map(str, numbers[:_MAX_NAMED]))
+    first_numbers = ", ".join(map(str, numbers[:_MAX_NAMED]))
     more = ", ..." if len(numbers) > _MAX_NAMED else ""
-    return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({named}{more})"
+    return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({first_numbers}{more})"
 
 
 def drive_origin(positions_m: np.ndarray) -> np.ndarray:
-    """What to subtract from the dataset's coordinates so that float32 keeps its digits, float64
+    """Offset to subtract from the dataset's coordinates so that float32 keeps its digits, float64
     [3]: zero near the dataset's origin, else whole metres near the first of the car's positions [F,
     3]."""
     far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
@@ -192,36 +193,43 @@ def usable_images(pictures: Sequence[Picture], *, every_camera: bool = True) -> 
             every_camera, none of the images that it has can be used."""
     with ThreadPoolExecutor(_READERS) as pool:
         look = partial(_header_or_fault, decode=len(pictures) <= _MAX_DECODED)
-        seen = dict(zip(pictures, pool.map(look, pictures), strict=True))
+        header_or_fault = dict(zip(pictures, pool.map(look, pictures), strict=True))
     by_camera: dict[str, list[Picture]] = defaultdict(list)
     for picture in pictures:
         by_camera[picture.camera].append(picture)
     paths: dict[int, dict[str, str]] = {picture.frame: {} for picture in pictures}
-    sizes, problems = {}, []
-    for camera, own in by_camera.items():
-        headers = [header for p in own if not isinstance(header := seen[p], str)]
+    sizes = {}
+    problems = []
+    for camera, camera_pictures in by_camera.items():
+        headers = [
+            header for p in camera_pictures if not isinstance(header := header_or_fault[p], str)
+        ]
         usual = Counter(header.size for header in headers).most_common(1)
-        size = own[0].size or (usual[0][0] if usual else None)
+        size = camera_pictures[0].size or (usual[0][0] if usual else None)
         faults = []
-        for picture in own:
-            fault = _fault(picture, seen[picture], picture.size or size)
+        for picture in camera_pictures:
+            fault = _fault(picture, header_or_fault[picture], picture.size or size)
             if fault:
                 faults.append(f"camera {camera}, frame {picture.frame}: {fault}")
             else:
                 paths[picture.frame][camera] = str(picture.path)
-        there = any(seen[picture] not in (MISSING, _NO_FILE) for picture in own)
-        if size is None or (len(faults) == len(own) and every_camera and there):
+        has_files = any(
+            header_or_fault[picture] not in (MISSING, _NO_FILE) for picture in camera_pictures
+        )
+        if size is None or (len(faults) == len(camera_pictures) and every_camera and has_files):
             raise AdapterError(
-                f"none of the {len(own)} images of camera {camera} can be used: "
+                f"none of the {len(camera_pictures)} images of camera {camera} can be used: "
                 f"{'; '.join(faults[:_MAX_FAULTS])}. Images and calibration must be of one drive, "
                 f"and not resized; unpack them again"
             )
         if len(faults) > _MAX_FAULTS:
-            faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(own)}"]
+            faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(camera_pictures)}"]
         sizes[camera] = size
         problems += faults
     used = [
-        (p, h) for p, h in seen.items() if p.camera in paths[p.frame] and not isinstance(h, str)
+        (p, h)
+        for p, h in header_or_fault.items()
+        if p.camera in paths[p.frame] and not isinstance(h, str)
     ]
     return DriveImages(paths, sizes, (*problems, *image_notes(used)))
 
@@ -230,17 +238,20 @@ def _header_or_fault(picture: Picture, *, decode: bool) -> ImageHeader | str:
     return _NO_FILE if picture.path is None else check_image(picture.path, decode=decode)
 
 
-def _fault(picture: Picture, seen: ImageHeader | str, expected: tuple[int, int] | None) -> str:
+def _fault(
+    picture: Picture, header_or_fault: ImageHeader | str, expected: tuple[int, int] | None
+) -> str:
     if picture.path is None:
         return "its image is missing"
-    if isinstance(seen, str):
-        return f"image {picture.path} {seen}; left out"
-    if expected is None or seen.size == expected:
+    if isinstance(header_or_fault, str):
+        return f"image {picture.path} {header_or_fault}; left out"
+    if expected is None or header_or_fault.size == expected:
         return ""
     size = "{0[0]}x{0[1]}".format
     return (
-        f"image {picture.path} is {size(seen.size)} pixels, its camera {size(expected)}; left out"
-        f"{exif_hint(seen, expected)}"
+        f"image {picture.path} is {size(header_or_fault.size)} pixels, its camera "
+        f"{size(expected)}; left out"
+        f"{exif_hint(header_or_fault, expected)}"
     )
 
 
@@ -293,15 +304,15 @@ class Sweep:
 
 
 def is_in_box(points: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Which points [N, 3] lie strictly inside an axis-aligned box, such as the recording car."""
+    """Mask of the points [N, 3] strictly inside an axis-aligned box, such as the recording car."""
     return ((points > low_m) & (points < high_m)).all(axis=1)
 
 
 def is_usable(
     sweep: Sweep, points_m: np.ndarray, world_from_ego: np.ndarray, ego_m: np.ndarray
 ) -> np.ndarray:
-    """Which returns are finite, of a surface, and not in the recording car's box ego_m [2, 3] in
-    its own axes, bool [N]. points_m: the sweep's in float64."""
+    """Mask of the returns that are finite, of a surface, and not in the recording car's box ego_m
+    [2, 3] in its own axes, bool [N]. points_m: the sweep's in float64."""
     with np.errstate(all="ignore"):
         ego = (points_m - world_from_ego[:3, 3]) @ world_from_ego[:3, :3]
     keep = ~is_in_box(ego, *ego_m) & (sweep.semantic != NO_SURFACE)
@@ -313,10 +324,10 @@ def world_classes(numbers: np.ndarray, meaning: Mapping[int, int]) -> np.ndarray
     numbers without a meaning."""
     if not meaning:
         return np.full(len(numbers), SemanticClass.UNKNOWN, np.int16)
-    known = np.array(sorted(meaning), np.int64)
-    classes = np.array([meaning[int(number)] for number in known], np.int16)
-    at = np.clip(np.searchsorted(known, numbers), 0, len(known) - 1)
-    return np.where(known[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
+    class_numbers = np.array(sorted(meaning), np.int64)
+    classes = np.array([meaning[int(number)] for number in class_numbers], np.int16)
+    at = np.clip(np.searchsorted(class_numbers, numbers), 0, len(class_numbers) - 1)
+    return np.where(class_numbers[at] == numbers, classes[at], np.int16(SemanticClass.UNKNOWN))
 
 
 def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str) -> int:
@@ -327,8 +338,8 @@ def class_of_air(meaning: Mapping[int, int], names: Mapping[int, str], name: str
     number = next((number for number, word in names.items() if word == name), None)
     if number is not None:
         return number
-    for wanted in (NO_SURFACE, SemanticClass.UNKNOWN):
-        if numbers := [number for number, what in meaning.items() if what == wanted]:
+    for semantic in (NO_SURFACE, SemanticClass.UNKNOWN):
+        if numbers := [number for number, what in meaning.items() if what == semantic]:
             return min(numbers)
     return next(number for number in itertools.count() if number not in meaning)
 
@@ -414,10 +425,13 @@ class TimedBoxes:
                 yield None, False
                 continue
             pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = rotations[i], boxes.centers_m[i] - world_origin_m
+            pose[:3, :3] = rotations[i]
+            pose[:3, 3] = boxes.centers_m[i] - world_origin_m
             sibling = None if siblings is None else siblings[i]
             sibling = sibling if isinstance(sibling, str) and sibling not in ("", "-") else None
-            name, label, size_m = boxes.track_ids[i], boxes.labels[i], boxes.sizes_m[i]
+            name = boxes.track_ids[i]
+            label = boxes.labels[i]
+            size_m = boxes.sizes_m[i]
             sample = BoxSample(name, sibling, label, self.frame, int(times[i]), pose, size_m, row=i)
             yield sample, bool(moves[i])
 
@@ -458,17 +472,19 @@ def find_objects(
     several: an object may have several boxes in a frame; else the first one counts."""
     samples: list[BoxSample] = []
     labelled: set[str] = set()
-    bad, twice, nameless = [], [], []
+    bad = []
+    twice = []
+    nameless = []
     for timed in frames:
         nameless += [timed.frame for label in timed.boxes.labels if not label]
-        seen: set[str] = set()
+        frame_object_ids: set[str] = set()
         for sample, moves in timed.samples(world_origin_m):
             if sample is None:
                 bad.append(timed.frame)
-            elif sample.object_id in seen and not several:
+            elif sample.object_id in frame_object_ids and not several:
                 twice.append((sample.object_id, timed.frame))
             else:
-                seen.add(sample.object_id)
+                frame_object_ids.add(sample.object_id)
                 samples.append(sample)
                 labelled |= {sample.object_id} if moves else set()
     moving = labelled | objects_that_travel((s.object_id, s.world_from_box[:3, 3]) for s in samples)
@@ -512,13 +528,13 @@ def objects_that_travel(places: Iterable[tuple[str, np.ndarray]]) -> set[str]:
 
 
 def colour_every(images: int) -> int:
-    """Of the frames of a drive with so many images, every such one gives colours."""
+    """Step between the frames that give colours, in a drive with so many images."""
     return max(1, -(-images // _MAX_COLOUR_IMAGES))
 
 
 @dataclass(frozen=True, eq=False)
 class RawDrive:
-    """What a dataset has of one drive, in the scene's world: the dataset's less world_origin_m.
+    """One drive of a dataset, in the scene's world: the dataset's less world_origin_m.
 
     frames: those asked for, in order of time, with cameras and the images that can be used.
     held_out: numbers of those that the scene is built without. sweeps: usable returns, one sweep a
@@ -578,7 +594,8 @@ class IncompleteDrive(AdapterError):
 
     def __init__(self, message: str, drive: RawDrive, ground: Ground | None) -> None:
         super().__init__(message)
-        self.drive, self.ground = drive, ground
+        self.drive = drive
+        self.ground = ground
 
 
 def scene_of_drive(
@@ -621,7 +638,8 @@ def scene_of_drive(
 def _checked(drive: RawDrive) -> RawDrive:
     """The drive without returns that lie beyond any LiDAR's reach, and with a sentence for what
     seems to be in another frame."""
-    low, high = drive.path.min(axis=0), drive.path.max(axis=0)
+    low = drive.path.min(axis=0)
+    high = drive.path.max(axis=0)
     is_near = [
         ((sweep.points > low - _MAX_RANGE_M) & (sweep.points < high + _MAX_RANGE_M)).all(axis=1)
         for sweep in drive.sweeps

@@ -43,15 +43,15 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
             anything but tables and arrays, or holds no table."""
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
-        found = Pickle(stream, _TABLE_NAMES).value()
-        if isinstance(found, _Frame):
-            return found.frame()
+        content = Pickle(stream, _TABLE_NAMES).value()
+        if isinstance(content, _Frame):
+            return content.frame()
     except PickleError as error:
         raise AdapterError(
             f"{path} was not read: {error}. Only pickled pandas tables of numbers and object "
             f"columns of strings are accepted: obtain the file from the dataset's publisher again"
         ) from None
-    kind = "ndarray" if isinstance(found, ArrayRecord) else type(found).__name__.lstrip("_")
+    kind = "ndarray" if isinstance(content, ArrayRecord) else type(content).__name__.lstrip("_")
     raise AdapterError(f"{path} must hold a pandas table; it holds a {kind}")
 
 
@@ -68,10 +68,10 @@ def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.n
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
         check_holds_object(stream)
-        found = _unwrapped(Pickle(stream, ARRAY_NAMES).value())
+        content = _unwrapped(Pickle(stream, ARRAY_NAMES).value())
         arrays = {
             name: value.take()
-            for name, value in found.items()
+            for name, value in content.items()
             if type(name) is str and isinstance(value, ArrayRecord)
         }
     except PickleError as error:
@@ -79,7 +79,7 @@ def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.n
             f"{path} was not read: {error}. Only a .npy file of one dictionary of arrays is "
             f"accepted"
         ) from None
-    if len(arrays) != len(found) or any(array.dtype.hasobject for array in arrays.values()):
+    if len(arrays) != len(content) or any(array.dtype.hasobject for array in arrays.values()):
         raise AdapterError(f"{path} must hold a dictionary of arrays; it holds something else")
     return arrays
 
@@ -116,16 +116,16 @@ def stream_arrays(file: BufferedIOBase) -> Iterator[tuple[int, np.ndarray]]:
                 raise PickleError("it holds an array of objects where numbers are expected")
             count += 1
             yield number, array
-    found = _unwrapped(pickle.stack[-1])
-    if len(found) != count or not all(isinstance(v, ArrayRecord) for v in found.values()):
+    content = _unwrapped(pickle.stack[-1])
+    if len(content) != count or not all(isinstance(v, ArrayRecord) for v in content.values()):
         raise PickleError("it holds one array twice, or something that is no array")
 
 
-def _unwrapped(found: Any) -> dict[Any, Any]:
-    found = found.wrapped if isinstance(found, ArrayRecord) else found
-    if type(found) is not dict:
+def _unwrapped(content: Any) -> dict[Any, Any]:
+    content = content.wrapped if isinstance(content, ArrayRecord) else content
+    if type(content) is not dict:
         raise PickleError("it holds no dictionary")
-    return found
+    return content
 
 
 # ---- Tables of pandas ----------------------------------------------------------------------------
@@ -169,15 +169,16 @@ class _Manager(Record):
     """The columns of a table in blocks of one type. blocks: (values [columns, rows], places)."""
 
     def __init__(self, blocks: Any = (), axes: Any = (), *_: Any) -> None:
-        self.blocks, self.axes = blocks, axes
+        self.blocks = blocks
+        self.axes = axes
         if blocks:
             self.blocks = [(block.values, block.places) for block in blocks]
 
     def build(self, state: Any) -> None:
         """As pandas before 1.3 has it: the last of the state is what counts."""
-        held = state[-1]["0.14.1"]
-        self.axes = held["axes"]
-        self.blocks = [(block["values"], block["mgr_locs"]) for block in held["blocks"]]
+        content = state[-1]["0.14.1"]
+        self.axes = content["axes"]
+        self.blocks = [(block["values"], block["mgr_locs"]) for block in content["blocks"]]
 
 
 @dataclass(frozen=True)
@@ -279,8 +280,8 @@ def _table_names() -> dict[tuple[str, str], Callable[..., Any]]:
         "UInt64Index": ("pandas.core.indexes.numeric", _IndexClass),
         "Float64Index": ("pandas.core.indexes.numeric", _IndexClass),
     }
-    for name, (home, made) in homes.items():
-        table["pandas", name] = table[home, name] = made
+    for name, (home, record_class) in homes.items():
+        table["pandas", name] = table[home, name] = record_class
     for module in ("pandas.core.internals.managers", "pandas.core.internals"):
         table[module, "BlockManager"] = _Manager
     return table
@@ -296,7 +297,8 @@ def _read_bounded(path: Path, max_bytes: int) -> bytes:
             zipped = raw.read(2) == _GZIP_MAGIC
             raw.seek(0)
             stream = gzip.GzipFile(fileobj=raw) if zipped else raw
-            chunks, size = [], 0
+            chunks = []
+            size = 0
             while chunk := stream.read(_CHUNK):
                 size += len(chunk)
                 if size > max_bytes:

@@ -89,19 +89,21 @@ def cached_scene(
     folder = _cache_folder()
     if key is None or folder is None:
         return build()
-    found = _read(folder, key)
-    if found is None or not _has_images(found, folder):
+    stored_scene = _read(folder, key)
+    if stored_scene is None or not _has_images(stored_scene, folder):
         with _alone(folder, key) as can_write:
-            found = _read(folder, key) if can_write else None  # by another process meanwhile
-            if found is None or not _has_images(found, folder):
+            stored_scene = _read(folder, key) if can_write else None  # by another process meanwhile
+            if stored_scene is None or not _has_images(stored_scene, folder):
                 scene = build()
                 if can_write:
                     _store(scene, folder, key, limit_bytes)
                 return scene
     return replace(
-        found,
+        stored_scene,
         source=format_uri(scheme, path, query),
-        frames=tuple(with_images_in(path, frame, os.path.abspath(path)) for frame in found.frames),
+        frames=tuple(
+            with_images_in(path, frame, os.path.abspath(path)) for frame in stored_scene.frames
+        ),
         labels=open_labels(),
         recorded_source=None,
     )
@@ -117,12 +119,12 @@ def image_folder(name: str, sources: Sequence[Path]) -> Path:
             "XDG_CACHE_HOME"
         )
     facts = json.dumps(list(_facts_of(sources))).encode()
-    own = scenes.with_name(_IMAGES) / f"{name}-{hashlib.sha256(facts).hexdigest()[:16]}"
+    image_dir = scenes.with_name(_IMAGES) / f"{name}-{hashlib.sha256(facts).hexdigest()[:16]}"
     with contextlib.suppress(OSError):  # what cannot be written, the writer says
-        own.mkdir(mode=0o700, parents=True, exist_ok=True)
-        os.utime(own)
-        _make_room_for_images(own.parent, _limit_bytes())
-    return own
+        image_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.utime(image_dir)
+        _make_room_for_images(image_dir.parent, _limit_bytes())
+    return image_dir
 
 
 def _make_room_for_images(folder: Path, limit_bytes: float) -> None:
@@ -135,10 +137,10 @@ def _make_room_for_images(folder: Path, limit_bytes: float) -> None:
 
 
 def _has_images(scene: Scene, folder: Path) -> bool:
-    """Whether those of the scene's images are there that lie beside the cache's folder."""
-    own = str(folder.with_name(_IMAGES)) + os.sep
+    """True if all of the scene's images that belong beside the cache's folder exist."""
+    image_prefix = str(folder.with_name(_IMAGES)) + os.sep
     paths = (path for frame in scene.frames for path in frame.image_paths.values())
-    return all(has_image(Path(path)) for path in paths if path.startswith(own))
+    return all(has_image(Path(path)) for path in paths if path.startswith(image_prefix))
 
 
 def leave_out_cache() -> None:
@@ -147,10 +149,10 @@ def leave_out_cache() -> None:
 
 
 def _cache_folder() -> Path | None:
-    """Where entries are; None where the user has no home."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    """Folder of the entries; None where the user has no home."""
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
-        base = given if given.is_absolute() else Path.home() / ".cache"
+        base = cache_home if cache_home.is_absolute() else Path.home() / ".cache"
     except RuntimeError:
         return None
     return base / "climategs" / "scenes"
@@ -249,7 +251,9 @@ def _builder() -> tuple[str, ...]:
         for file in sorted(top.rglob("*.py")):
             code.update(f"{file.relative_to(top)}\0".encode() + file.read_bytes())
     installed = {
-        each.name: each.version for name in _LIBRARIES for each in distributions(name=name)
+        distribution.name: distribution.version
+        for name in _LIBRARIES
+        for distribution in distributions(name=name)
     }
     return (code.hexdigest(), *map(str, installed.items()), get_host_cpu_name())
 
@@ -336,9 +340,9 @@ def _remembered(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str
     if scenes is not None and _limit_bytes():
         memo = scenes.with_name(_DIGESTS) / f"{_sha256(names)}.json"
         with contextlib.suppress(OSError, ValueError, RecursionError):
-            known = json.loads(read_file(memo))
-            if isinstance(known, dict) and known.get("facts") == facts:
-                return str(known["digest"])
+            memo_content = json.loads(read_file(memo))
+            if isinstance(memo_content, dict) and memo_content.get("facts") == facts:
+                return str(memo_content["digest"])
     parts = [[name, _content_digest(*files[name], stats[name].st_size)] for name in stats]
     digest = _sha256([_DIGEST_FORMAT, parts])
     latest_s = max((s.st_mtime for s in stats.values()), default=0.0)

@@ -26,7 +26,7 @@ _DATA_KEY = "data"
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Where raw data lie. path: absolute, or a builtin scene's name."""
+    """Location of raw data. path: absolute, or a builtin scene's name."""
 
     scheme: str
     path: str
@@ -59,11 +59,13 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     assert scene.recorded_source is not None
     recorded = _recording(scene.recorded_source, saved.working_folder)
     if _DATA_KEY in query:
-        found = _given(query[_DATA_KEY])
+        new_recording = _given(query[_DATA_KEY])
         if recorded is not None:
-            moved = (with_images_in(found.path, frame, recorded.path) for frame in scene.frames)
+            moved = (
+                with_images_in(new_recording.path, frame, recorded.path) for frame in scene.frames
+            )
             scene = dataclasses.replace(scene, frames=tuple(moved))
-        recorded = found
+        recorded = new_recording
     try:
         if recorded is None or not recorded.is_there:
             name = scene.recorded_source if recorded is None else recorded.uri

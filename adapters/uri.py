@@ -35,7 +35,7 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 @dataclass(frozen=True)
 class Scheme:
-    """What opens a kind of scene; functions as module:name, imported when used.
+    """Openers of one kind of scene; functions as module:name, imported when used.
 
     opener: from path and query to a Scene whose `source` is `format_uri(scheme, path, query)`, with
     an AdapterError for unknown keys. builtin: names that the path may be where it is no file; the
@@ -162,22 +162,22 @@ class UriOptions(BaseModel):
 
     @classmethod
     def from_query(cls, scheme: str, query: Mapping[str, str]) -> Self:
-        known = {name: field.description or "" for name, field in cls.model_fields.items()}
-        check_query(scheme, query, known)
+        meanings = {name: field.description or "" for name, field in cls.model_fields.items()}
+        check_query(scheme, query, meanings)
         try:
             return cls.model_validate(dict(query))
         except ValidationError as error:
             key = str(error.errors()[0]["loc"][0])
-            message = f"{scheme}: {key} must be {known[key]}; got {query[key]!r}"
+            message = f"{scheme}: {key} must be {meanings[key]}; got {query[key]!r}"
             raise AdapterError(message) from None
 
 
-def check_query(scheme: str, query: Mapping[str, str], known: Mapping[str, str]) -> None:
-    """Refuse options that are not among the known ones, which are given with their meaning."""
-    if unknown := sorted(set(query) - set(known)):
-        near = nearest_word(unknown[0], tuple(known))
+def check_query(scheme: str, query: Mapping[str, str], meanings: Mapping[str, str]) -> None:
+    """Refuse options that are not among the keys of meanings, which hold each option's meaning."""
+    if unknown := sorted(set(query) - set(meanings)):
+        near = nearest_word(unknown[0], tuple(meanings))
         guess = "" if near is None else f"did you mean {near!r}? "
-        allowed = "; ".join(f"{key}: {meaning}" for key, meaning in known.items())
+        allowed = "; ".join(f"{key}: {meaning}" for key, meaning in meanings.items())
         raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; {guess}allowed are {allowed}")
 
 

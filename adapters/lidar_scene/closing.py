@@ -41,27 +41,32 @@ from augment.semantics import SemanticClass, class_of_label
 from augment.view_images import SURFACE_ALPHA
 
 _WIDTH = 480  # columns of the images that are drawn
-_CELL_PX, _MAX_CELL_PX = 2, 8  # of those, from one new disc to the next; larger ones hide the sky
-_IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # that images are decoded at
-_STEP_M = 1.2  # images are taken that far apart on the way
-_MIN_FRAMES, _FRAMES_PART = 4, 1 / 3  # and no more frames than these
-_TRANSMITTANCE = 0.02  # of a closed pixel, at most
-_BEHIND, _BEHIND_M = 0.002, 0.02  # of its depth, and metres, that a disc lies behind what leaks
-_NEIGHBOURS, _FAR_QUANTILE = 16, 0.75
+_CELL_PX = 2  # smallest spacing of new discs, pixels of those images
+_MAX_CELL_PX = 8  # spacing that is doubled no further, pixels: larger discs hide the sky
+_IMAGE_SCALES = (0.125, 0.25, 0.5, 1.0)  # scales that recorded images can be decoded at
+_STEP_M = 1.2  # distance on the path from one image that is taken to the next
+_MIN_FRAMES = 4  # smallest limit on the number of frames whose images are taken
+_FRAMES_PART = 1 / 3  # the limit as a part of all frames, where that is more
+_TRANSMITTANCE = 0.02  # largest transmittance of a closed pixel
+_BEHIND = 0.002  # gap from a surface that leaks to the disc behind it, as a part of the depth
+_BEHIND_M = 0.02  # constant part of that gap, metres
+_NEIGHBOURS = 16  # cells with a surface that are compared for one hole
+_FAR_QUANTILE = 0.75  # quantile of the neighbours' depths that the hole takes
 _CELLS_PER_LAB = 1.0  # a difference in colour (CIELAB) as a distance in the image
-_SQUARE_M = 0.5  # of the map of the ground
-_ON_GROUND_M = 0.2
-_FURTHEST_M = 300.0
-_CAR_M = 3.0  # from a camera; so near, the recording car itself is in the way of most rays
-_NEAREST_DISC_M = 0.2  # depth; nothing of the world is nearer to a camera on a car
-_STRETCH = 20.0  # of a disc on the ground that is seen at a slant
+_SQUARE_M = 0.5  # side of a square in the map of the ground
+_ON_GROUND_M = 0.2  # height below which a surface counts as ground
+_FURTHEST_M = 300.0  # largest depth of a disc
+_CAR_M = 3.0  # depth up to which the recording car itself is in the way of most rays
+_NEAREST_DISC_M = 0.2  # smallest depth of a disc: nothing is nearer to a camera on a car
+_STRETCH = 20.0  # largest length over width of a disc on the ground that is seen at a slant
 _SOLID = 0.4  # part of a box's narrower side that a ray must pass to meet what is in it
-_SKIN = 0.15  # how deep in a box, as part of the ray's way through it, paint and glass lie
-_NEAREST_M, _FURTHEST_BOX_M = 0.1, 40.0  # depths of boxes that are looked into
-_NEAR_BOX_M = 0.15  # labelled boxes are good to that
-_MIN_OWN = 8  # cells that show an object's surface
-_SMOOTH = 9  # cells
-_SILL_M = 0.25  # of a vehicle, above the ground
+_SKIN = 0.15  # depth of paint and glass in a box, as part of the ray's length through it
+_NEAREST_M = 0.1  # smallest depth at which a ray may enter a box that is filled
+_FURTHEST_BOX_M = 40.0  # largest depth of the nearest corner of a box that is filled
+_NEAR_BOX_M = 0.15  # accuracy of labelled boxes
+_MIN_OWN = 8  # cells that must show a vehicle's surface before the rest of it is filled
+_SMOOTH = 9  # side of the square that depths behind a box's side are averaged over, cells
+_SILL_M = 0.25  # height of a vehicle's sill above the ground
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
 # Discs on a grid of their own pitch let 2 % through at most, between four of them.
 _SHAPE = SplatShape(sigma_per_spacing=0.8, opacity=0.99)
@@ -84,40 +89,41 @@ def close_parts(
     where they come near it, discs are larger, and those far away are left out."""
     parts = list(parts)
     ground = _GroundMap.of(points)
-    standing = [
+    still_boxes = [
         _Box(0, box.world_from_box, np.asarray(box.size_m), class_of_label(box.label))
         for box in still
     ]
     for view in _spread_views(views):
-        posed = {0: np.eye(4)}
+        poses = {0: np.eye(4)}
         for number, track in enumerate(tracks, start=1):
             pose = track.motion.pose_at(view.camera.timestamp_ns)
             if pose is not None:
-                posed[number] = pose
-        boxes = standing + [
+                poses[number] = pose
+        boxes = still_boxes + [
             _Box(n, pose, tracks[n - 1].size_m, class_of_label(tracks[n - 1].label))
-            for n, pose in posed.items()
+            for n, pose in poses.items()
             if n
         ]
         centre = view.camera.centre.numpy()
         boxes.sort(key=lambda box: -np.linalg.norm(box.world_from_box[:3, 3] - centre))
-        drawn = _draw(parts, posed, view.camera)
-        photo = _read_photo(view, drawn.camera, boxes)
+        rendering = _draw(parts, poses, view.camera)
+        photo = _read_photo(view, rendering.camera, boxes)
         if photo is None:
             continue  # a problem of the scene already
-        side_px, most = _CELL_PX, (max_gaussians - sum(map(len, parts))) // 2
+        side_px = _CELL_PX
+        max_discs = (max_gaussians - sum(map(len, parts))) // 2
         while True:
-            cells = drawn.cells(side_px)
+            cells = rendering.cells(side_px)
             # Of a nearer box after, and so over, those of a further one.
             discs = _discs(cells, photo.resized(cells.camera), ground, boxes)
-            if len(discs.part) <= most or side_px >= _MAX_CELL_PX:
+            if len(discs.part) <= max_discs or side_px >= _MAX_CELL_PX:
                 break
             side_px *= 2
-        if len(discs.part) > most:  # what is near shows in fog and water
-            discs = discs.select(np.sort(np.argsort(discs.depth, kind="stable")[:most]))
+        if len(discs.part) > max_discs:  # what is near shows in fog and water
+            discs = discs.select(np.sort(np.argsort(discs.depth, kind="stable")[:max_discs]))
         for number in np.unique(discs.part):
-            own = discs.select(discs.part == number)
-            new = own.gaussians(cells.camera, posed[int(number)])
+            part_discs = discs.select(discs.part == number)
+            new = part_discs.gaussians(cells.camera, poses[int(number)])
             parts[number] = join_gaussians([parts[number], new])
     return parts
 
@@ -128,15 +134,20 @@ def _spread_views(views: Sequence[View]) -> list[View]:
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
     frames = list(by_frame.values())
-    chosen, last = [], None
-    for number, own in enumerate(frames):
-        centre = own[0].camera.centre.numpy()
-        if last is None or np.linalg.norm(centre - last) >= _STEP_M or number == len(frames) - 1:
-            chosen.append(own)
-            last = centre
-    count = min(len(chosen), max(_MIN_FRAMES, round(_FRAMES_PART * len(frames))))
-    places = np.linspace(0, len(chosen) - 1, count).round().astype(int)
-    return [view for place in places for view in chosen[place]]
+    spread = []
+    last_centre = None
+    for number, frame_views in enumerate(frames):
+        centre = frame_views[0].camera.centre.numpy()
+        if (
+            last_centre is None
+            or np.linalg.norm(centre - last_centre) >= _STEP_M
+            or number == len(frames) - 1
+        ):
+            spread.append(frame_views)
+            last_centre = centre
+    count = min(len(spread), max(_MIN_FRAMES, round(_FRAMES_PART * len(frames))))
+    places = np.linspace(0, len(spread) - 1, count).round().astype(int)
+    return [view for place in places for view in spread[place]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,14 +169,17 @@ class _GroundMap:
         corner = xyz[:, :2].min(axis=0)
         i, j = np.floor((xyz[:, :2] - corner) / _SQUARE_M).astype(np.int64).T
         shape = (i.max() + 1, j.max() + 1)
-        heights, semantic = np.zeros(shape), np.zeros(shape, np.int16)
+        heights = np.zeros(shape)
+        semantic = np.zeros(shape, np.int16)
         count = np.zeros(shape)
         np.add.at(heights, (i, j), xyz[:, 2])
         np.add.at(count, (i, j), 1)
         semantic[i, j] = points.semantic[flat]
         heights /= np.maximum(count, 1)
-        seen = count > 0
-        return _GroundMap(corner, _from_nearest(heights, seen), _from_nearest(semantic, seen))
+        has_ground = count > 0
+        return _GroundMap(
+            corner, _from_nearest(heights, has_ground), _from_nearest(semantic, has_ground)
+        )
 
     def square(self, xy: np.ndarray) -> tuple[np.ndarray, ...]:
         """Indices of the squares nearest to places [..., 2]."""
@@ -174,13 +188,13 @@ class _GroundMap:
         return index[..., 0], index[..., 1]
 
 
-def _from_nearest(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _from_nearest(image: np.ndarray, is_known: np.ndarray) -> np.ndarray:
     """The image [H, W] with each unknown pixel's value from the known one nearest to it."""
     _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        (~is_known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     values = np.zeros(labels.max() + 1, image.dtype)
-    values[labels[known]] = image[known]
+    values[labels[is_known]] = image[is_known]
     return values[labels]
 
 
@@ -199,9 +213,9 @@ def _meet_ground(
     for _ in range(5):
         square = ground.square(centre[:2] + times[..., None] * rays[..., :2])
         times = np.clip((centre[2] - ground.heights[square]) / down, 0.1, _FURTHEST_M)
-    under = ground.square(centre[:2] + times[..., None] * rays[..., :2])
-    over = centre[2] - times * down - ground.heights[under]
-    is_in_air = (times < _CAR_M) & (over > _ON_GROUND_M)
+    square_under = ground.square(centre[:2] + times[..., None] * rays[..., :2])
+    height_m = centre[2] - times * down - ground.heights[square_under]
+    is_in_air = (times < _CAR_M) & (height_m > _ON_GROUND_M)
     return np.where(is_in_air, np.inf, times), ground.semantic[square]
 
 
@@ -220,7 +234,7 @@ class _Cells(NamedTuple):
     semantic: np.ndarray
 
 
-class _Drawn(NamedTuple):
+class _RenderedView(NamedTuple):
     """A view drawn: alpha, depth [H, W], float32; part, semantic: of the splat that counts most,
     int [H, W], at pixels with a surface."""
 
@@ -232,12 +246,17 @@ class _Drawn(NamedTuple):
 
     def cells(self, side_px: int) -> _Cells:
         camera = self.camera
-        rows, columns = -(-camera.height // side_px), -(-camera.width // side_px)
+        rows = -(-camera.height // side_px)
+        columns = -(-camera.width // side_px)
         small = dataclasses.replace(
-            camera, width=columns, height=rows,
-            fx=camera.fx / side_px, fy=camera.fy / side_px,
-            cx=camera.cx / side_px, cy=camera.cy / side_px,
-        )  # fmt: skip
+            camera,
+            width=columns,
+            height=rows,
+            fx=camera.fx / side_px,
+            fy=camera.fy / side_px,
+            cx=camera.cx / side_px,
+            cy=camera.cy / side_px,
+        )
 
         def blocks(image: np.ndarray) -> np.ndarray:
             """[h, w, side_px^2]; those at the border repeat its pixels."""
@@ -262,30 +281,34 @@ class _Drawn(NamedTuple):
         )
 
 
-def _draw(parts: Sequence[Gaussians], posed: dict[int, np.ndarray], camera: Camera) -> _Drawn:
+def _draw(
+    parts: Sequence[Gaussians], poses: dict[int, np.ndarray], camera: Camera
+) -> _RenderedView:
     camera = camera.scaled(min(1.0, _WIDTH / camera.width))
-    drawn = [
+    posed_gaussians = [
         PosedGaussians(parts[n], torch.from_numpy(pose) if n else None, instance_id=n)
-        for n, pose in posed.items()
+        for n, pose in poses.items()
     ]
-    raster = rasterize(drawn, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+    raster = rasterize(posed_gaussians, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
     assert raster.alpha is not None and raster.median_depth is not None
     assert raster.splat_ids is not None
     ids = raster.splat_ids.numpy().clip(0)
     # One more than there are: of an image in which nothing stands.
-    part = np.append(np.repeat(list(posed), [len(parts[n]) for n in posed]), 0)
-    classes = [parts[n].semantic.numpy() for n in posed if len(parts[n])]
+    part = np.append(np.repeat(list(poses), [len(parts[n]) for n in poses]), 0)
+    classes = [parts[n].semantic.numpy() for n in poses if len(parts[n])]
     semantic = np.concatenate([*classes, np.zeros(1, np.int16)])
-    return _Drawn(
+    return _RenderedView(
         camera, raster.alpha.numpy(), raster.median_depth.numpy(), part[ids], semantic[ids]
     )
 
 
 class _Photo(NamedTuple):
-    """One image at the cells, RGB uint8 [h, w, 3], what it shows of the recording car filled from
-    around it. still: without the moving objects too, filled alike."""
+    """One recorded image at the size of the cells.
 
-    whole: np.ndarray
+    image: RGB uint8 [h, w, 3]; the recording car's pixels are filled from around it. still: the
+    same, with the moving objects' pixels filled too."""
+
+    image: np.ndarray
     still: np.ndarray
 
     def resized(self, camera: Camera) -> _Photo:
@@ -295,8 +318,8 @@ class _Photo(NamedTuple):
 
 def _read_photo(view: View, camera: Camera, boxes: Sequence[_Box]) -> _Photo | None:
     """The photo at about half the camera's size; None if it cannot be decoded."""
-    wanted = camera.width / view.camera.width
-    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= wanted))
+    scale = camera.width / view.camera.width
+    image = read_image(view.path, next(s for s in _IMAGE_SCALES if s >= scale))
     if image is None:
         return None
     small = camera.scaled(1 / _CELL_PX)
@@ -360,36 +383,47 @@ def _discs(
     rays = cells.camera.ray_directions(torch.float64).numpy()
     ground_depth, ground_class = _meet_ground(ground, centre, rays)
     # Heights over the ground further along the ray: over a road, the same.
-    over = (ground_depth - cells.depth) * -rays[..., 2]
-    flat = (over < _ON_GROUND_M) & (cells.part == 0)
+    height_m = (ground_depth - cells.depth) * -rays[..., 2]
+    flat = (height_m < _ON_GROUND_M) & (cells.part == 0)
     holes = cells.is_open & ~cells.has_surface
     flat |= is_flat(cells.semantic) & (cells.part == 0)
-    there, semantic, on_ground = cells.depth * (1 + _BEHIND) + _BEHIND_M, cells.semantic, flat
+    disc_depth = cells.depth * (1 + _BEHIND) + _BEHIND_M
+    semantic = cells.semantic
+    on_ground = flat
     # What a ray meets behind ground that leaks is ground.
-    there = np.where(flat & np.isfinite(ground_depth), np.maximum(there, ground_depth), there)
+    disc_depth = np.where(
+        flat & np.isfinite(ground_depth), np.maximum(disc_depth, ground_depth), disc_depth
+    )
     if holes.any():
-        near = _nearest_surfaces(cells, photo.whole, holes)
-        around = cells.depth.ravel()[near]
+        surface_cell = _nearest_surfaces(cells, photo.image, holes)
+        surface_depth = cells.depth.ravel()[surface_cell]
         # What is around may be an object whose box ends there: the ground goes on beside it.
-        down = flat.ravel()[near] | (cells.part.ravel()[near] > 0)
-        down |= around >= ground_depth[holes]
-        down &= np.isfinite(ground_depth[holes])
-        there[holes] = np.where(down, ground_depth[holes], around)
-        semantic[holes] = np.where(down, ground_class[holes], semantic.ravel()[near])
-        on_ground[holes] = down
+        meets_ground = flat.ravel()[surface_cell] | (cells.part.ravel()[surface_cell] > 0)
+        meets_ground |= surface_depth >= ground_depth[holes]
+        meets_ground &= np.isfinite(ground_depth[holes])
+        disc_depth[holes] = np.where(meets_ground, ground_depth[holes], surface_depth)
+        semantic[holes] = np.where(
+            meets_ground, ground_class[holes], semantic.ravel()[surface_cell]
+        )
+        on_ground[holes] = meets_ground
     part = np.where(holes, 0, cells.part)
     close = cells.is_open.copy()
     for box in boxes:
-        window, inside, depth = _fill_box(box, cells, centre, rays, ground_depth, over, there)
-        part[window][inside], there[window][inside] = box.part, depth[inside]
-        semantic[window][inside], on_ground[window][inside] = box.semantic, False
+        window, inside, depth = _fill_box(
+            box, cells, centre, rays, ground_depth, height_m, disc_depth
+        )
+        part[window][inside] = box.part
+        disc_depth[window][inside] = depth[inside]
+        semantic[window][inside] = box.semantic
+        on_ground[window][inside] = False
         close[window] |= inside
         if box.part:  # beside a silhouette, what is behind may count as the object's
-            close &= (part != box.part) | box.holds(centre + there[..., None] * rays)
-    close &= there >= _NEAREST_DISC_M  # nearer: no distance is known, and a disc would hide all
-    depth = np.minimum(there[close], _FURTHEST_M)
+            close &= (part != box.part) | box.holds(centre + disc_depth[..., None] * rays)
+    # Nearer, no distance is known, and a disc would hide all.
+    close &= disc_depth >= _NEAREST_DISC_M
+    depth = np.minimum(disc_depth[close], _FURTHEST_M)
     points = centre + depth[:, None] * rays[close]
-    colours = np.where(part[close][:, None] > 0, photo.whole[close], photo.still[close]) / 255
+    colours = np.where(part[close][:, None] > 0, photo.image[close], photo.still[close]) / 255
     return _Discs(
         part[close],
         points,
@@ -402,20 +436,22 @@ def _discs(
 
 
 def _nearest_surfaces(cells: _Cells, image: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Of the cells with a surface that are nearest to each hole in place and colour, that at the
-    far side of their depths, as flat indices: a near object is the less likely to go on."""
-    known = np.flatnonzero(cells.has_surface & (cells.depth < _FURTHEST_M))
-    if not len(known):
+    """Flat index of the cell whose depth each hole takes, int64 [holes].
+
+    The cells with a surface that are nearest to the hole in place and colour are compared; the one
+    at _FAR_QUANTILE of their depths is taken: a near object is the less likely to go on."""
+    surface_cells = np.flatnonzero(cells.has_surface & (cells.depth < _FURTHEST_M))
+    if not len(surface_cells):
         return np.flatnonzero(holes)  # themselves, at no depth
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     rows, columns = np.mgrid[: holes.shape[0], : holes.shape[1]]
     places = np.dstack([rows, columns, lab * np.float32(_CELLS_PER_LAB)])
-    tree = cKDTree(places.reshape(-1, 5)[known])
-    k = min(_NEIGHBOURS, len(known))
+    tree = cKDTree(places.reshape(-1, 5)[surface_cells])
+    k = min(_NEIGHBOURS, len(surface_cells))
     index = tree.query(places[holes], k=[*range(1, k + 1)], workers=-1)[1]
-    order = np.argsort(cells.depth.ravel()[known][index], axis=1, kind="stable")
-    chosen = order[:, min(int(_FAR_QUANTILE * k), k - 1)]
-    return known[np.take_along_axis(index, chosen[:, None], 1)[:, 0]]
+    order = np.argsort(cells.depth.ravel()[surface_cells][index], axis=1, kind="stable")
+    far_neighbour = order[:, min(int(_FAR_QUANTILE * k), k - 1)]
+    return surface_cells[np.take_along_axis(index, far_neighbour[:, None], 1)[:, 0]]
 
 
 class _Box(NamedTuple):
@@ -428,7 +464,7 @@ class _Box(NamedTuple):
     semantic: SemanticClass
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Whether points [..., 3] lie in it or within a skin's breadth, bool [...]."""
+        """Mask of the points [..., 3] that lie in the box grown by SKIN_M, bool [...]."""
         local = (points - self.world_from_box[:3, 3]) @ self.world_from_box[:3, :3]
         return (np.abs(local) <= self.size_m / 2 + SKIN_M).all(axis=-1)
 
@@ -441,7 +477,8 @@ class _Box(NamedTuple):
             return None
         if z.min() < _NEAREST_M:
             return slice(0, camera.height), slice(0, camera.width)
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        u = camera.fx * x / z + camera.cx
+        v = camera.fy * y / z + camera.cy
         left, right = np.clip([u.min(), u.max() + 1], 0, camera.width).astype(int)
         top, bottom = np.clip([v.min(), v.max() + 1], 0, camera.height).astype(int)
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
@@ -453,8 +490,8 @@ def _fill_box(
     centre: np.ndarray,
     rays: np.ndarray,
     ground_depth: np.ndarray,
-    over: np.ndarray,
-    there: np.ndarray,
+    height_m: np.ndarray,
+    disc_depth: np.ndarray,
 ) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
     """Cells that show what is in the box and have no surface of it: their window in the image,
     which of it they are, and their depths.
@@ -475,27 +512,32 @@ def _fill_box(
     lengths = np.linalg.norm(rays[window], axis=-1)
     solid = (leave - enter) * lengths > _SOLID * min(box.size_m[:2])
     solid &= enter > _NEAREST_M
-    depth, has_surface = cells.depth[window], cells.has_surface[window]
+    depth = cells.depth[window]
+    has_surface = cells.has_surface[window]
     holes = cells.is_open[window] & ~has_surface
-    own = has_surface & (depth > enter - _NEAR_BOX_M) & (depth < leave + _NEAR_BOX_M)
-    own &= over[window] > _ON_GROUND_M
-    of_it = np.isin(cells.semantic[window], (box.semantic, SemanticClass.UNKNOWN))
-    own &= (cells.part[window] == box.part) & of_it
-    guess = there[window]
+    is_box_surface = has_surface & (depth > enter - _NEAR_BOX_M) & (depth < leave + _NEAR_BOX_M)
+    is_box_surface &= height_m[window] > _ON_GROUND_M
+    has_class = np.isin(cells.semantic[window], (box.semantic, SemanticClass.UNKNOWN))
+    is_box_surface &= (cells.part[window] == box.part) & has_class
+    guess = disc_depth[window]
     within = (guess >= enter) & (guess <= leave)
     guess = np.where(within, guess, enter + _SKIN * (leave - enter))
     inside = solid & holes
-    if box.semantic == SemanticClass.VEHICLE and own.sum() >= _MIN_OWN:
-        columns = np.flatnonzero(own.any(axis=0))
-        top = np.interp(np.arange(own.shape[1]), columns, own.argmax(axis=0)[columns])
-        body = solid & (np.arange(own.shape[0])[:, None] > top)
+    if box.semantic == SemanticClass.VEHICLE and is_box_surface.sum() >= _MIN_OWN:
+        columns = np.flatnonzero(is_box_surface.any(axis=0))
+        top = np.interp(
+            np.arange(is_box_surface.shape[1]), columns, is_box_surface.argmax(axis=0)[columns]
+        )
+        body = solid & (np.arange(is_box_surface.shape[0])[:, None] > top)
         body[:, : columns[0]] = body[:, columns[-1] + 1 :] = False
         body &= (ground_depth[window] - enter) * -rays[window][..., 2] > _SILL_M
         occluded = has_surface & (depth < enter - _NEAR_BOX_M)
-        body &= ~own & ~occluded
+        body &= ~is_box_surface & ~occluded
         # How far the surface lies behind the box's side: doors are as flat as that.
-        recess = np.clip(depth - enter, 0, max(float(np.median((depth - enter)[own])), 0))
-        recess = _from_nearest(recess, own).astype(np.float32)
+        recess = np.clip(
+            depth - enter, 0, max(float(np.median((depth - enter)[is_box_surface])), 0)
+        )
+        recess = _from_nearest(recess, is_box_surface).astype(np.float32)
         smooth = cv2.blur(cv2.medianBlur(recess, 5), (_SMOOTH, _SMOOTH))
         guess = np.where(body, np.minimum(enter + smooth, leave), guess)
         inside = body

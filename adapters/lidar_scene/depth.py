@@ -12,8 +12,9 @@ from augment.errors import AdapterError
 from augment.labels import EGO_VEHICLE, ClassifiesLidar, LidarSweep
 from augment.scene import Scene
 
-_NEAR_M = 0.1
-_SAME_DRIVE_NS = 10_000_000_000  # times further from the frame's count from some other start
+_NEAR_M = 0.1  # smallest depth of a return that a camera sees
+# Difference from the frame's time beyond which a sweep's times count from some other start.
+_SAME_DRIVE_NS = 10_000_000_000
 
 
 def sweep_times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
@@ -60,8 +61,8 @@ def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class DepthPixels:
-    """What is known of the depth at M pixels of one image. pixels: int32 [M], flat indices (row W +
-    column), increasing. depth_m: float32 [M], along the optical axis. weight: float32 [M], how much
+    """Measured depth at M pixels of one image. pixels: int32 [M], flat indices (row W + column),
+    increasing. depth_m: float32 [M], along the optical axis. weight: float32 [M], how much
     it is trusted."""
 
     pixels: np.ndarray
@@ -73,7 +74,7 @@ class DepthPixels:
 
     @staticmethod
     def of(pixels: np.ndarray, depth_m: np.ndarray, weight: float = 1.0) -> DepthPixels:
-        """Of pixels in any order, some of them several times: the nearest depth of each remains."""
+        """Depths of pixels in any order; of a pixel that comes several times, the nearest."""
         return DepthPixels._at(_nearest_of_each(pixels, depth_m), pixels, depth_m, weight)
 
     @staticmethod
@@ -114,15 +115,14 @@ def project_points(
     local = points @ transform[:3, :3].T + transform[:3, 3]
     index = np.flatnonzero(local[:, 2] > near_m)
     x, y, z = local[index].T
-    u, v = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+    u = np.floor(camera.fx * x / z + camera.cx)
+    v = np.floor(camera.fy * y / z + camera.cy)
     inside = (u >= margin_px) & (u < camera.width - margin_px)
     inside &= (v >= margin_px) & (v < camera.height - margin_px)
-    u, v, z, index = (
-        u[inside].astype(np.int64),
-        v[inside].astype(np.int64),
-        z[inside],
-        index[inside],
-    )
+    u = u[inside].astype(np.int64)
+    v = v[inside].astype(np.int64)
+    z = z[inside]
+    index = index[inside]
     pixels = v * camera.width + u
     nearest = _nearest_of_each(pixels, z)
     return DepthPixels._at(nearest, pixels, z, 1.0), index[nearest]
@@ -146,12 +146,12 @@ class FrameReturns:
         box counts as ground."""
         points = self.points.copy()
         present = np.ones(len(points), dtype=bool)
-        for motion, own, local in self.carried:
+        for motion, index, local in self.carried:
             pose = motion.pose_at(camera.timestamp_ns)
             if pose is None:
-                present[own] = False
+                present[index] = False
             else:
-                points[own] = local @ pose[:3, :3].T + pose[:3, 3]
+                points[index] = local @ pose[:3, :3].T + pose[:3, 3]
         return project_points(points[present], camera, near_m=_NEAR_M)[0]
 
 
@@ -175,15 +175,17 @@ def read_returns(
     if of_surfaces and isinstance(scene.labels, ClassifiesLidar):
         classes = scene.labels.lidar_classes(sweep)
         keep &= True if classes is None else classes >= 0
-    points, times = points[keep], times[keep]
+    points = points[keep]
+    times = times[keep]
     carried = []
     for actor in scene.actors:
         if actor.label == EGO_VEHICLE:
             continue
-        motion, size_m = Motion.of(actor.track), np.array(actor.size_m)
+        motion = Motion.of(actor.track)
+        size_m = np.array(actor.size_m)
         near = motion.near(points, times, size_m)
         local = motion.into_actor(points[near], times[near])
-        own = inside_box(local, size_m, SKIN_M) & (local[:, 2] > FLOOR_M - size_m[2] / 2)
-        if own.any():
-            carried.append((motion, near[own], local[own]))
+        is_actor = inside_box(local, size_m, SKIN_M) & (local[:, 2] > FLOOR_M - size_m[2] / 2)
+        if is_actor.any():
+            carried.append((motion, near[is_actor], local[is_actor]))
     return FrameReturns(points, times, tuple(carried))

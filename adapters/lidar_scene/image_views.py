@@ -23,10 +23,10 @@ from augment.jobs.processes import available_cores
 
 DEPTH_WIDTH = 480  # columns of the z-buffers
 DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap
-_LEVELS = 5
+_LEVELS = 5  # sizes of an image in its pyramid
 _KEEP_SCORE = 0.5  # part of a camera's best score from which its observations count
-_CAMERA_POWER = 2.0  # of that best score, as the camera's weight
-_COVER_MARGIN_M = 0.15
+_CAMERA_POWER = 2.0  # power of that best score that is the camera's weight
+_COVER_MARGIN_M = 0.15  # growth of a moving object's box to all sides, where it covers the world
 _AHEAD = 2  # images that are decoded before their turn
 _REDUCED = {
     1.0: cv2.IMREAD_COLOR,
@@ -50,12 +50,12 @@ class View:
 
     def shows_car(self, width: int, height: int) -> np.ndarray:
         """The pixels of the recording car in the image at another size, bool [height, width]."""
-        shown = np.zeros((height, width), np.bool_)
+        car_mask = np.zeros((height, width), np.bool_)
         if self.own_car is not None:
             mask = self.own_car.astype(np.uint8)
-            shown = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        shown[int(self.used_rows * height) :] = True
-        return shown
+            car_mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        car_mask[int(self.used_rows * height) :] = True
+        return car_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def observe_views(
                 _observe_one(bodies, stores, view, number, image, sky, pool)
     # A camera's observations by their median, cameras averaged.
     blended = (kernels.blended_colours(*store, _KEEP_SCORE, _CAMERA_POWER) for store in stores)
-    return tuple(Seen(*found) for found in blended), tuple(problems)
+    return tuple(Seen(*columns) for columns in blended), tuple(problems)
 
 
 def read_ahead(
@@ -137,14 +137,15 @@ def read_image(path: Path, image_scale: float) -> np.ndarray | None:
 
 class _Part(NamedTuple):
     """Some surfels of a body, where it stood in one image. extent: float32 [N, 2], half axes.
-    pose: of the body in the camera's frame. moves: it is no part of the world."""
+    pose: of the body in the camera's frame. moves: it is no part of the world. rows: those of the
+    body's surfels that the part holds."""
 
     surfels: Surfels
     store: _Observations
     extent: np.ndarray
     pose: tuple[np.ndarray, np.ndarray]
     moves: bool
-    own: slice
+    rows: slice
 
 
 def _observe_one(
@@ -160,7 +161,8 @@ def _observe_one(
     camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    cover, nothing = depth.copy(), depth.copy()
+    cover = depth.copy()
+    no_cover = depth.copy()
     parts = []
     for body, store in zip(bodies, stores, strict=True):
         transform = camera.camera_from_world.numpy()
@@ -171,37 +173,54 @@ def _observe_one(
             transform = transform @ pose
             draw_cover(cover, camera, transform, body.track.size_m)
         extent = body.surfels.spacing * np.float32(DISC_PER_SPACING)
-        placed = transform[:3, :3].copy(), transform[:3, 3].copy()
+        part_pose = transform[:3, :3].copy(), transform[:3, 3].copy()
         parts += [
-            _Part(body.surfels, store, extent, placed, body.track is not None, own)
-            for own in parts_of(len(body.surfels))
+            _Part(body.surfels, store, extent, part_pose, body.track is not None, rows)
+            for rows in parts_of(len(body.surfels))
         ]
 
     def draw(part: _Part) -> np.ndarray:
-        s, own, nearest = part.surfels, part.own, np.full_like(depth, np.inf)
+        s = part.surfels
+        rows = part.rows
+        nearest = np.full_like(depth, np.inf)
         kernels.draw_depth(
-            s.centres[own], s.normals[own], s.major[own], part.extent[own], *part.pose,
-            *intrinsics, nearest,
-        )  # fmt: skip
+            s.centres[rows],
+            s.normals[rows],
+            s.major[rows],
+            part.extent[rows],
+            *part.pose,
+            *intrinsics,
+            nearest,
+        )
         return nearest
 
     def observe(part: _Part) -> None:
-        s, own = part.surfels, part.own
+        s = part.surfels
+        rows = part.rows
         kernels.observe(
-            s.centres[own], s.normals[own], part.extent[own], *part.pose, *intrinsics,
-            depth, nothing if part.moves else cover, levels, sizes, view.used_rows,
-            camera_number, *(column[own] for column in part.store),
-        )  # fmt: skip
+            s.centres[rows],
+            s.normals[rows],
+            part.extent[rows],
+            *part.pose,
+            *intrinsics,
+            depth,
+            no_cover if part.moves else cover,
+            levels,
+            sizes,
+            view.used_rows,
+            camera_number,
+            *(column[rows] for column in part.store),
+        )
 
-    drawn = pool.map(draw, parts)
+    depth_images = pool.map(draw, parts)
     levels, sizes = _pyramid(image)
-    for nearest in drawn:
+    for nearest in depth_images:
         np.minimum(depth, nearest, out=depth)
     car = view.shows_car(camera.width, camera.height)
-    cover[car] = nothing[car] = 0  # it stands before all else
-    observed = pool.map(observe, parts)
+    cover[car] = no_cover[car] = 0  # it stands before all else
+    observations = pool.map(observe, parts)
     sky.add(camera, np.isinf(depth) & np.isinf(cover), levels, sizes, pool)
-    list(observed)
+    list(observations)
 
 
 def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -218,7 +237,7 @@ def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64) / 2
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-_CLIP_M = 0.05
+_CLIP_M = 0.05  # depth of the plane that a box's edges are clipped at
 
 
 def draw_cover(
@@ -232,7 +251,8 @@ def draw_cover(
     corners = corners @ camera_from_box[:3, :3].T + camera_from_box[:3, 3]
     points = [c for c in corners if c[2] >= _CLIP_M]
     for a, b in _EDGES:
-        za, zb = corners[a, 2], corners[b, 2]
+        za = corners[a, 2]
+        zb = corners[b, 2]
         if (za - _CLIP_M) * (zb - _CLIP_M) < 0:
             points.append(corners[a] + (corners[b] - corners[a]) * ((_CLIP_M - za) / (zb - za)))
     if len(points) < 3:

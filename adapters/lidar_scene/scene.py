@@ -47,13 +47,13 @@ logger = logging.getLogger(__name__)
 # under and behind what hides it, up to so many metres.
 _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
-_MASK_SCALE = 0.25  # of images in which the recording car is looked for
-_MEASURED_PART = 0.9  # of max_gaussians, at most, is for what was measured; the rest closes it
-_MIN_POINTS = 8  # that surfaces are sought in
-_TRIAL = 3.0  # voxels of the trial in units of those asked for
-_REACHES_M = (8.0, 16.0)
-_MIN_RETURNS = 200
-_LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
+_MASK_SCALE = 0.25  # scale of the images in which the recording car is looked for
+_MEASURED_PART = 0.9  # largest part of max_gaussians for measured points; the rest closes holes
+_MIN_POINTS = 8  # fewest points that surfaces are sought in
+_TRIAL = 3.0  # edge of the trial's voxels over that of the finest voxels
+_REACHES_M = (8.0, 16.0)  # radii around the car in which its low height is sought, in turn
+_MIN_RETURNS = 200  # fewest returns in such a radius that are trusted
+_LOW_QUANTILE = 0.02  # quantile of heights that is low, yet not decided by a single stray return
 
 
 def views_of(
@@ -73,12 +73,12 @@ def with_own_car(views: Sequence[View]) -> tuple[View, ...]:
     for view in views:
         by_camera.setdefault(view.camera.name, []).append(view)
     masks = {}
-    for name, own in by_camera.items():
-        moving = [own[i] for i in moving_frames([view.camera for view in own])]
+    for name, camera_views in by_camera.items():
+        moving = [camera_views[i] for i in moving_frames([view.camera for view in camera_views])]
         images = [read_image(view.path, _MASK_SCALE) for view in moving]
-        there = [i for i, image in enumerate(images) if image is not None]
-        cameras = [moving[i].camera for i in there]
-        masks[name] = find_ego_mask(cameras, [images[i] for i in there])
+        image_numbers = [i for i, image in enumerate(images) if image is not None]
+        cameras = [moving[i].camera for i in image_numbers]
+        masks[name] = find_ego_mask(cameras, [images[i] for i in image_numbers])
     return tuple(
         dataclasses.replace(view, own_car=mask) if (mask := masks[view.camera.name]).any() else view
         for view in views
@@ -112,10 +112,10 @@ def build_lidar_scene(
     sky = SkyGatherer(options.sky_size, math.radians(drive.lidar_top_deg))
     views = views_of(drive.used[:: drive.colour_every], drive.used_rows)
     views = with_own_car([v for v in views if v.camera.name not in drive.grey_cameras])
-    seen, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
+    body_colours, faults = observe_views(bodies, views, sky, image_scale=options.image_scale)
     parts = [
-        _gaussians(*thing, found, *colours)
-        for thing, found, colours in zip(sampled, surfels, seen, strict=True)
+        _gaussians(*sample, body_surfels, *colours)
+        for sample, body_surfels, colours in zip(sampled, surfels, body_colours, strict=True)
     ]
     if added is not None:
         parts[0] = join_gaussians([parts[0], added])
@@ -156,20 +156,20 @@ def build_lidar_scene(
 
 def _still_boxes(drive: RawDrive) -> list[BoxSample]:
     """One labelled box of each object that does not move."""
-    found: dict[str, BoxSample | None] = {sample.object_id: None for sample in drive.boxes}
+    boxes: dict[str, BoxSample | None] = {sample.object_id: None for sample in drive.boxes}
     for frame in drive.used:
         for sample, _ in TimedBoxes(
             frame.index, drive.labels.boxes(frame.index), frame.timestamp_ns
         ).samples(drive.world_origin_m):
             if sample is not None:
-                found.setdefault(sample.object_id, sample)
-    return [sample for sample in found.values() if sample is not None]
+                boxes.setdefault(sample.object_id, sample)
+    return [sample for sample in boxes.values() if sample is not None]
 
 
 def without_points(tracks: Sequence[ObjectTrack], scene: Scene) -> tuple[str, ...]:
     """A sentence for the moving objects of which nothing was measured, or that no image shows."""
-    there = {actor.track_id for actor in scene.actors}
-    missing = [track.track_id for track in tracks if track.track_id not in there]
+    track_ids = {actor.track_id for actor in scene.actors}
+    missing = [track.track_id for track in tracks if track.track_id not in track_ids]
     if not missing:
         return ()
     return (
@@ -183,7 +183,8 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
     the returns around each position. The reach widens until there are enough to trust: what is
     nearest is the recording car and spray."""
     widest = _REACHES_M[-1]
-    low, high = path.min(axis=0) - widest, path.max(axis=0) + widest
+    low = path.min(axis=0) - widest
+    high = path.max(axis=0) + widest
     near = points.points[indices_between(points.points, low, high)]
     heights = []
     for position in path:
@@ -197,18 +198,22 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
 
 
 def _sample_all(
-    things: Sequence[PointSet], paths: Sequence[np.ndarray], finest_m: float, most: int
+    point_sets: Sequence[PointSet], paths: Sequence[np.ndarray], finest_m: float, max_points: int
 ) -> list[tuple[PointSet, np.ndarray]]:
-    """Every thing thinned and its gaps filled with one voxel size, the smallest from finest_m on
-    that gives so many points at most. things: the world first. paths: the driven path in each
-    one's frame."""
+    """Every point set thinned and its gaps filled with one voxel size: the smallest from finest_m
+    on that gives max_points at most. point_sets: the world first. paths: the driven path in each
+    set's frame."""
 
-    levels = [levels_at(thing.points, path) for thing, path in zip(things, paths, strict=True)]
+    levels = [
+        levels_at(point_set.points, path) for point_set, path in zip(point_sets, paths, strict=True)
+    ]
 
     def sample(voxel_m: float) -> tuple[list[tuple[PointSet, np.ndarray]], int]:
         sampled = [
-            _sample(thing, path, level, voxel_m, is_world=i == 0)
-            for i, (thing, path, level) in enumerate(zip(things, paths, levels, strict=True))
+            _sample(point_set, path, level, voxel_m, is_world=i == 0)
+            for i, (point_set, path, level) in enumerate(
+                zip(point_sets, paths, levels, strict=True)
+            )
         ]
         count = sum(len(points) for points, _ in sampled)
         logger.info("%d surfels at a voxel of %.3f m", count, voxel_m)
@@ -216,19 +221,19 @@ def _sample_all(
 
     # A coarse trial tells what the fine one needs: on surfaces the count goes with the square.
     _, trial = sample(_TRIAL * finest_m)
-    needed = 1.01 * _TRIAL * (trial / most) ** 0.5
+    needed = 1.01 * _TRIAL * (trial / max_points) ** 0.5
     voxel_m = finest_m * max(1.0, needed)
     while True:
         sampled, count = sample(voxel_m)
-        if count <= most:
+        if count <= max_points:
             return sampled
-        voxel_m *= max(1.02, (count / most) ** 0.55)
+        voxel_m *= max(1.02, (count / max_points) ** 0.55)
 
 
 def _sample(
-    thing: PointSet, path: np.ndarray, level: np.ndarray, voxel_m: float, *, is_world: bool
+    points: PointSet, path: np.ndarray, level: np.ndarray, voxel_m: float, *, is_world: bool
 ) -> tuple[PointSet, np.ndarray]:
-    thin, edges = thin_points(thing, path, voxel_m=voxel_m, level=level)
+    thin, edges = thin_points(points, path, voxel_m=voxel_m, level=level)
     if len(thin) < _MIN_POINTS:
         return thin, edges
     surfels = surfels_from_points(thin.points, edges, semantic=thin.semantic)
@@ -247,9 +252,13 @@ def _path_in(track: ObjectTrack, path: np.ndarray, times_ns: np.ndarray) -> np.n
 
 
 def _gaussians(
-    points: PointSet, edges: np.ndarray, surfels: Surfels, colours: np.ndarray, seen: np.ndarray
+    points: PointSet,
+    edges: np.ndarray,
+    surfels: Surfels,
+    colours: np.ndarray,
+    is_observed: np.ndarray,
 ) -> Gaussians:
     reach = np.where(is_flat(points.semantic), np.float32(_BORROW_GROUND_M), _BORROW_EDGES * edges)
-    colours, known = borrow_colours(points.points, colours, seen, reach)
-    keep = np.flatnonzero(known & ~surfels.isolated)
+    colours, has_colour = borrow_colours(points.points, colours, is_observed, reach)
+    keep = np.flatnonzero(has_colour & ~surfels.isolated)
     return gaussians_from_surfels(surfels.select(keep), colours[keep], points.semantic[keep])

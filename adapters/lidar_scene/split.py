@@ -50,8 +50,9 @@ class Motion:
         )
 
     def exists_at(self, timestamps_ns: np.ndarray) -> np.ndarray:
-        """Whether the actor is there at each time, bool [N]."""
-        first, last = self.knots_ns[0] - self.hold_ns, self.knots_ns[-1] + self.hold_ns
+        """Mask of the times at which the actor exists, bool [N]."""
+        first = self.knots_ns[0] - self.hold_ns
+        last = self.knots_ns[-1] + self.hold_ns
         return (timestamps_ns >= first) & (timestamps_ns <= last)
 
     def pose_at(self, timestamp_ns: int) -> np.ndarray | None:
@@ -77,8 +78,8 @@ class Motion:
             return np.zeros(0, dtype=np.int64)
         low, high = self.span(int(timestamps_ns.min()), int(timestamps_ns.max()))
         reach = float(np.linalg.norm(size_m)) / 2 + HALO_M
-        found = indices_between(points, low - reach, high + reach)
-        return found[self.exists_at(timestamps_ns[found])]
+        index = indices_between(points, low - reach, high + reach)
+        return index[self.exists_at(timestamps_ns[index])]
 
     def span(self, first_ns: int, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest coordinates of the centre over a time span, two float64 [3]."""
@@ -90,17 +91,17 @@ class Motion:
 
 
 def inside_box(local: np.ndarray, size_m: np.ndarray, margin_m: float) -> np.ndarray:
-    """Whether points in the box's frame lie in the box grown by a margin on all sides, bool [N]."""
+    """Mask of the points (in the box's frame) that lie in the box grown by margin_m, bool [N]."""
     return (np.abs(local) <= size_m / 2 + margin_m).all(axis=1)
 
 
 def indices_between(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Indices of the points [N, 3] strictly inside an axis-aligned box, int64, ascending."""
-    # One column first: it leaves few points for the rest, and this runs once a box and sweep.
+    # One column first: it leaves few points for the others, and this runs once a box and sweep.
     x = points[:, 0]
     index = np.flatnonzero((x > low[0]) & (x < high[0]))
-    rest = points[index, 1:]
-    return index[((rest > low[1:]) & (rest < high[1:])).all(axis=1)]
+    yz = points[index, 1:]
+    return index[((yz > low[1:]) & (yz < high[1:])).all(axis=1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +143,8 @@ def _unite(samples: Sequence[BoxSample]) -> dict[str, str]:
     for sample in samples:
         # A sibling that has no box in these frames names nothing.
         if sample.sibling_id in order:
-            a, b = root(sample.object_id), root(sample.sibling_id)
+            a = root(sample.object_id)
+            b = root(sample.sibling_id)
             first, second = sorted((a, b), key=order.__getitem__)
             parent[second] = first
     return {name: root(name) for name in order}
@@ -153,13 +155,13 @@ def _join(name: str, group: list[BoxSample]) -> ObjectTrack:
     for sample in group:
         by_frame[sample.frame].append(sample)
     merged = sorted(map(_mean_pose, by_frame.values()), key=lambda sample: sample[0])
-    kept = [merged[0]]
+    knots = [merged[0]]
     for time, pose in merged[1:]:
-        if time - kept[-1][0] >= _MERGE_NS:
-            kept.append((time, pose))
+        if time - knots[-1][0] >= _MERGE_NS:
+            knots.append((time, pose))
     track = Track(
-        torch.tensor([time for time, _ in kept], dtype=torch.int64),
-        torch.stack([pose for _, pose in kept]),
+        torch.tensor([time for time, _ in knots], dtype=torch.int64),
+        torch.stack([pose for _, pose in knots]),
     )
     size_m = np.mean([s.size_m for s in group], axis=0)
     return ObjectTrack(name, group[0].label, track, size_m)
@@ -194,7 +196,7 @@ class PointSet:
 
 
 def is_flat(semantic: np.ndarray) -> np.ndarray:
-    """Whether each class is ground that is driven or walked on, bool [N]."""
+    """Mask of the classes that are ground to drive or walk on, bool [N]."""
     return np.isin(semantic, _FLAT)
 
 
@@ -214,10 +216,10 @@ def split_sweeps(
             ground = is_flat(classes)
             halo = inside_box(local, track.size_m, HALO_M) & ~ground
             low = local[:, 2] < FLOOR_M - track.size_m[2] / 2
-            own = inside_box(local, track.size_m, SKIN_M) & ~ground
-            own &= ~(low & (classes == SemanticClass.UNKNOWN))
+            is_object = inside_box(local, track.size_m, SKIN_M) & ~ground
+            is_object &= ~(low & (classes == SemanticClass.UNKNOWN))
             is_static[near[halo]] = False
-            parts.append(PointSet(local[own].astype(np.float32), classes[own]))
+            parts.append(PointSet(local[is_object].astype(np.float32), classes[is_object]))
         static.append(PointSet(sweep.points[is_static], sweep.semantic[is_static]))
     return PointSet.join(static), tuple(map(PointSet.join, actors))
 
@@ -231,23 +233,35 @@ def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
     j = min(i + 1, last)
     if j > i:
         f = min(max((time - knots[i]) / (knots[j] - knots[i]), 0.0), 1.0)
-    a, b = quats[i], quats[j]
+    a = quats[i]
+    b = quats[j]
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = -1.0 if dot < 0 else 1.0
     angle = np.arccos(min(abs(dot), 1.0))
-    wa, wb = 1.0 - f, f
+    wa = 1.0 - f
+    wb = f
     if angle > 1e-6:  # below, sin loses its digits and the straight line is exact
-        wa, wb = np.sin(wa * angle) / np.sin(angle), np.sin(wb * angle) / np.sin(angle)
+        wa = np.sin(wa * angle) / np.sin(angle)
+        wb = np.sin(wb * angle) / np.sin(angle)
     wb *= sign
-    w, x = wa * a[0] + wb * b[0], wa * a[1] + wb * b[1]
-    y, z = wa * a[2] + wb * b[2], wa * a[3] + wb * b[3]
+    w = wa * a[0] + wb * b[0]
+    x = wa * a[1] + wb * b[1]
+    y = wa * a[2] + wb * b[2]
+    z = wa * a[3] + wb * b[3]
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * n, x * n, y * n, z * n
-    out[0, 0], out[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+    w = w * n
+    x = x * n
+    y = y * n
+    z = z * n
+    out[0, 0] = 1 - 2 * (y * y + z * z)
+    out[1, 1] = 1 - 2 * (x * x + z * z)
     out[2, 2] = 1 - 2 * (x * x + y * y)
-    out[0, 1], out[0, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
-    out[1, 0], out[1, 2] = 2 * (x * y + w * z), 2 * (y * z - w * x)
-    out[2, 0], out[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    out[0, 1] = 2 * (x * y - w * z)
+    out[0, 2] = 2 * (x * z + w * y)
+    out[1, 0] = 2 * (x * y + w * z)
+    out[1, 2] = 2 * (y * z - w * x)
+    out[2, 0] = 2 * (x * z - w * y)
+    out[2, 1] = 2 * (y * z + w * x)
     for k in range(3):
         out[k, 3] = (1.0 - f) * centres[i, k] + f * centres[j, k]
 

@@ -30,15 +30,16 @@ NEAR_M = 6.0  # voxels have their given size up to this distance from the path
 # still resolves what is far ahead.
 GROWTH = 0.7
 _STEP = 0.5  # octaves of distance that share a size, so that points near each other share a grid
-_MAX_LEVEL = 15
+_MAX_LEVEL = 15  # largest level: its 4 bits in a voxel's key hold no more
 NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
 _COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
-_STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
+_STRETCH = 2.0  # widest gap that a splat closes, in edges
+_STRETCH_FIRM = 4.0  # the same on ground, walls and where there is no class
 _UPRIGHT = (Class.BUILDING, Class.BARRIER, Class.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 _GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
 _THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
-_MIN_THICKNESS_M = 0.005
+_MIN_THICKNESS_M = 0.005  # smallest standard deviation along the normal
 
 
 def thin_points(
@@ -61,7 +62,7 @@ def levels_at(points: np.ndarray, path: np.ndarray) -> np.ndarray:
     """How far each position is from the path, in steps of voxels' sizes, uint8 [N]."""
     points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
     out = np.empty(len(points), np.uint8)
-    in_parts(lambda own: _levels(points[own], path, out[own]), len(points))
+    in_parts(lambda rows: _levels(points[rows], path, out[rows]), len(points))
     return out
 
 
@@ -98,7 +99,7 @@ def _levels(points, path, out):  # pragma: no cover - compiled
 def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """4 bits of level, then 20 a coordinate: 20 km each way at the finest edge."""
     out = np.empty(len(points), np.uint64)
-    in_parts(lambda own: _fill_keys(points[own], level[own], edges, out[own]), len(points))
+    in_parts(lambda rows: _fill_keys(points[rows], level[rows], edges, out[rows]), len(points))
     return out
 
 
@@ -122,7 +123,8 @@ def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compile
     classes = np.empty(runs, np.int16)
     levels = np.empty(runs, np.uint8)
     votes = np.zeros(64, np.int64)
-    start, run = 0, 0
+    start = 0
+    run = 0
     for end in range(1, len(keys) + 1):
         if end < len(keys) and keys[order[end]] == keys[order[start]]:
             continue
@@ -141,7 +143,8 @@ def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compile
                 best = c
         classes[run] = best
         levels[run] = level[order[start]]
-        start, run = end, run + 1
+        start = end
+        run = run + 1
     return means, classes, levels
 
 
@@ -189,7 +192,8 @@ def surfels_from_points(
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
         spacing = np.repeat(edge_m[:, None], 2, 1).astype(np.float32)
-        isolated, neighbours = np.ones(count, bool), np.zeros((count, 0), int)
+        isolated = np.ones(count, bool)
+        neighbours = np.zeros((count, 0), int)
         return Surfels(points, frame[:, 2], frame[:, 0], spacing, isolated, neighbours)
     if semantic is None:
         semantic = np.full(count, Class.UNKNOWN, np.int16)
@@ -218,7 +222,8 @@ def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray,
 def _principal_axes(points: np.ndarray, index: np.ndarray, semantic: np.ndarray) -> np.ndarray:
     """Axis of largest variance, middle one, and normal of every point, float32 [N, 3 axes, 3]."""
     values, vectors = np.linalg.eigh(_covariances(points, index))
-    major, normal = vectors[:, :, 2], vectors[:, :, 0]
+    major = vectors[:, :, 2]
+    normal = vectors[:, :, 0]
     on_line = (values[:, 1] < _LINE * values[:, 2]) & (np.abs(major[:, 2]) < 0.9)
     sideways = np.cross(major, np.array([0.0, 0.0, 1.0]))
     hints = [(is_flat(semantic), np.cross(sideways, major)), (_is_upright(semantic), sideways)]
@@ -289,7 +294,8 @@ def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma:
                 continue
             gaps[side] = min(gaps[side], reach)
         for axis in range(2):
-            a, b = gaps[2 * axis], gaps[2 * axis + 1]
+            a = gaps[2 * axis]
+            b = gaps[2 * axis + 1]
             if np.isinf(a) and np.isinf(b):
                 gap = np.inf
             elif endless[i] and not np.isinf(max(a, b)):
@@ -337,19 +343,20 @@ def gaussians_from_surfels(
 
 
 def borrow_colours(
-    points: np.ndarray, colours: np.ndarray, seen: np.ndarray, reach_m: np.ndarray
+    points: np.ndarray, colours: np.ndarray, has_colour: np.ndarray, reach_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours [N, 3] for unseen points [N, 3] from the nearest seen one within reach_m [N], and who
-    has a colour now."""
-    if seen.all() or not seen.any():
-        return colours, seen
-    unseen = np.flatnonzero(~seen)
-    distance, nearest = cKDTree(points[seen]).query(points[unseen], workers=-1)
+    """The colours [N, 3], where a point without one takes that of the nearest point that has one
+    within reach_m [N]; and the mask of the points that have a colour now, bool [N]."""
+    if has_colour.all() or not has_colour.any():
+        return colours, has_colour
+    unseen = np.flatnonzero(~has_colour)
+    distance, nearest = cKDTree(points[has_colour]).query(points[unseen], workers=-1)
     near = distance <= reach_m[unseen]
-    colours, seen = colours.copy(), seen.copy()
-    colours[unseen[near]] = colours[np.flatnonzero(seen)[nearest[near]]]
-    seen[unseen[near]] = True
-    return colours, seen
+    colours = colours.copy()
+    has_colour = has_colour.copy()
+    colours[unseen[near]] = colours[np.flatnonzero(has_colour)[nearest[near]]]
+    has_colour[unseen[near]] = True
+    return colours, has_colour
 
 
 # ---- Points where no LiDAR ring fell -------------------------------------------------------------
@@ -360,7 +367,8 @@ def borrow_colours(
 # sensor, heights are interpolated within the extent of the ground seen around the hole.
 
 MAX_WALL_GAP_M = 3.0  # gaps higher than this stay open
-_CELL_M, _CELL_EDGES = 0.2, 1.5  # size in plan of a column of wall
+_CELL_M = 0.2  # smallest side in plan of a column of wall, metres
+_CELL_EDGES = 1.5  # that side in edges, where it is larger
 _SPARSER = 1.6  # spacing of new points in edges: what is guessed needs no detail
 _MAX_UPWARD = 0.4  # largest upward part of an upright surface's unit normal
 _MAX_GAP_M = {
@@ -370,12 +378,13 @@ _MAX_GAP_M = {
     Class.VEHICLE: 0.4,
     Class.UNKNOWN: 0.4,
 }
-_MAX_OTHER_GAP_M = 0.25
-CELL_M = 0.25
+_MAX_OTHER_GAP_M = 0.25  # widest gap that is bridged on any other class
+CELL_M = 0.25  # side of a cell of the map of the ground's heights
 CLOSE_M = 3.0  # holes up to twice this wide are filled
-BESIDE_M = 8.0  # from the path: filled whatever is around
-REACH_M = 60.0  # from the path
-_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3  # to settle across half the widest hole
+BESIDE_M = 8.0  # distance from the path up to which every hole is filled
+REACH_M = 60.0  # distance from the path up to which ground is filled
+# Steps of relaxation: enough to settle across half the widest hole.
+_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3
 _STEEP = 0.35  # height over distance that ground can have from one cell to the next
 
 
@@ -384,24 +393,30 @@ def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointS
     edge_m: float32 [N], distance that the points were thinned to."""
     wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.SIGN, Class.UNKNOWN))
     wall &= np.abs(surfels.normals[:, 2]) < _MAX_UPWARD
-    some, edges, classes = points.points[wall], edge_m[wall], points.semantic[wall]
-    if len(some) < 2:
+    wall_points = points.points[wall]
+    edges = edge_m[wall]
+    classes = points.semantic[wall]
+    if len(wall_points) < 2:
         return PointSet(points.points[:0], points.semantic[:0])
-    column = _columns(some, edges)
-    order = np.lexsort((some[:, 2], column))
-    some, edges, classes, column = some[order], edges[order], classes[order], column[order]
-    gap, longest = np.diff(some[:, 2]), _SPARSER * edges[:-1].astype(np.float64)
+    column = _columns(wall_points, edges)
+    order = np.lexsort((wall_points[:, 2], column))
+    wall_points = wall_points[order]
+    edges = edges[order]
+    classes = classes[order]
+    column = column[order]
+    gap = np.diff(wall_points[:, 2])
+    longest = _SPARSER * edges[:-1].astype(np.float64)
     is_open = (column[:-1] == column[1:]) & (longest < gap) & (gap <= MAX_WALL_GAP_M)
     below = np.flatnonzero(is_open)
     pair, along = _cuts(np.ceil(gap[below] / longest[below]).astype(np.int64))
     below = below[pair]
-    new = some[below] * (1 - along.astype(np.float64)) + some[below + 1] * along
+    new = wall_points[below] * (1 - along.astype(np.float64)) + wall_points[below + 1] * along
     return PointSet(new.astype(np.float32), classes[below])
 
 
 def _cuts(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of pairs of points with so many pieces between them, int64 [P]: the pair of each cut, int64
-    [M], and its part of the way, float32 [M, 1]."""
+    """Cuts of the segments between pairs of points into equal pieces, pieces int64 [P] a pair: the
+    pair of each cut, int64 [M], and its place as a fraction of the segment, float32 [M, 1]."""
     inner = np.maximum(pieces - 1, 0)
     pair = np.repeat(np.arange(len(pieces)), inner)
     step = np.arange(len(pair)) - np.repeat(np.cumsum(inner) - inner, inner) + 1
@@ -422,9 +437,14 @@ def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> Point
     for semantic, width in _MAX_GAP_M.items():
         widest[semantic] = width
     a, b = _find_bridges(
-        points.points, points.semantic, surfels.normals, surfels.major, surfels.neighbours,
-        edge_m, widest,
-    )  # fmt: skip
+        points.points,
+        points.semantic,
+        surfels.normals,
+        surfels.major,
+        surfels.neighbours,
+        edge_m,
+        widest,
+    )
     length = np.linalg.norm(points.points[a] - points.points[b], axis=1)
     pair, along = _cuts(np.ceil(length / edge_m[a]).astype(np.int64))
     new = points.points[a[pair]] * (1 - along) + points.points[b[pair]] * along
@@ -439,7 +459,8 @@ def _find_bridges(
     first = np.empty(4 * len(points), np.int64)
     second = np.empty(4 * len(points), np.int64)
     count = 0
-    gaps, who = np.empty(4), np.empty(4, np.int64)
+    gaps = np.empty(4)
+    who = np.empty(4, np.int64)
     for i in range(len(points)):
         gaps[:] = np.inf
         for j in index[i]:
@@ -454,18 +475,20 @@ def _find_bridges(
             if max(abs(w), abs(wj)) > 0.25 * reach:
                 continue
             if reach < gaps[side]:
-                gaps[side], who[side] = reach, j
+                gaps[side] = reach
+                who[side] = j
         for side in range(4):
             # One of a pair of wires has nothing on its other side.
             if 1.5 * edge_m[i] < gaps[side] <= widest[semantic[i]] and gaps[side ^ 1] < np.inf:
-                first[count], second[count] = i, who[side]
+                first[count] = i
+                second[count] = who[side]
                 count += 1
     return first[:count], second[:count]
 
 
 def ground_points(points: PointSet) -> np.ndarray:
-    """Which points are ground, bool [N]: by class where any has one, else the lowest of their
-    square metre where its height agrees with the squares around it."""
+    """Mask of the points that are ground, bool [N]: by class where any has one, else the lowest of
+    their square metre where its height agrees with the squares around it."""
     flat = is_flat(points.semantic)
     if flat.any() or (points.semantic != Class.UNKNOWN).any():
         return flat
@@ -475,20 +498,22 @@ def ground_points(points: PointSet) -> np.ndarray:
 def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointSet:
     """New ground points only, a little sparser than `thin_points`; class of the nearest point."""
     is_ground = ground_points(points)
-    ground, classes = points.points[is_ground], points.semantic[is_ground]
+    ground = points.points[is_ground]
+    classes = points.semantic[is_ground]
     near = cKDTree(path[:, :2]).query(ground[:, :2])[0] < REACH_M
-    ground, classes = ground[near], classes[near]
+    ground = ground[near]
+    classes = classes[near]
     if len(ground) < 16:
         return PointSet(points.points[:0], points.semantic[:0])
     origin = ground[:, :2].min(axis=0) - 2 * CLOSE_M
     shape = np.ceil((ground[:, :2].max(axis=0) + 2 * CLOSE_M - origin) / CELL_M).astype(int) + 1
-    heights, seen = _height_grid(ground, origin, shape)
+    heights, has_ground = _height_grid(ground, origin, shape)
     # Holes among cells with ground up to 2 CLOSE_M wide count; nothing beyond the outline does.
     radius = round(CLOSE_M / CELL_M)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    inside = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    inside = cv2.morphologyEx(has_ground.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
     inside |= _beside(path, origin, shape)
-    heights = _spread(heights, seen)
+    heights = _spread(heights, has_ground)
     voxel_m = voxel_m * _SPARSER
     new = _candidates(heights, inside, origin, path, voxel_m)
     distance, nearest = cKDTree(ground[:, :2]).query(new[:, :2], workers=-1)
@@ -519,20 +544,21 @@ def _height_grid(
     return heights, (count > 0).reshape(shape)
 
 
-def _spread(heights: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _spread(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
     """Heights for every cell: in holes the smoothest surface that joins their rim (Laplace's
     equation, relaxed from averages over ever wider surroundings)."""
-    fixed = np.where(seen, heights, 0.0).astype(np.float32)
-    out, known = fixed.copy(), seen.copy()
+    fixed = np.where(has_ground, heights, 0.0).astype(np.float32)
+    out = fixed.copy()
+    has_height = has_ground.copy()
     sigma = 1.0
-    while not known.all() and sigma * CELL_M < 4 * CLOSE_M:
-        both = cv2.GaussianBlur(np.dstack([fixed, seen.astype(np.float32)]), (0, 0), sigma)
-        reached = ~known & (both[..., 1] > 1e-2)
+    while not has_height.all() and sigma * CELL_M < 4 * CLOSE_M:
+        both = cv2.GaussianBlur(np.dstack([fixed, has_ground.astype(np.float32)]), (0, 0), sigma)
+        reached = ~has_height & (both[..., 1] > 1e-2)
         out[reached] = both[reached, 0] / both[reached, 1]
-        known |= reached
+        has_height |= reached
         sigma *= 2.0
     for _ in range(_RELAXATIONS):
-        out = np.where(seen, fixed, cv2.blur(out, (3, 3)))
+        out = np.where(has_ground, fixed, cv2.blur(out, (3, 3)))
     return out
 
 
@@ -545,15 +571,15 @@ def _candidates(
     edges = edges_at(centres, path, voxel_m=voxel_m)
     out = []
     for edge in np.unique(edges):
-        some = centres[edges == edge]
+        cell_centres = centres[edges == edge]
         count = max(1, round(CELL_M / float(edge)))
         # Coarser than a cell: keep about one cell in (edge / cell)^2, on a grid.
         stride = max(1, round(float(edge) / CELL_M))
         index = cells[edges == edge]
-        some = some[(index % stride == 0).all(axis=1)]
+        cell_centres = cell_centres[(index % stride == 0).all(axis=1)]
         ticks = (np.arange(count) + 0.5) / count * CELL_M - CELL_M / 2
         dx, dy = np.meshgrid(ticks, ticks, indexing="ij")
-        xy = some[:, None, :2] + np.stack([dx.ravel(), dy.ravel()], 1)[None]
+        xy = cell_centres[:, None, :2] + np.stack([dx.ravel(), dy.ravel()], 1)[None]
         out.append(xy.reshape(-1, 2))
     xy = np.concatenate(out)
     grid = (xy - origin) / CELL_M - 0.5
