@@ -119,7 +119,7 @@ class RecordingLabels:
         return () if path is None else (path,)
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """The same columns, types and notes."""
+        """Return a weathered sweep as a file with the columns, types and notes of the clear one."""
         with _reading(file, _LIDAR_FILE):
             table = read_table(file, str(file)).take(pa.array(sweep.columns[INDEX_COLUMN]))
             columns = {name: np.asarray(sweep.columns[name]) for name in "xyz"}
@@ -137,8 +137,10 @@ class RecordingLabels:
             return sink.getvalue().to_pybytes()
 
     def _classes_with_air(self, sweep: LidarSweep) -> np.ndarray:
-        """The class numbers of a weathered sweep, with that of no surface, or of none, for returns
-        that drops, flakes or fog made; unchanged where numbers are not known to mean anything."""
+        """Return the class numbers of a weathered sweep.
+
+        Returns that drops, flakes or fog made get the number that stands for no surface, else one
+        of unknown class. Where the meaning of the numbers is not known, all stay as they are."""
         classes = np.asarray(sweep.columns[_CLASS])
         numbers = class_numbers(self.root / "lidar", classes)
         meaning, _ = class_meanings(read_lidar_classes(self.root), [numbers])
@@ -171,15 +173,19 @@ def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
 
 
 def lidar_files(root: Path) -> dict[int, Path]:
-    """The sweeps' files by frame number: of a variant that a job wrote, those of its scene where
-    the weather has changed none."""
+    """Return the sweeps' files by frame number.
+
+    A variant that a job wrote has none of its own where the weather changed no sweep; those of its
+    scene are returned then."""
     is_variant = (root / "recipe.yaml").is_file() and not (root / SWEEPS).is_dir()
     return numbered_files(root.parent if is_variant else root, SWEEPS, (".parquet",))
 
 
 def all_boxes(root: Path) -> dict[int, FrameBoxes]:
-    """The boxes of every frame that has any: of labels/boxes.parquet, or of a job's blocks, each of
-    which has all boxes of its frames."""
+    """Return the boxes of every frame that has any.
+
+    They are read from labels/boxes.parquet, or else from a job's blocks, each of which has all
+    boxes of its frames."""
     path = root / "labels" / "boxes.parquet"
     single_file = [inside(root, path)] if path.exists() else None
     boxes_by_frame: dict[int, FrameBoxes] = {}
@@ -462,8 +468,7 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
 def read_recording(
     path: str, query: dict[str, str], options: DriveOptions
 ) -> tuple[RawDrive, Calibration]:
-    """The frames that the options ask for with their boxes and the LiDAR's sweeps, of which there
-    may be none."""
+    """Read the frames that the options ask for, with their boxes and LiDAR sweeps, if any."""
     root = Path(path)
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")

@@ -75,8 +75,9 @@ def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
 
 
 def inside(root: Path, path: Path) -> Path:
-    """The path itself, refused where a link leads out of `root`: a folder from elsewhere must not
-    make this machine read its other files."""
+    """Return the path; raise AdapterError where a link in it leads out of `root`.
+
+    A folder from elsewhere must not make this machine read its other files."""
     real = path.resolve()
     real_root = root.resolve()
     if not real.is_relative_to(real_root):

@@ -263,8 +263,9 @@ def find_road(shots: Sequence[Shot]) -> Road:
 def _plane_under(
     normal: np.ndarray, point: np.ndarray, centres: np.ndarray, up: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
-    """The plane through a point with its normal upwards, and the cameras' median height over it;
-    None where it is too steep or above a camera."""
+    """Return the unit normal and offset of a plane, and the cameras' median height over it.
+
+    The normal points upwards. Returns None where the plane is too steep or above a camera."""
     length = np.linalg.norm(normal)
     if length == 0:
         return None
@@ -369,8 +370,10 @@ def _fit_positions(
     positions: Mapping[str, np.ndarray],
     path: Path,
 ) -> tuple[np.ndarray, float, float]:
-    """The turn about z that lays the cameras' path on the positions, metres per unit, and how far
-    apart they are then (median, metres)."""
+    """Fit the cameras' path to the positions.
+
+    Returns the rotation about z, [4, 4]; metres per unit of the model; and the median distance of
+    the fitted path from the positions, metres. path: of the table, for messages."""
     pairs = [
         ((world_from_model @ shot.model_from_camera)[:2, 3], positions[name])
         for shot in shots

@@ -293,8 +293,10 @@ def _car_at(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _range_images(
     segment: Segment, component: str, frame: int, channels: int, returns: tuple[int, ...] = (1, 2)
 ) -> dict[int, tuple[np.ndarray | None, ...]]:
-    """The images [H, W, channels] of a frame by laser, one a return, None for null; their memory
-    is the table's. Empty without the component or a row of the frame."""
+    """Return the range images of a frame by laser, one for each return, None for null.
+
+    Each is [H, W, channels] and shares the table's memory. The result is empty without the
+    component or a row of the frame."""
     if not segment.files.has(component):
         return {}
     rows_by_laser = _index(segment, component, "key.laser_name", LASERS).get(frame, {})
@@ -551,9 +553,10 @@ def _all_boxes(segment: Segment) -> dict[int, Boxes]:
 def moving_boxes(
     segment: Segment, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Any, ...], tuple[str, ...]]:
-    """The boxes of moving objects in the frames, and a sentence for each fault. When the labels
-    stand for is not published: a box is taken to be where its object was as the TOP laser's turn
-    came past it."""
+    """Return the boxes of moving objects in the frames, and a sentence for each fault.
+
+    The dataset does not state the time of a box. It is taken to be the time at which the TOP
+    laser's turn passed the box."""
     timed = []
     for n in numbers:
         boxes = _all_boxes(segment).get(n, Boxes.empty())
@@ -637,7 +640,7 @@ def waymo_labels(path: str, query: dict[str, str]) -> WaymoLabels:
 
 
 def waymo_files(path: Path | str, query: dict[str, str]) -> list[Path]:
-    """The files that are read of a segment, whether they are there or not."""
+    """Return the paths of all files that a segment may have; they need not exist."""
     files = find_segment(Path(path), query.get("segment"))
     return [files.path(component) for component in COMPONENTS]
 
@@ -693,9 +696,10 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
 def read_sweeps(
     segment: Segment, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """The usable returns of the frames in the scene's world, and what was missing. Of long drives
-    every second return is taken, or every third, and so on, so that there are at most
-    _MAX_RETURNS."""
+    """Return the usable returns of the frames in the scene's world, and a sentence for each fault.
+
+    Long drives are thinned: every second return is taken, or every third, and so on, so that there
+    are at most _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
     missing: list[int] = []
     faults: dict[int, AdapterError] = {}

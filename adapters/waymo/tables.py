@@ -133,7 +133,9 @@ def _segment_names(table: pa.Table, path: Path) -> list[str]:
 
 
 class Rows:
-    """The rows of a segment in one component; columns go by their fields' names, keys by theirs."""
+    """The rows of one segment in one component.
+
+    A column is named by its field, such as `type`, or by its key, such as `key.laser_name`."""
 
     def __init__(self, files: SegmentFiles, component: str, fields: Sequence[str]) -> None:
         self.path = files.path(component)
@@ -172,8 +174,10 @@ class Rows:
         return self._table[self.name(field)].combine_chunks()
 
     def values(self, field: str, *, or_else: float | None = None) -> np.ndarray:
-        """A number for each row, as the file has it. or_else: for nulls, which are refused without,
-        and for all rows where there is no such column."""
+        """Return a number for each row, in the file's type.
+
+        or_else: value for nulls, and for all rows where there is no such column; without it, both
+        are refused."""
         if or_else is not None and not self.has(field):
             return np.full(len(self), or_else)
         column = self.column(field)
