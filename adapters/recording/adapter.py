@@ -86,7 +86,8 @@ _CACHED_FILES = 4  # box files kept: every frame asks for its own part of one
 _DAMAGED = (OutputError, OSError, pa.ArrowException, KeyError, IndexError, TypeError, ValueError)
 _LIDAR_FILE = "a LiDAR file with columns x, y, z"
 _FAR_M = 1000.0  # no LiDAR on the ground sees this far
-_OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
+_OWN_M = 1.5  # returns nearer to the cameras' middle are likely on the recording car
+_OWN_PART = 1e-3  # of all returns; a car's own are some hundreds a sweep
 _TOP_QUANTILE = 0.999
 _TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
 _TOP_DEG = (2.0, 60.0)
@@ -118,7 +119,7 @@ class RecordingLabels:
         return () if path is None else (path,)
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """The same columns, types and notes."""
+        """Return a weathered sweep as a file with the columns, types and notes of the clear one."""
         with _reading(file, _LIDAR_FILE):
             table = read_table(file, str(file)).take(pa.array(sweep.columns[INDEX_COLUMN]))
             columns = {name: np.asarray(sweep.columns[name]) for name in "xyz"}
@@ -136,8 +137,10 @@ class RecordingLabels:
             return sink.getvalue().to_pybytes()
 
     def _classes_with_air(self, sweep: LidarSweep) -> np.ndarray:
-        """The class numbers of a weathered sweep, with that of no surface, or of none, for returns
-        that drops, flakes or fog made; unchanged where numbers are not known to mean anything."""
+        """Return the class numbers of a weathered sweep.
+
+        Returns that drops, flakes or fog made get the number that stands for no surface, else one
+        of unknown class. Where the meaning of the numbers is not known, all stay as they are."""
         classes = np.asarray(sweep.columns[_CLASS])
         numbers = class_numbers(self.root / "lidar", classes)
         meaning, _ = class_meanings(read_lidar_classes(self.root), [numbers])
@@ -170,21 +173,25 @@ def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
 
 
 def lidar_files(root: Path) -> dict[int, Path]:
-    """The sweeps' files by frame number: of a variant that a job wrote, those of its scene where
-    the weather has changed none."""
+    """Return the sweeps' files by frame number.
+
+    A variant that a job wrote has none of its own where the weather changed no sweep; those of its
+    scene are returned then."""
     is_variant = (root / "recipe.yaml").is_file() and not (root / SWEEPS).is_dir()
     return numbered_files(root.parent if is_variant else root, SWEEPS, (".parquet",))
 
 
 def all_boxes(root: Path) -> dict[int, FrameBoxes]:
-    """The boxes of every frame that has any: of labels/boxes.parquet, or of a job's blocks, each of
-    which has all boxes of its frames."""
+    """Return the boxes of every frame that has any.
+
+    They are read from labels/boxes.parquet, or else from a job's blocks, each of which has all
+    boxes of its frames."""
     path = root / "labels" / "boxes.parquet"
-    one = [inside(root, path)] if path.exists() else None
-    found: dict[int, FrameBoxes] = {}
-    for path in one or block_files(root, "labels/boxes", ".parquet"):
-        found = read_frame_boxes(path) | found
-    return found
+    single_file = [inside(root, path)] if path.exists() else None
+    boxes_by_frame: dict[int, FrameBoxes] = {}
+    for path in single_file or block_files(root, "labels/boxes", ".parquet"):
+        boxes_by_frame = read_frame_boxes(path) | boxes_by_frame
+    return boxes_by_frame
 
 
 def read_sweep(path: Path) -> LidarSweep:
@@ -272,20 +279,22 @@ def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
 def class_meanings(
     lidar_classes: Mapping[int, int] | None, numbers: Sequence[np.ndarray]
 ) -> tuple[Mapping[int, int] | None, tuple[str, ...]]:
-    """SemanticClass (or NO_SURFACE) by the files' class number, None where their meaning is not
-    known, and a sentence where that is so. numbers: those that occur."""
+    """Return SemanticClass (or NO_SURFACE) by the files' class number, and the problems.
+
+    The first is None where the meaning of the numbers is not known; then there is one problem, a
+    sentence. lidar_classes: those of the calibration. numbers: the class numbers that occur."""
     if lidar_classes is not None:
         return lidar_classes, ()
-    known = {number: number for number in range(SemanticClass.SKY)}
+    semantic_numbers = {number: number for number in range(SemanticClass.SKY)}
     for column in numbers:
-        wrong = column[(column < 0) | (column >= SemanticClass.SKY)]
-        if len(wrong):
+        invalid = column[(column < 0) | (column >= SemanticClass.SKY)]
+        if len(invalid):
             return None, (
-                f"lidar/: the column semantic holds {int(wrong.min())}, which is no SemanticClass "
-                f"(0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the numbers mean "
-                f'in calibration.json: "lidar_classes": {{"7": "road", ...}}',
+                f"lidar/: the column semantic holds {int(invalid.min())}, which is no "
+                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what "
+                f'the numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
             )
-    return known, ()
+    return semantic_numbers, ()
 
 
 class LidarDrive(NamedTuple):
@@ -301,13 +310,14 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
     """The sweeps of the given frames, without returns that are not finite, of no surface, or of the
     recording car (ego_box_m)."""
     files = lidar_files(root)
-    known = [frame for frame in frames if frame.index in files]
+    lidar_frames = [frame for frame in frames if frame.index in files]
     missing = [frame.index for frame in frames if frame.index not in files] if files else []
     problems = []
     if missing:
         problems.append(f"lidar/: the files of {some(missing)} are missing, their points too")
-    raws, timeless = [], []
-    for frame in tqdm(known, desc="LiDAR", unit="frame", disable=None):
+    raws = []
+    timeless = []
+    for frame in tqdm(lidar_frames, desc="LiDAR", unit="frame", disable=None):
         sweep, numbers, has_times = _read_returns(files[frame.index], frame, calibration)
         raws.append((sweep, numbers))
         timeless += [] if has_times else [frame.index]
@@ -318,7 +328,7 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
             f"used, fast objects are smeared"
         )
     occurring = [numbers for _, numbers in raws if numbers is not None]
-    meaning, more = class_meanings(calibration.lidar_classes, occurring)
+    meaning, class_problems = class_meanings(calibration.lidar_classes, occurring)
     sweeps = []
     for sweep, numbers in raws:
         if numbers is not None and meaning is not None:
@@ -326,15 +336,17 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
             sweep = dataclasses.replace(sweep, semantic=semantic).select(semantic != NO_SURFACE)
         sweeps.append(sweep)
     if calibration.ego_box_m is None:
-        problems += _own_returns(sweeps, known)
-    return LidarDrive(tuple(sweeps), _top_deg(sweeps, known), (*problems, *more))
+        problems += _own_returns(sweeps, lidar_frames)
+    return LidarDrive(tuple(sweeps), _top_deg(sweeps, lidar_frames), (*problems, *class_problems))
 
 
 def _read_returns(
     path: Path, frame: Frame, calibration: Calibration
 ) -> tuple[Sweep, np.ndarray | None, bool]:
-    """The finite returns that are not the recording car's, of unknown class; their class numbers in
-    the file, int64; and whether they have times of their own."""
+    """Return the finite returns of a sweep that are not on the recording car, of unknown class.
+
+    Also returns their class numbers in the file, int64 or None, and True if the file has a time
+    for each return."""
     sweep = read_sweep(path)
     world = sweep.points_m - calibration.world_origin_m
     pose = frame.world_from_ego.numpy()
@@ -352,18 +364,20 @@ def _read_returns(
         times = sweep_times(sweep, frame.timestamp_ns)
     except ValueError as error:
         raise AdapterError(f"{path}: {error}") from None
-    found = Sweep.of_unknown_class(world[keep], frame.timestamp_ns)
+    returns = Sweep.of_unknown_class(world[keep], frame.timestamp_ns)
     if times is not None:
-        found = dataclasses.replace(found, timestamps_ns=times[keep])
+        returns = dataclasses.replace(returns, timestamps_ns=times[keep])
     column = sweep.columns.get("semantic")
     numbers = None if column is None else class_numbers(path, column)[keep]
-    return found, numbers, times is not None
+    return returns, numbers, times is not None
 
 
-def _own_returns(sweeps: Sequence[Sweep], known: Sequence[Frame]) -> list[str]:
-    """A sentence where the LiDAR seems to see its own car."""
+def _own_returns(sweeps: Sequence[Sweep], frames: Sequence[Frame]) -> list[str]:
+    """Return a sentence if the LiDAR seems to see its own car.
+
+    frames: those of the sweeps, in the same order."""
     near = total = 0
-    for sweep, frame in zip(sweeps, known, strict=True):
+    for sweep, frame in zip(sweeps, frames, strict=True):
         if frame.cameras:
             total += len(sweep)
             distance = np.linalg.norm(sweep.points - _middle(frame), axis=1)
@@ -382,11 +396,13 @@ def _middle(frame: Frame) -> np.ndarray:
     return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
 
 
-def _top_deg(sweeps: Sequence[Sweep], known: Sequence[Frame]) -> float:
-    """About the elevation of the highest channel: that of nearly the steepest return, as seen from
-    the height of the cameras, for want of the sensor's own."""
+def _top_deg(sweeps: Sequence[Sweep], frames: Sequence[Frame]) -> float:
+    """Estimate the elevation of the LiDAR's highest channel, degrees.
+
+    It is that of nearly the steepest return. The sensor's height is not known, so elevations are
+    those seen from the height of the cameras."""
     rises = []
-    for sweep, frame in zip(sweeps, known, strict=True):
+    for sweep, frame in zip(sweeps, frames, strict=True):
         if not frame.cameras or not len(sweep):
             continue
         offset = sweep.points - _middle(frame)
@@ -419,13 +435,16 @@ _MAX_GAUSSIANS = 60_000
 _SHELL_SHARE = 2 / 3  # of them; the rest are ground and boxes
 _VOXEL_M = 0.15  # finer ground would only be a finer guess
 _SHELLS_M = 4.0 * 20.0 ** (np.arange(6) / 5)  # 4 m to 80 m, a factor of 1.8 apart
-_GROUND_REACH_M, _GROUND_STEP_M, _BOX_STEP_M = 40.0, 0.5, 0.15
-_MAX_VIEWS = 48
+_GROUND_REACH_M = 40.0  # the guessed ground ends this far from the path
+_GROUND_STEP_M = 0.5  # between points of the guessed ground
+_BOX_STEP_M = 0.15  # between points of a box's faces
+_MAX_VIEWS = 48  # images that shells are guessed from
 _DRIVEN_M = 1.6  # the car went through here: nothing stands there
-_MIN_CAMERA_HEIGHT_M = 0.1
+_MIN_CAMERA_HEIGHT_M = 0.1  # above the guessed ground; a lower camera is refused
 _ABOVE_GROUND_M = 0.2  # a ray that is lower at a shell has met the ground before
 _SHAPE = SplatShape(sigma_per_spacing=0.5, opacity=0.1)
-_IMAGE_SCALE, _SMALL_PX = 0.125, 64  # smaller images are read as they are
+_IMAGE_SCALE = 0.125  # at which images are read for the colours of shells
+_SMALL_PX = 64  # images with a shorter side are read at their own size
 _NEVER_NS = -(2**62)  # a time at which no object exists: these points belong to the static world
 
 
@@ -449,8 +468,7 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
 def read_recording(
     path: str, query: dict[str, str], options: DriveOptions
 ) -> tuple[RawDrive, Calibration]:
-    """The frames that the options ask for with their boxes and the LiDAR's sweeps, of which there
-    may be none."""
+    """Read the frames that the options ask for, with their boxes and LiDAR sweeps, if any."""
     root = Path(path)
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")
@@ -488,10 +506,10 @@ def read_objects(root: Path, frames: Sequence[Frame], origin: np.ndarray) -> Rec
     """The objects that the frames have boxes of, in the scene's world."""
     boxes = all_boxes(root)
     timed = (
-        TimedBoxes(f.index, found.boxes, f.timestamp_ns if times is None else times)
+        TimedBoxes(f.index, frame_boxes.boxes, f.timestamp_ns if times is None else times)
         for f in frames
-        if (found := boxes.get(f.index)) is not None
-        for times in [found.timestamps_ns]
+        if (frame_boxes := boxes.get(f.index)) is not None
+        for times in [frame_boxes.timestamps_ns]
     )
     return find_objects(timed, origin)
 
@@ -508,10 +526,10 @@ def _best_scene(
     if any(map(len, sweeps)):
         start += f": the scene starts from the points of {len(sweeps)} depth images"
         problems = (*drive.problems, *problems, start)
-        seen = dataclasses.replace(
+        depth_drive = dataclasses.replace(
             drive, sweeps=sweeps, lidar_top_deg=_DEPTH_TOP_DEG, problems=problems
         )
-        return scene_of_drive(seen, options)
+        return scene_of_drive(depth_drive, options)
     start += (
         f" and {root / 'depth'} no depth: the scene starts from a flat ground "
         f"{calibration.ego_above_ground_m:g} m below the ego origin, the labelled boxes, and "
@@ -525,7 +543,7 @@ def _best_scene(
         update={"voxel_m": max(_VOXEL_M, options.voxel_m), "max_gaussians": budget - len(shells)}
     )
     objects = read_objects(root, drive.frames, drive.world_origin_m)
-    guessed = dataclasses.replace(
+    guessed_drive = dataclasses.replace(
         drive,
         sweeps=guess_surfaces(road, objects.moving, objects.still),
         lidar_top_deg=_SKY_ABOVE_DEG,
@@ -533,13 +551,14 @@ def _best_scene(
     )
     # Whatever is found in the guessed surfaces is the height they were given.
     ground = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
-    return scene_of_drive(guessed, coarse, added=shells, ground=ground)
+    return scene_of_drive(guessed_drive, coarse, added=shells, ground=ground)
 
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
     """One sweep for each depth image of the frames' cameras, and a sentence for each image that
     cannot be used. Each point has its camera's time."""
-    sweeps, problems = [], []
+    sweeps = []
+    problems = []
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
     files = {n: numbered_files(root, f"depth/{folder_name(n)}", (".png",)) for n in names}
     for frame in frames:
@@ -571,7 +590,8 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
     usable[:, 1:-1] &= _is_straight(inverse[:, :-2], inverse[:, 1:-1], inverse[:, 2:])
     step = max(1, math.ceil(math.sqrt(depth_m.size / _POINTS_PER_IMAGE)))
     rows, columns = np.nonzero(usable[step // 2 :: step, step // 2 :: step])
-    rows, columns = rows * step + step // 2, columns * step + step // 2
+    rows = rows * step + step // 2
+    columns = columns * step + step // 2
     z = depth_m[rows, columns].astype(np.float64)
     local = np.stack(
         [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
@@ -581,8 +601,8 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
     return Sweep.of_unknown_class(local @ pose[:3, :3].T + pose[:3, 3], camera.timestamp_ns)
 
 
-def _is_straight(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:
-    return np.abs(before + after - 2 * here) <= _BENT * here
+def _is_straight(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
+    return np.abs(before + after - 2 * middle) <= _BENT * middle
 
 
 def ground_heights(frames: Sequence[Frame], ego_above_ground_m: float) -> np.ndarray:
@@ -609,11 +629,11 @@ def guess_surfaces(
 ) -> tuple[Sweep, ...]:
     """Points on the ground around the path (road: float64 [F, 3], the nearest pose's height counts)
     and on the sides and tops of all boxes."""
-    once = {box.object_id: box for box in reversed(moving)}
-    things = [(_ground(road), _NEVER_NS)]
-    things += [(_box_surface(box), _NEVER_NS) for box in still]
-    things += [(_box_surface(box), box.timestamp_ns) for box in once.values()]
-    return tuple(Sweep.of_unknown_class(*thing) for thing in things)
+    box_of_object = {box.object_id: box for box in reversed(moving)}
+    point_sets = [(_ground(road), _NEVER_NS)]
+    point_sets += [(_box_surface(box), _NEVER_NS) for box in still]
+    point_sets += [(_box_surface(box), box.timestamp_ns) for box in box_of_object.values()]
+    return tuple(Sweep.of_unknown_class(*point_set) for point_set in point_sets)
 
 
 def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussians:
@@ -650,16 +670,17 @@ def _box_surface(box: BoxSample) -> np.ndarray:
     half = box.size_m / 2
     faces = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1), (2, 1)):
-        others = [other for other in range(3) if other != axis]
-        counts = [max(2, int(np.ceil(2 * half[o] / _BOX_STEP_M)) + 1) for o in others]
+        side_axes = [side for side in range(3) if side != axis]
+        counts = [max(2, int(np.ceil(2 * half[side] / _BOX_STEP_M)) + 1) for side in side_axes]
         ticks = [
-            np.linspace(-half[o], half[o], min(count, 200))
-            for o, count in zip(others, counts, strict=True)
+            np.linspace(-half[side], half[side], min(count, 200))
+            for side, count in zip(side_axes, counts, strict=True)
         ]
         a, b = np.meshgrid(*ticks)
         face = np.empty((a.size, 3))
         face[:, axis] = sign * half[axis]
-        face[:, others[0]], face[:, others[1]] = a.ravel(), b.ravel()
+        face[:, side_axes[0]] = a.ravel()
+        face[:, side_axes[1]] = b.ravel()
         faces.append(face)
     local = np.concatenate(faces)
     return local @ box.world_from_box[:3, :3].T + box.world_from_box[:3, 3]
@@ -698,5 +719,5 @@ def _facing(
     major = np.cross(up, normals)
     major /= np.linalg.norm(major, axis=1, keepdims=True)
     surfels = Surfels.discs(points, normals, major, spacing)
-    unknown = np.full(len(points), SemanticClass.UNKNOWN, np.int16)
-    return gaussians_from_surfels(surfels, colours.astype(np.float32), unknown, _SHAPE)
+    semantic = np.full(len(points), SemanticClass.UNKNOWN, np.int16)
+    return gaussians_from_surfels(surfels, colours.astype(np.float32), semantic, _SHAPE)

@@ -56,17 +56,17 @@ def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int
     where = root / folder
     if not where.is_dir():
         return {}
-    found: dict[int, Path] = {}
+    paths: dict[int, Path] = {}
     for path in sorted(where.iterdir()):
         if path.suffix.lower() not in suffixes or not re.fullmatch(r"[0-9]{1,18}", path.stem):
             continue
         number = int(path.stem)
-        if number in found:
+        if number in paths:
             raise AdapterError(
-                f"{found[number]} and {path} are both of frame {number}; delete one of them"
+                f"{paths[number]} and {path} are both of frame {number}; delete one of them"
             )
-        found[number] = inside(root, path)
-    return found
+        paths[number] = inside(root, path)
+    return paths
 
 
 def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
@@ -75,9 +75,11 @@ def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
 
 
 def inside(root: Path, path: Path) -> Path:
-    """The path itself, refused where a link leads out of `root`: a folder from elsewhere must not
-    make this machine read its other files."""
-    real, real_root = path.resolve(), root.resolve()
+    """Return the path; raise AdapterError where a link in it leads out of `root`.
+
+    A folder from elsewhere must not make this machine read its other files."""
+    real = path.resolve()
+    real_root = root.resolve()
     if not real.is_relative_to(real_root):
         raise AdapterError(
             f"{path} leads through a link to {real}, outside {real_root}; put the files themselves "
@@ -103,8 +105,10 @@ def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...],
         if files[name] and (camera := frame.cameras.get(name))
     ]
     images = usable_images(pictures, every_camera=False)
-    found = (dataclasses.replace(f, image_paths=images.paths.get(f.index, {})) for f in frames)
-    return tuple(found), (*problems, *images.problems)
+    frames_with_images = (
+        dataclasses.replace(f, image_paths=images.paths.get(f.index, {})) for f in frames
+    )
+    return tuple(frames_with_images), (*problems, *images.problems)
 
 
 def unlisted_images(root: Path, frames: Sequence[Frame]) -> tuple[str, ...]:
@@ -167,19 +171,19 @@ def _classes(names: Any) -> Mapping[int, int] | None:
     meanings = {member.name.lower(): int(member) for member in SemanticClass}
     meanings["none"] = NO_SURFACE
     try:
-        known = {int(number): meanings[str(name).lower()] for number, name in names.items()}
-        np.array([*known], np.int64)
+        classes = {int(number): meanings[str(name).lower()] for number, name in names.items()}
+        np.array([*classes], np.int64)
     except (AttributeError, ValueError, KeyError, OverflowError) as error:
         text = f"must map class numbers to {', '.join(meanings)} ({error!r:.80})"
         raise ValueError(text) from None
-    return known
+    return classes
 
 
 _Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
 
 
 class _CameraEntry(BaseModel):
-    """timestamp_ns: the frame's where there is none."""
+    """One camera in one frame of calibration.json. timestamp_ns: the frame's where it is None."""
 
     width: _Pixels
     height: _Pixels
@@ -271,16 +275,21 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
             if not isinstance(entry, dict) or not isinstance(entry.get("cameras"), dict):
                 raise AdapterError(f"{block}: each of 'frames' must be an object with cameras")
             number = entry.get("frame")
-            known = frames.get(number) if isinstance(number, int) else None
-            if known is None:
+            earlier_entry = frames.get(number) if isinstance(number, int) else None
+            if earlier_entry is None:
                 frames[number if isinstance(number, int) else repr(number)] = entry
                 continue
-            if any(known.get(key) != entry.get(key) for key in ("timestamp_ns", "world_from_ego")):
+            if any(
+                earlier_entry.get(key) != entry.get(key)
+                for key in ("timestamp_ns", "world_from_ego")
+            ):
                 raise AdapterError(
                     f"{block}: frame {number} has another time or ego pose than in the files "
                     f"before it; the folder holds blocks of different recordings"
                 )
-            frames[number] = known | {"cameras": known["cameras"] | entry["cameras"]}
+            frames[number] = earlier_entry | {
+                "cameras": earlier_entry["cameras"] | entry["cameras"]
+            }
     return blocks[0].parent, parts[0] | {"frames": list(frames.values())}
 
 
@@ -290,15 +299,15 @@ def _frame(path: Path, content: Any) -> Frame:
     entry = validated(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
     for name, values in entry.cameras.items():
-        own = f"{where}, camera {name!r:.80}"
-        camera = validated(_CameraEntry, values, own, hint=_HINT)
+        camera_where = f"{where}, camera {name!r:.80}"
+        camera = validated(_CameraEntry, values, camera_where, hint=_HINT)
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns
         try:
             cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
         except ValueError as error:
-            raise AdapterError(f"{own}: {error}") from None
+            raise AdapterError(f"{camera_where}: {error}") from None
     try:
         return Frame(entry.frame, entry.timestamp_ns, entry.world_from_ego, cameras)
     except SceneError as error:
@@ -310,14 +319,14 @@ def _recentred(frame: Frame, origin: np.ndarray) -> Frame:
     world_from_ego[:3, 3] -= torch.from_numpy(origin)
     cameras = {}
     for name, camera in frame.cameras.items():
-        moved = camera.camera_from_world.clone()
-        moved[:3, 3] += moved[:3, :3] @ torch.from_numpy(origin)
-        cameras[name] = dataclasses.replace(camera, camera_from_world=moved)
+        camera_from_scene = camera.camera_from_world.clone()
+        camera_from_scene[:3, 3] += camera_from_scene[:3, :3] @ torch.from_numpy(origin)
+        cameras[name] = dataclasses.replace(camera, camera_from_world=camera_from_scene)
     return dataclasses.replace(frame, world_from_ego=world_from_ego, cameras=cameras)
 
 
 def _name(content: Mapping[str, Any], root: Path) -> str:
-    """What a job named its scene and variant, else the folder's name."""
+    """Return the recording's name: a job's names of scene and variant, else the folder's name."""
     parts = [content.get("scene"), content.get("variant")]
-    given = [part for part in parts if isinstance(part, str) and part]
-    return "-".join(given) if given else root.resolve().name
+    names = [part for part in parts if isinstance(part, str) and part]
+    return "-".join(names) if names else root.resolve().name

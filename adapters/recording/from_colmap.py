@@ -34,17 +34,23 @@ from augment.jobs.files import encode_depth
 CAMERA = "camera"  # of images that lie in no folder of their own
 _JPEG_QUALITY = 97
 _MAX_ERROR_PX = 2.0  # of a point's reprojection
-# The road: heights of its points stray by this part of their distance from the cameras.
-_ON_ROAD, _MAX_TILT_DEG, _MIN_ON_ROAD = 0.01, 8.0, 30
+_ON_ROAD = 0.01  # heights of the road's points stray by this part of their distance
+_MAX_TILT_DEG = 8.0  # of the road against the cameras' level
+_MIN_ON_ROAD = 30  # points that a road needs
 _MAX_RESIDUAL = 0.1  # of the cameras' height
-_TRIES, _MOST_POINTS, _SEED = 2000, 20_000, 20260101
-_MIN_PATH_HEIGHTS = 2.0
+_TRIES = 2000  # planes that are tried
+_MOST_POINTS = 20_000  # low points that planes are tried on
+_SEED = 20260101  # of the choice of points and planes
+_MIN_PATH_HEIGHTS = 2.0  # extent of the cameras' path over their height above the road
 _LOW_DEG = 3.0  # points that are seen further below the horizon may be the road's
 # Depth between points: across triangles whose corners are this near in pixels of the width, and in
 # depth; where the cameras drove, the road itself has points.
-_MAX_EDGE, _MAX_RATIO = 1 / 6, 1.5
-_LANE_M, _LANE_STEP_M, _LANE_REACH_M = 1.0, 0.5, 30.0
-_EARTH_M = 6_378_137.0
+_MAX_EDGE = 1 / 6  # of a triangle, over the image's width
+_MAX_RATIO = 1.5  # of the depths at a triangle's corners
+_LANE_M = 1.0  # half the width of the lane that the cameras drove
+_LANE_STEP_M = 0.5  # between points of the lane
+_LANE_REACH_M = 30.0  # a camera uses points of the lane up to here; it ends half of this ahead
+_EARTH_M = 6_378_137.0  # radius at the equator, WGS 84
 _MIN_PATH_M = 5.0  # GPS is wrong by metres
 
 
@@ -75,8 +81,11 @@ class Road(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What was written. metres: in a unit of the model; None where that is not known. left_out:
-    images of the folder that have no pose."""
+    """Summary of a recording that `record_colmap` wrote.
+
+    frames, images: how many it has. left_out: how many images of the folder have no pose. metres:
+    length of the model's unit, None where that is not known. residual_m: median distance of the
+    cameras from their given positions, None without positions."""
 
     frames: int
     images: int
@@ -110,10 +119,13 @@ def record_colmap(
     road = find_road(shots)
     _check_path(shots, road, model)
     metres = None if camera_height_m is None else camera_height_m / road.height
-    world_from_model, residual_m = _levelled(shots[0], road), None
+    world_from_model = _levelled(shots[0], road)
+    residual_m = None
     if positions is not None:
-        known = read_positions(positions)
-        turn, measured, residual_m = _fit_positions(shots, world_from_model, known, positions)
+        position_of_image = read_positions(positions)
+        turn, measured, residual_m = _fit_positions(
+            shots, world_from_model, position_of_image, positions
+        )
         world_from_model = turn @ world_from_model
         metres = measured if metres is None else metres
     scale = 1.0 if metres is None else metres
@@ -141,8 +153,8 @@ def record_colmap(
         "frames": [frames[number] for number in sorted(frames)],
     }
     (out / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
-    there = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in images.rglob("*"))
-    return Recorded(len(frames), len(shots), there - len(shots), road, metres, residual_m)
+    num_files = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in images.rglob("*"))
+    return Recorded(len(frames), len(shots), num_files - len(shots), road, metres, residual_m)
 
 
 # ---- The model -----------------------------------------------------------------------------------
@@ -150,13 +162,13 @@ def record_colmap(
 
 def read_shots(model: Path) -> list[Shot]:
     """The images that have poses, by frame and camera."""
-    found = find_colmap_model(model)
-    if found is None:
+    model_dir = find_colmap_model(model)
+    if model_dir is None:
         raise AdapterError(
             f"{model} holds no COLMAP model: expected cameras, images and points3D, .bin or .txt, "
             f"in it or in sparse/0"
         )
-    reconstruction = open_colmap_model(found)
+    reconstruction = open_colmap_model(model_dir)
     points = {
         number: np.asarray(point.xyz)
         for number, point in reconstruction.points3D.items()
@@ -169,24 +181,24 @@ def read_shots(model: Path) -> list[Shot]:
         digits = re.search(r"(\d{1,15})\D*$", Path(image.name).stem)
         if digits is None:
             raise AdapterError(
-                f"{found}: image {image.name} has no frame number; name images as 000001.jpg"
+                f"{model_dir}: image {image.name} has no frame number; name images as 000001.jpg"
             )
         camera = re.sub(r"[^\w.-]", "-", Path(image.name).parent.as_posix().replace("/", "-"))
         camera = CAMERA if camera == "." else camera
         ids = [p.point3D_id for p in image.points2D if p.has_point3D()]
-        seen = [points[number] for number in ids if number in points]
+        shown_points = [points[number] for number in ids if number in points]
         key = int(digits[1]), camera
         if key in shots:
             raise AdapterError(
-                f"{found}: {shots[key].name} and {image.name} are both frame {key[0]} of camera "
-                f"{camera}; give each camera a folder of its own"
+                f"{model_dir}: {shots[key].name} and {image.name} are both frame {key[0]} of "
+                f"camera {camera}; give each camera a folder of its own"
             )
         pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         lens = reconstruction.cameras[image.camera_id]
-        where = np.array(seen).reshape(-1, 3)
-        shots[key] = Shot(image.name, camera, key[0], lens, invert_pose(pose), where)
+        shot_points = np.array(shown_points).reshape(-1, 3)
+        shots[key] = Shot(image.name, camera, key[0], lens, invert_pose(pose), shot_points)
     if not shots:
-        raise AdapterError(f"{found}: no image of this model has a pose")
+        raise AdapterError(f"{model_dir}: no image of this model has a pose")
     return [shots[key] for key in sorted(shots)]
 
 
@@ -208,7 +220,8 @@ def find_road(shots: Sequence[Shot]) -> Road:
     if len(points) > _MOST_POINTS:
         points = points[np.sort(rng.choice(len(points), _MOST_POINTS, replace=False))]
     far = np.linalg.norm(points - centres.mean(axis=0), axis=1)
-    best, road = 0, None
+    best_score = 0
+    best_plane = None
     for _ in range(_TRIES if len(points) >= _MIN_ON_ROAD else 0):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         plane = _plane_under(np.cross(b - a, c - a), a, centres, up)
@@ -216,37 +229,43 @@ def find_road(shots: Sequence[Shot]) -> Road:
             continue
         heights = (points @ plane[0] + plane[1]) / far
         score = int((np.abs(heights) < _ON_ROAD).sum()) - 2 * int((heights < -3 * _ON_ROAD).sum())
-        if score > best:
-            best, road = score, plane
-    for _ in range(3 if road is not None else 0):
-        assert road is not None
-        own = points[np.abs(points @ road[0] + road[1]) < _ON_ROAD * far]
-        normal = np.linalg.svd(own - own.mean(axis=0))[2][2] if len(own) > 2 else road[0]
-        road = _plane_under(normal, own.mean(axis=0), centres, up) or road
-    if road is None or best < _MIN_ON_ROAD:
+        if score > best_score:
+            best_score = score
+            best_plane = plane
+    for _ in range(3 if best_plane is not None else 0):
+        assert best_plane is not None
+        road_points = points[np.abs(points @ best_plane[0] + best_plane[1]) < _ON_ROAD * far]
+        normal = (
+            np.linalg.svd(road_points - road_points.mean(axis=0))[2][2]
+            if len(road_points) > 2
+            else best_plane[0]
+        )
+        best_plane = _plane_under(normal, road_points.mean(axis=0), centres, up) or best_plane
+    if best_plane is None or best_score < _MIN_ON_ROAD:
         raise AdapterError(
-            f"no road is seen under the cameras: at most {max(best, 0)} of {len(points)} low "
+            f"no road is seen under the cameras: at most {max(best_score, 0)} of {len(points)} low "
             f"points lie on one plane within {_MAX_TILT_DEG:.0f} degrees of the cameras' level; "
             f"{_MIN_ON_ROAD} are needed. Film with the road in view, hold the camera level, take "
             f"more frames"
         )
-    distance = np.abs(points @ road[0] + road[1])
-    own = distance[distance < _ON_ROAD * far]
-    found = Road(*road, len(own), float(np.median(own)) / road[2])
-    if found.residual > _MAX_RESIDUAL:
+    distance = np.abs(points @ best_plane[0] + best_plane[1])
+    road_distance = distance[distance < _ON_ROAD * far]
+    road = Road(*best_plane, len(road_distance), float(np.median(road_distance)) / best_plane[2])
+    if road.residual > _MAX_RESIDUAL:
         raise AdapterError(
-            f"no road is clear under the cameras: {found.points} points of the best plane stray "
-            f"from it by {100 * found.residual:.0f} % of the cameras' height (median; at most "
+            f"no road is clear under the cameras: {road.points} points of the best plane stray "
+            f"from it by {100 * road.residual:.0f} % of the cameras' height (median; at most "
             f"{100 * _MAX_RESIDUAL:.0f}). Film with more of the road in view, take more frames"
         )
-    return found
+    return road
 
 
 def _plane_under(
     normal: np.ndarray, point: np.ndarray, centres: np.ndarray, up: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
-    """The plane through a point with its normal upwards, and the cameras' median height over it;
-    None where it is too steep or above a camera."""
+    """Return the unit normal and offset of a plane, and the cameras' median height over it.
+
+    The normal points upwards. Returns None where the plane is too steep or above a camera."""
     length = np.linalg.norm(normal)
     if length == 0:
         return None
@@ -320,41 +339,46 @@ def read_positions(path: Path) -> dict[str, np.ndarray]:
         csv.DictReader(io.StringIO(read_text(path, if_missing="give a table of positions")))
     )
     names = set(rows[0]) if rows else set()
-    wanted = next((c for c in (("lat", "lon"), ("x", "y")) if {"image", *c} <= names), None)
-    if wanted is None:
+    columns = next((c for c in (("lat", "lon"), ("x", "y")) if {"image", *c} <= names), None)
+    if columns is None:
         raise AdapterError(
             f"{path} must be a table with the columns image, lat, lon or image, x, y, separated by "
             f"commas; it has {sorted(map(str, names))[:10]}"
         )
-    found: dict[str, np.ndarray] = {}
+    positions: dict[str, np.ndarray] = {}
     for number, row in enumerate(rows, start=2):
         try:
-            value = np.array([float(row[name]) for name in wanted])
+            value = np.array([float(row[name]) for name in columns])
         except (TypeError, ValueError):
             value = np.full(2, np.nan)
         if not (np.abs(value) <= LARGEST).all():
             raise AdapterError(
-                f"{path}, line {number}: {', '.join(wanted)} must be numbers; got {row}"
+                f"{path}, line {number}: {', '.join(columns)} must be numbers; got {row}"
             )
-        found[str(row["image"])] = value
-    if wanted == ("x", "y"):
-        return found
-    first = next(iter(found.values()))
+        positions[str(row["image"])] = value
+    if columns == ("x", "y"):
+        return positions
+    first = next(iter(positions.values()))
     east = np.cos(np.radians(first[0]))
     scale = np.radians(1.0) * _EARTH_M
-    return {n: scale * (v - first)[::-1] * [east, 1.0] for n, v in found.items()}
+    return {n: scale * (v - first)[::-1] * [east, 1.0] for n, v in positions.items()}
 
 
 def _fit_positions(
-    shots: Sequence[Shot], world_from_model: np.ndarray, known: Mapping[str, np.ndarray], path: Path
+    shots: Sequence[Shot],
+    world_from_model: np.ndarray,
+    positions: Mapping[str, np.ndarray],
+    path: Path,
 ) -> tuple[np.ndarray, float, float]:
-    """The turn about z that lays the cameras' path on the positions, metres per unit, and how far
-    apart they are then (median, metres)."""
+    """Fit the cameras' path to the positions.
+
+    Returns the rotation about z, [4, 4]; metres per unit of the model; and the median distance of
+    the fitted path from the positions, metres. path: of the table, for messages."""
     pairs = [
-        ((world_from_model @ shot.model_from_camera)[:2, 3], known[name])
+        ((world_from_model @ shot.model_from_camera)[:2, 3], positions[name])
         for shot in shots
-        for name in (shot.name, Path(shot.name).name)[: 1 if shot.name in known else 2]
-        if name in known
+        for name in (shot.name, Path(shot.name).name)[: 1 if shot.name in positions else 2]
+        if name in positions
     ]
     model, metres = (np.array([p[i] for p in pairs]).reshape(-1, 2) for i in (0, 1))
     spread = float(np.linalg.norm(np.ptp(metres, axis=0))) if len(pairs) else 0.0
@@ -382,11 +406,14 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
     source = inside(images, shot.name, "the model")
     target = out / "images" / shot.camera / f"{shot.frame:06d}.jpg"
     target.parent.mkdir(parents=True, exist_ok=True)
-    lens, plain = shot.lens, shot.lens
+    lens = shot.lens
+    pinhole = shot.lens
     if not lens.is_undistorted():
-        plain = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
-    fx, fy = plain.focal_length_x, plain.focal_length_y
-    cx, cy = plain.principal_point_x, plain.principal_point_y
+        pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    fx = pinhole.focal_length_x
+    fy = pinhole.focal_length_y
+    cx = pinhole.principal_point_x
+    cy = pinhole.principal_point_y
     image = decode_image(source, cv2.IMREAD_COLOR)
     if image is None or image.shape[:2] != (lens.height, lens.width):
         got = "no image" if image is None else f"{image.shape[1]}x{image.shape[0]} pixels"
@@ -399,14 +426,16 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
     if lens.is_undistorted() and source.suffix.lower() in (".jpg", ".jpeg"):
         shutil.copyfile(source, target)
     else:
-        u, v = np.meshgrid(np.arange(plain.width) + 0.5, np.arange(plain.height) + 0.5)
+        u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
         rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1)
         # OpenCV has whole numbers at the middle of pixels, COLMAP at their corners.
-        at = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*u.shape, 2).astype(np.float32) - 0.5
-        image = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        lens_px = (
+            lens.img_from_cam(rays.reshape(-1, 3)).reshape(*u.shape, 2).astype(np.float32) - 0.5
+        )
+        image = cv2.remap(image, lens_px[..., 0], lens_px[..., 1], cv2.INTER_LINEAR)
         flags = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         target.write_bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
-    size = {"width": int(plain.width), "height": int(plain.height)}
+    size = {"width": int(pinhole.width), "height": int(pinhole.height)}
     return size | {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
 
 
@@ -428,28 +457,32 @@ def _write_depth(
     points: np.ndarray,
     lane: np.ndarray,
 ) -> None:
-    """Depth between the points that the image shows and the lane, where neighbours are near."""
-    centre, turn = world_from_camera[:3, 3], world_from_camera[:3, :3]
+    """Write the depth image of a shot: interpolated in triangles between near points.
+
+    points: those that the image shows, world. lane: points of the road, world."""
+    centre = world_from_camera[:3, 3]
+    turn = world_from_camera[:3, :3]
     near = lane[np.linalg.norm(lane - centre, axis=1) < _LANE_REACH_M]
     local = (np.concatenate([points, near]) - centre) @ turn
     local = local[local[:, 2] > 0.1]
     uv = local[:, :2] / local[:, 2:] * [lens["fx"], lens["fy"]] + [lens["cx"], lens["cy"]]
     size = np.array([lens["width"], lens["height"]])
-    shown = ((uv > 0) & (uv < size)).all(axis=1)
-    uv, inverse = uv[shown], 1 / local[shown, 2]
+    is_in_image = ((uv > 0) & (uv < size)).all(axis=1)
+    uv = uv[is_in_image]
+    inverse = 1 / local[is_in_image, 2]
     if len(np.unique(uv.round(), axis=0)) < 4:
         return
-    between = LinearNDInterpolator(uv, inverse, fill_value=0.0)
-    corners = between.tri.simplices
+    interpolator = LinearNDInterpolator(uv, inverse, fill_value=0.0)
+    corners = interpolator.tri.simplices
     edges = np.linalg.norm(uv[corners] - uv[np.roll(corners, 1, axis=1)], axis=2).max(axis=1)
     ratio = inverse[corners].max(axis=1) / inverse[corners].min(axis=1)
-    known = (edges < _MAX_EDGE * size[0]) & (ratio < _MAX_RATIO)
+    is_small = (edges < _MAX_EDGE * size[0]) & (ratio < _MAX_RATIO)
     u, v = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    triangle = between.tri.find_simplex(pixels)
-    is_known = (triangle >= 0) & known[triangle]
+    triangle = interpolator.tri.find_simplex(pixels)
+    is_known = (triangle >= 0) & is_small[triangle]
     depth = np.zeros(len(pixels), np.float32)
-    depth[is_known] = 1 / between(pixels[is_known])
+    depth[is_known] = 1 / interpolator(pixels[is_known])
     path = out / "depth" / shot.camera / f"{shot.frame:06d}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_depth(depth.reshape(size[1], size[0])))

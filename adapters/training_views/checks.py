@@ -38,18 +38,18 @@ from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 
 _WIDTH = 480  # columns of the images compared, at most
-_REACH_DEG = 1.2
+_REACH_DEG = 1.2  # largest shift that is searched, to each side
 _NEAR_M = 8.0  # nearer returns shift with the camera's position and time, not only its rotation
-_BINS = 16
-_MAX_POINTS = 60_000
-_MIN_POINTS = 3000
+_BINS = 16  # of intensity and of grey value, equally filled
+_MAX_POINTS = 60_000  # returns that are compared with the images, over all views
+_MIN_POINTS = 3000  # returns in all views together; fewer measure no shift
 _CONTRAST = 0.1  # how much the best shift must stand out
 _AGREE_PX = 0.75  # between the measurement in every other frame and the rest
 _ALONE_PX = 2.0  # a single frame says less, and less exactly
-_STEPS_S = np.arange(-5, 6) * 0.010
+_STEPS_S = np.arange(-5, 6) * 0.010  # time offsets that are compared
 _TIMING_NEAR_M = 3.0  # near returns shift most with time
-_MIN_SPEED_MPS = 1.0
-_EVERY = 3  # return is enough
+_MIN_SPEED_MPS = 1.0  # of the camera; a slower one shows no time
+_RETURN_STRIDE = 3  # returns from one that is compared to the next
 _TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
 _MAX_TIME_OFFSET_S = 0.030  # rolling shutters alone make 10 to 20 ms
 _MAX_SHIFT_DEG = 0.35  # a pixel at 480 columns is up to 0.25
@@ -59,14 +59,16 @@ _JUMP_STOPS = 0.4  # a third more or less light
 _JUMP_TIMES = 5.0  # this many times the camera's usual change
 _BLOCKS = (32, 18)  # columns and rows of the means that are compared
 _MAX_NAMED = 3  # jumps of a camera that are named one by one
-_INTENSITY, _SENSOR = ("intensity", "i"), ("sensor", "d")
+_INTENSITY = ("intensity", "i")  # names that a sweep's column of intensities may have
+_SENSOR = ("sensor", "d")  # names that a sweep's column of sensor numbers may have
 
 
 @dataclass(frozen=True)
 class CameraOffset:
-    """Where a camera's images lie beside the LiDAR's returns, pixels at `width_px` columns.
-    is_sure: the shift stands out, lies within the range searched, and two halves of the frames
-    agree."""
+    """Shift of one camera's images against the LiDAR's returns.
+
+    right_px, down_px: pixels of an image of `width_px` columns. is_sure: the shift stands out, lies
+    within the range searched, and two halves of the frames agree."""
 
     camera: str
     right_px: float
@@ -108,25 +110,28 @@ class Points(NamedTuple):
 def measure_offset(
     returns: Mapping[int, Returns], views: RecordedViews, cameras: Mapping[ViewKey, Camera]
 ) -> CameraOffset | None:
-    """The shift of one camera's images; None if fewer than 3000 returns (by frame) are seen.
-    cameras: the views to compare, at any resolution."""
+    """Return the shift of one camera's images; None if they show fewer than 3000 returns.
+
+    returns: by frame. cameras: the views to compare, at any resolution."""
     camera = _compared(next(iter(cameras.values())))
     reach = min(max(round(math.radians(_REACH_DEG) * camera.fx), 4), 16)
-    seen = project_returns(returns, views, cameras, reach=reach, near_m=_NEAR_M)
-    if sum(len(points.rows) for points in seen) < _MIN_POINTS:
+    points_by_view = project_returns(returns, views, cameras, reach=reach, near_m=_NEAR_M)
+    if sum(len(points.rows) for points in points_by_view) < _MIN_POINTS:
         return None
-    score = shared_information(seen, reach)
+    score = shared_information(points_by_view, reach)
     right, down = _peak(score)
 
-    def apart(some: Sequence[Points]) -> float:
-        other = _peak(shared_information(some, reach))
-        return math.hypot(right - other[0], down - other[1])
+    def shift_distance_px(points_of_views: Sequence[Points]) -> float:
+        shift = _peak(shared_information(points_of_views, reach))
+        return math.hypot(right - shift[0], down - shift[1])
 
-    halves = [apart(half) for half in (seen[::2], seen[1::2]) if half]
+    halves = [
+        shift_distance_px(half) for half in (points_by_view[::2], points_by_view[1::2]) if half
+    ]
     # Repeated shapes can look shifted to all frames together, but not to most of them one by one.
-    near = [apart([points]) < _ALONE_PX for points in seen]
+    agrees = [shift_distance_px([points]) < _ALONE_PX for points in points_by_view]
     contrast = float(score.max() / max(float(np.median(score)), 1e-12) - 1)
-    inside = max(abs(right), abs(down)) < reach - 0.5
+    is_inside = max(abs(right), abs(down)) < reach - 0.5
     return CameraOffset(
         camera=camera.name,
         right_px=right,
@@ -136,8 +141,8 @@ def measure_offset(
         # At the border of the range the shift is at least as large as that.
         is_sure=contrast > _CONTRAST
         and len(halves) == 2
-        and (max(halves) < _AGREE_PX or not inside)
-        and 2 * sum(near) >= len(near),
+        and (max(halves) < _AGREE_PX or not is_inside)
+        and 2 * sum(agrees) >= len(agrees),
     )
 
 
@@ -146,8 +151,9 @@ def _compared(camera: Camera) -> Camera:
 
 
 def read_intensities(scene: Scene, frames: Iterable[int]) -> dict[int, Returns]:
-    """The returns of each frame's sweep, of the sensor that has most; frames without intensity
-    left out."""
+    """Return the returns of each frame's sweep, from the sensor that has most of them.
+
+    Frames without intensity are left out."""
     out: dict[int, Returns] = {}
     for frame in dict.fromkeys(frames):
         sweep = scene.lidar(frame)
@@ -176,8 +182,10 @@ def project_returns(
     reach: int,
     near_m: float,
 ) -> list[Points]:
-    """The returns beyond near_m that each view's camera sees, with its image; views of frames
-    without returns are left out. reach: pixels from the image's border that are left out."""
+    """Return, for each view, its grey image and the returns beyond near_m that its camera sees.
+
+    Views of frames without returns are left out. reach: pixels from the image's border that are
+    left out."""
     out = []
     for key, camera in cameras.items():
         if key.frame not in returns:
@@ -186,22 +194,25 @@ def project_returns(
         grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
         grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         points, intensity = returns[key.frame]
-        seen, index = project_points(points, camera, near_m=near_m, margin_px=reach)
-        front = visible(seen, camera)
-        rows, columns = np.divmod(seen.pixels[front], camera.width)
-        out.append(Points(columns, rows, intensity[index[front]], grey))
+        depth_pixels, index = project_points(points, camera, near_m=near_m, margin_px=reach)
+        is_visible = visible(depth_pixels, camera)
+        rows, columns = np.divmod(depth_pixels.pixels[is_visible], camera.width)
+        out.append(Points(columns, rows, intensity[index[is_visible]], grey))
     return out
 
 
-def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
-    """Mutual information of intensity and grey value over their joint entropy for each shift,
-    float64 [2 reach + 1, 2 reach + 1], rows of downward shifts."""
-    stride = max(1, -(-sum(len(points.rows) for points in seen) // _MAX_POINTS))
-    columns = np.concatenate([p.columns[::stride] for p in seen])
-    rows = np.concatenate([p.rows[::stride] for p in seen])
-    intensity = np.concatenate([p.intensity[::stride] for p in seen])
-    images = np.repeat(np.arange(len(seen)), [len(p.rows[::stride]) for p in seen])
-    grey = _stacked([points.grey for points in seen])
+def shared_information(points_by_view: Sequence[Points], reach: int) -> np.ndarray:
+    """Return the mutual information of intensity and grey value, over their joint entropy.
+
+    float64 [2 reach + 1, 2 reach + 1], one value for each shift; rows are downward shifts."""
+    stride = max(1, -(-sum(len(points.rows) for points in points_by_view) // _MAX_POINTS))
+    columns = np.concatenate([p.columns[::stride] for p in points_by_view])
+    rows = np.concatenate([p.rows[::stride] for p in points_by_view])
+    intensity = np.concatenate([p.intensity[::stride] for p in points_by_view])
+    images = np.repeat(
+        np.arange(len(points_by_view)), [len(p.rows[::stride]) for p in points_by_view]
+    )
+    grey = _stacked([points.grey for points in points_by_view])
     ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
     a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
     bins = np.quantile(grey[images, rows, columns], ranks)
@@ -236,7 +247,8 @@ def _peak(score: np.ndarray) -> tuple[float, float]:
     """Shift to the right and down of the highest score, to fractions of a pixel by parabolas."""
     reach = len(score) // 2
     i, j = np.unravel_index(int(score.argmax()), score.shape)
-    down, right = float(i) - reach, float(j) - reach
+    down = float(i) - reach
+    right = float(j) - reach
     if 0 < i < 2 * reach:
         down += _vertex(score[i - 1, j], score[i, j], score[i + 1, j])
     if 0 < j < 2 * reach:
@@ -244,8 +256,8 @@ def _peak(score: np.ndarray) -> tuple[float, float]:
     return right, down
 
 
-def _vertex(before: float, here: float, after: float) -> float:
-    bend = before - 2 * here + after
+def _vertex(before: float, middle: float, after: float) -> float:
+    bend = before - 2 * middle + after
     return 0.0 if bend == 0 else float(0.5 * (before - after) / bend)
 
 
@@ -271,17 +283,18 @@ def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera
     path: the same camera over time, in order, this one among them."""
     times = [other.timestamp_ns for other in path]
     place = times.index(camera.timestamp_ns)
-    before, after = path[max(place - 1, 0)], path[min(place + 1, len(path) - 1)]
+    before = path[max(place - 1, 0)]
+    after = path[min(place + 1, len(path) - 1)]
     span_s = (after.timestamp_ns - before.timestamp_ns) * 1e-9
     if span_s <= 0 or offset_s == 0:
         return camera
     part = torch.tensor(offset_s / span_s, dtype=torch.float64)
     turn = after.world_from_camera[:3, :3] @ before.world_from_camera[:3, :3].T
-    still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-    turned = slerp(still, quat_from_rotmat(turn), part)
-    now = quat_from_rotmat(camera.world_from_camera[:3, :3])
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    part_turn = slerp(identity, quat_from_rotmat(turn), part)
+    camera_quat = quat_from_rotmat(camera.world_from_camera[:3, :3])
     pose = rigid(
-        rotmat_from_quat(multiply_quats(turned, now)),
+        rotmat_from_quat(multiply_quats(part_turn, camera_quat)),
         camera.centre + (after.centre - before.centre) * part,
     )
     return dataclasses.replace(
@@ -303,19 +316,21 @@ def measure_time_offset(
     show a time: those that look sideways do. None where the car hardly moves, sweeps have no
     intensity, or no time within 50 ms stands out."""
     returns = {
-        frame: Returns(found.points[::_EVERY], found.intensity[::_EVERY])
-        for frame, found in returns.items()
+        frame: Returns(
+            frame_returns.points[::_RETURN_STRIDE], frame_returns.intensity[::_RETURN_STRIDE]
+        )
+        for frame, frame_returns in returns.items()
     }
     total = np.zeros(len(_STEPS_S))
     cameras = 0
-    for name, own in keys.items():
+    for name, camera_keys in keys.items():
         path = _path(scene, name)
-        own = [key for key in own if key.frame in returns]
-        moving = [key for key in own if _speed_mps(path, scene, key) > _MIN_SPEED_MPS]
+        camera_keys = [key for key in camera_keys if key.frame in returns]
+        moving = [key for key in camera_keys if _speed_mps(path, scene, key) > _MIN_SPEED_MPS]
         scores = [_fit(scene, returns, views, path, moving, float(offset)) for offset in _STEPS_S]
-        known = np.array([score for score in scores if score is not None])
-        if len(known) == len(_STEPS_S) and known.mean() > 0:
-            total += known / known.mean()
+        valid_scores = np.array([score for score in scores if score is not None])
+        if len(valid_scores) == len(_STEPS_S) and valid_scores.mean() > 0:
+            total += valid_scores / valid_scores.mean()
             cameras += 1
     i = int(total.argmax())
     stands_out = total[i] >= (1 + _TIMING_CONTRAST) * total.mean()
@@ -333,11 +348,13 @@ def _fit(
     keys: Sequence[ViewKey],
     offset_s: float,
 ) -> float | None:
-    """How much images and returns tell of each other if images were taken later by offset_s."""
-    taken = {key: scene.frame(key.frame).cameras[key.camera] for key in keys}
-    later = {key: camera_at(path, camera, offset_s) for key, camera in taken.items()}
-    seen = project_returns(returns, views, later, reach=0, near_m=_TIMING_NEAR_M)
-    return float(shared_information(seen, 0)[0, 0]) if seen else None
+    """Return the shared information of images and returns, had images been taken offset_s later."""
+    stamped_cameras = {key: scene.frame(key.frame).cameras[key.camera] for key in keys}
+    later_cameras = {
+        key: camera_at(path, camera, offset_s) for key, camera in stamped_cameras.items()
+    }
+    points_by_view = project_returns(returns, views, later_cameras, reach=0, near_m=_TIMING_NEAR_M)
+    return float(shared_information(points_by_view, 0)[0, 0]) if points_by_view else None
 
 
 def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
@@ -348,9 +365,11 @@ def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
 
 @dataclass(frozen=True)
 class Checks:
-    """problems: one sentence each. time_offset_s: how much later than stamped the images fit the
-    LiDAR best, None where unknown. offsets: how images and LiDAR are shifted, a camera each, once
-    that is taken into account."""
+    """Results of `check_views`.
+
+    problems: one sentence each. time_offset_s: seconds after their stamps at which images fit the
+    LiDAR best; None where unknown. offsets: the shift of each camera, measured at the corrected
+    times."""
 
     problems: tuple[str, ...]
     time_offset_s: float | None
@@ -359,10 +378,11 @@ class Checks:
     @property
     def facts(self) -> dict[str, Any]:
         """JSON-able, for reports: pixels of the image compared, to the right and down."""
-        late, names = self.time_offset_s, ("right_px", "down_px", "angle_deg", "is_sure")
+        offset_s = self.time_offset_s
+        names = ("right_px", "down_px", "angle_deg", "is_sure")
         offsets = {o.camera: {name: getattr(o, name) for name in names} for o in self.offsets}
         return {
-            "camera_time_offset_ms": None if late is None else 1e3 * late,
+            "camera_time_offset_ms": None if offset_s is None else 1e3 * offset_s,
             "calibration_offsets": offsets,
         }
 
@@ -372,30 +392,42 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
 
     The calibration is not checked where sweeps have no intensity."""
     keys = sorted((*views.train, *views.test), key=lambda key: key.frame)
-    own = {name: [k for k in keys if k.camera == name] for name in scene.camera_names}
-    own = {name: found for name, found in own.items() if found}
+    keys_by_camera = {name: [k for k in keys if k.camera == name] for name in scene.camera_names}
+    keys_by_camera = {
+        name: camera_keys for name, camera_keys in keys_by_camera.items() if camera_keys
+    }
     problems: list[str] = []
-    for found in own.values():
-        problems += exposure_jumps(views, found)
+    for camera_keys in keys_by_camera.values():
+        problems += exposure_jumps(views, camera_keys)
     # What is measured changes the cameras, so held-out images have no part in it.
-    learnt = {name: [k for k in found if k in set(views.train)] for name, found in own.items()}
-    own = {name: spread(found, _NUM_FRAMES) for name, found in learnt.items() if found}
-    returns = read_intensities(scene, (key.frame for found in own.values() for key in found))
-    late = measure_time_offset(scene, returns, views, own)
-    if late is not None and abs(late) > _MAX_TIME_OFFSET_S:
+    train_keys = {
+        name: [k for k in camera_keys if k in set(views.train)]
+        for name, camera_keys in keys_by_camera.items()
+    }
+    keys_by_camera = {
+        name: spread(camera_keys, _NUM_FRAMES)
+        for name, camera_keys in train_keys.items()
+        if camera_keys
+    }
+    returns = read_intensities(
+        scene, (key.frame for camera_keys in keys_by_camera.values() for key in camera_keys)
+    )
+    time_offset_s = measure_time_offset(scene, returns, views, keys_by_camera)
+    if time_offset_s is not None and abs(time_offset_s) > _MAX_TIME_OFFSET_S:
         problems.append(
-            f"images fit the LiDAR best if they were taken {abs(late) * 1e3:.0f} ms "
-            f"{'after' if late > 0 else 'before'} their time stamps: one of the clocks is wrong"
+            f"images fit the LiDAR best if they were taken {abs(time_offset_s) * 1e3:.0f} ms "
+            f"{'after' if time_offset_s > 0 else 'before'} their time stamps: one of the "
+            f"clocks is wrong"
         )
-    timed = scene if late is None else with_camera_times(scene, late)
+    timed = scene if time_offset_s is None else with_camera_times(scene, time_offset_s)
     offsets = []
-    for found in own.values():
-        cameras = {k: timed.frame(k.frame).cameras[k.camera] for k in found}
+    for camera_keys in keys_by_camera.values():
+        cameras = {k: timed.frame(k.frame).cameras[k.camera] for k in camera_keys}
         offset = measure_offset(returns, views, cameras)
         if offset is not None:
             offsets.append(offset)
             problems += offset.problems
-    return Checks(tuple(problems), late, tuple(offsets))
+    return Checks(tuple(problems), time_offset_s, tuple(offsets))
 
 
 def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
@@ -412,22 +444,24 @@ def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
     change = np.array([np.median(b - a) for a, b in itertools.pairwise(levels)])
     usual = float(np.median(np.abs(change)))
     bound = max(_JUMP_STOPS, _JUMP_TIMES * usual)
-    found = np.flatnonzero(np.abs(change) > bound)
-    out = [
+    jumps = np.flatnonzero(np.abs(change) > bound)
+    sentences = [
         f"camera {keys[i].camera}: brightness changes by a factor of {2 ** change[i]:.2f} between "
         f"frames {keys[i].frame} and {keys[i + 1].frame}; one exposure for the whole drive will "
         f"not fit both"
-        for i in found[:_MAX_NAMED]
+        for i in jumps[:_MAX_NAMED]
     ]
-    if len(found) > _MAX_NAMED:
-        out.append(
-            f"camera {keys[0].camera}: brightness jumps {len(found) - _MAX_NAMED} more times, last "
-            f"after frame {keys[found[-1]].frame}"
+    if len(jumps) > _MAX_NAMED:
+        sentences.append(
+            f"camera {keys[0].camera}: brightness jumps {len(jumps) - _MAX_NAMED} more times, last "
+            f"after frame {keys[jumps[-1]].frame}"
         )
-    return out
+    return sentences
 
 
 def _block_stops(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Logarithm to base 2 of the mean brightness of so many blocks across and down, float32."""
+    """Return the logarithm to base 2 of the mean brightness of each block, float32.
+
+    size: blocks across and down."""
     grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     return np.log2(grey.astype(np.float32) + 4)  # a few levels, so that black does not count

@@ -33,15 +33,18 @@ _NUMBER = re.compile(r"\d{1,12}")
 _SPARSE_NAME = re.compile(r"(\d{1,12})_(.+)")
 _ASPECT_TOLERANCE = 0.02  # maps are often rounded to a multiple of 14 or 32 pixels
 _MIN_KNOWN = 30  # known distances that two numbers may be fitted to
-_ROUNDS = 30
+_ROUNDS = 30  # of reweighted least squares
 _MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
-_MIN_CORRELATION = 0.5
-_NEAREST_M, _FURTHEST_M = 0.5, 120.0
+_MIN_CORRELATION = 0.5  # of relative values and inverse depths; a map below it is refused
+_NEAREST_M = 0.5  # depth from which an aligned relative map is believed
+_FURTHEST_M = 120.0  # depth up to which an aligned relative map is believed
 _GRID_PX = 4  # dense maps are used at every such pixel of every such row
 _RELATIVE_WEIGHT = 0.1  # of relative maps beside LiDAR, which is 1
-_NEAREST_IN_FILE_M, _FURTHEST_IN_FILE_M = 0.1, 1000.0  # what a file may call a depth
+_NEAREST_IN_FILE_M = 0.1  # values of a file that are larger are depths
+_FURTHEST_IN_FILE_M = 1000.0  # values of a file that are smaller are depths
 # A return is clearly behind another from this ratio of depths and this many metres more.
-_BEHIND_RATIO, _BEHIND_M = 1.05, 0.5
+_BEHIND_RATIO = 1.05
+_BEHIND_M = 0.5
 _NEIGHBOURS = 16  # returns around one that say whether it is surrounded
 _WIDEST_PART = 0.02  # of the image's width: what is further away says nothing
 # Depth of a view at its training camera, float32 [H, W] metres, 0 where unknown.
@@ -51,18 +54,26 @@ ReferenceDepth = Callable[[ViewKey, Camera], np.ndarray]
 def find_maps(
     folder: Path, keys: Collection[ViewKey], image_stems: Mapping[ViewKey, str], suffixes: set[str]
 ) -> dict[ViewKey, Path]:
-    """The file of each view that has one: DIR/<camera>/<name>, named as the recorded image is or,
-    where no file of the camera is, with the frame's number."""
+    """Return the depth map's path of each view that has one.
+
+    A file is DIR/<camera>/<name>. Its name is that of the recorded image; where no file of the
+    camera has such a name, it is the frame's number."""
     _check_folder(folder)
-    found: dict[ViewKey, Path] = {}
+    paths: dict[ViewKey, Path] = {}
     for camera in dict.fromkeys(key.camera for key in keys):
-        own = [key for key in keys if key.camera == camera]
+        camera_keys = [key for key in keys if key.camera == camera]
         files = sorted(p for p in (folder / camera).glob("*") if p.suffix.lower() in suffixes)
-        by_stem = {path.stem: path for path in files}
-        named = {k: by_stem[image_stems[k]] for k in own if image_stems.get(k) in by_stem}
-        by_number = {int(p.stem): p for p in files if _NUMBER.fullmatch(p.stem)}
-        found |= named or {k: by_number[k.frame] for k in own if k.frame in by_number}
-    return found
+        path_by_stem = {path.stem: path for path in files}
+        paths_by_name = {
+            k: path_by_stem[image_stems[k]]
+            for k in camera_keys
+            if image_stems.get(k) in path_by_stem
+        }
+        path_by_number = {int(p.stem): p for p in files if _NUMBER.fullmatch(p.stem)}
+        paths |= paths_by_name or {
+            k: path_by_number[k.frame] for k in camera_keys if k.frame in path_by_number
+        }
+    return paths
 
 
 def find_sparse(
@@ -72,7 +83,7 @@ def find_sparse(
     its number in the scene's order as Street Gaussians counts them."""
     _check_folder(folder)
     requested = set(keys)
-    found: dict[ViewKey, Path] = {}
+    paths: dict[ViewKey, Path] = {}
     for path in sorted(folder.glob("*.npy")):
         match = _SPARSE_NAME.fullmatch(path.stem)
         if match is None:
@@ -82,8 +93,8 @@ def find_sparse(
             name = camera_names[int(name)]
         key = ViewKey(int(match[1]), name)
         if key in requested:
-            found[key] = path
-    return found
+            paths[key] = path
+    return paths
 
 
 def read_metric(path: Path) -> np.ndarray:
@@ -122,12 +133,13 @@ def read_relative(path: Path) -> np.ndarray:
 
 def read_sparse(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Street Gaussians' depth: mask bool [h, w] and the metres of its pixels, float32 [M]."""
-    held = read_array_dict(path)
-    mask, value = held.get("mask"), held.get("value")
+    arrays = read_array_dict(path)
+    mask = arrays.get("mask")
+    value = arrays.get("value")
     if mask is None or value is None or mask.ndim != 2:
         raise AdapterError(
             f"{path} must hold 'mask' [height, width] and 'value'; it holds "
-            f"{ {name: list(array.shape) for name, array in held.items()} }"
+            f"{ {name: list(array.shape) for name, array in arrays.items()} }"
         )
     mask = mask.astype(np.bool_)
     if value.dtype.kind not in "fiu" or value.shape != (int(mask.sum()),):
@@ -154,7 +166,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def join_priors(priors: Sequence[DepthPixels]) -> DepthPixels:
-    """All of them, at least one; where several know a pixel, the first in the sequence counts."""
+    """Join one or more priors; where several have a pixel, the first in the sequence counts."""
     names = ("pixels", "depth_m", "weight")
     parts = [np.concatenate([getattr(prior, name) for prior in priors]) for name in names]
     _, first = np.unique(parts[0], return_index=True)  # the first occurrence, in order
@@ -181,9 +193,11 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
     Iteratively reweighted with Cauchy's weights, whose spread follows the median residual (Holland
     and Welsch 1977), from a line through the quartiles. It fails with fewer than 30 known pixels,
     without contrast, or where larger values are not clearly nearer."""
-    x, y = relative.astype(np.float64), 1.0 / depth_m.astype(np.float64)
-    known = np.isfinite(x) & np.isfinite(y)
-    x, y = x[known], y[known]
+    x = relative.astype(np.float64)
+    y = 1.0 / depth_m.astype(np.float64)
+    is_finite = np.isfinite(x) & np.isfinite(y)
+    x = x[is_finite]
+    y = y[is_finite]
     if len(x) < _MIN_KNOWN:
         return None
     low, middle, high = np.quantile(x, [0.1, 0.5, 0.9])
@@ -192,14 +206,16 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
         return None
     x = (x - middle) / unit  # so that the normal equations are well conditioned
     bottom, top = np.quantile(y, [0.1, 0.9])
-    scale, shift = top - bottom, float(np.median(y))
+    scale = top - bottom
+    shift = float(np.median(y))
     weight = np.ones_like(x)
     for _ in range(_ROUNDS):
         residual = y - (scale * x + shift)
         spread = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SPREAD_PER_M)
         weight = 1.0 / (1.0 + (residual / (2.385 * spread)) ** 2)
         weight /= weight.sum()
-        mean_x, mean_y = float(weight @ x), float(weight @ y)
+        mean_x = float(weight @ x)
+        mean_y = float(weight @ y)
         variance = float(weight @ (x - mean_x) ** 2)
         covariance = float(weight @ ((x - mean_x) * (y - mean_y)))
         if not variance > 0:
@@ -233,9 +249,9 @@ def metric_prior(path: Path, camera: Camera, sky: np.ndarray) -> DepthPixels:
     # The nearest pixel: between a car and the wall behind it there is no surface.
     y = ((rows + 0.5) * depth.shape[0] / camera.height).astype(np.int64)
     x = ((columns + 0.5) * depth.shape[1] / camera.width).astype(np.int64)
-    at = depth[y, x]
-    usable = (at > _NEAREST_IN_FILE_M) & (at < _FURTHEST_IN_FILE_M) & ~sky[rows, columns]
-    return DepthPixels.of((rows * camera.width + columns)[usable], at[usable])
+    depth_m = depth[y, x]
+    usable = (depth_m > _NEAREST_IN_FILE_M) & (depth_m < _FURTHEST_IN_FILE_M) & ~sky[rows, columns]
+    return DepthPixels.of((rows * camera.width + columns)[usable], depth_m[usable])
 
 
 def relative_prior(
@@ -246,34 +262,35 @@ def relative_prior(
     relative = read_relative(path)
     check_aspect(path, relative.shape, camera)
     size = (camera.width, camera.height)
-    enough = relative.shape[0] <= camera.height
-    how = cv2.INTER_LINEAR if enough else cv2.INTER_AREA
-    relative = cv2.resize(relative, size, interpolation=how)
-    known = reference > 0
-    found = align(relative[known], reference[known])
-    if found is None:
+    is_smaller = relative.shape[0] <= camera.height
+    interpolation = cv2.INTER_LINEAR if is_smaller else cv2.INTER_AREA
+    relative = cv2.resize(relative, size, interpolation=interpolation)
+    has_reference = reference > 0
+    alignment = align(relative[has_reference], reference[has_reference])
+    if alignment is None:
         raise AdapterError(
-            f"{path} does not agree with the {int(known.sum())} known distances: there must be "
-            f"some, and larger values must be nearer (inverse depth, not depth)"
+            f"{path} does not agree with the {int(has_reference.sum())} known distances: there "
+            f"must be some, and larger values must be nearer (inverse depth, not depth)"
         )
     rows, columns = _grid(camera)
-    at = found.depth_m(relative[rows, columns])
-    usable = np.isfinite(at) & ~sky[rows, columns]
+    depth_m = alignment.depth_m(relative[rows, columns])
+    usable = np.isfinite(depth_m) & ~sky[rows, columns]
     pixels = (rows * camera.width + columns)[usable]
-    return DepthPixels.of(pixels, at[usable], _RELATIVE_WEIGHT)
+    return DepthPixels.of(pixels, depth_m[usable], _RELATIVE_WEIGHT)
 
 
-def beside(dense: DepthPixels, known: DepthPixels, camera: Camera) -> DepthPixels:
-    """The dense prior where no cell of its grid holds anything better known."""
-    if len(known) == 0:
+def beside(dense: DepthPixels, trusted_prior: DepthPixels, camera: Camera) -> DepthPixels:
+    """Return the pixels of the dense prior in whose grid cell the trusted prior has no pixel."""
+    if len(trusted_prior) == 0:
         return dense
     columns = -(-camera.width // _GRID_PX)
 
     def cells(prior: DepthPixels) -> np.ndarray:
-        row, column = prior.pixels // camera.width, prior.pixels % camera.width
+        row = prior.pixels // camera.width
+        column = prior.pixels % camera.width
         return row // _GRID_PX * columns + column // _GRID_PX
 
-    return dense.select(~np.isin(cells(dense), cells(known)))
+    return dense.select(~np.isin(cells(dense), cells(trusted_prior)))
 
 
 def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -287,7 +304,7 @@ def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def hidden_returns(
     pixels, depth_m, grid, enough, most_radius, ratio, margin_m
 ):  # pragma: no cover - compiled
-    """Which returns lie behind nearer ones on all sides, bool [M].
+    """Mask of the returns that lie behind nearer ones on all sides, bool [M].
 
     pixels: int32 [M], flat indices into grid; grid: float32 [H, W], depth at them, 0 elsewhere.
     The square window around a return grows until it holds `enough` others or has the radius
@@ -297,9 +314,11 @@ def hidden_returns(
     height, width = grid.shape
     out = np.zeros(len(pixels), np.bool_)
     for i in numba.prange(len(pixels)):
-        row, column = pixels[i] // width, pixels[i] % width
+        row = pixels[i] // width
+        column = pixels[i] % width
         limit = depth_m[i] / ratio - margin_m
-        found, count = 0, 0
+        quadrants = 0  # one bit for each that holds a nearer return
+        count = 0
         for radius in range(1, most_radius + 1):
             for dy in range(-radius, radius + 1):
                 y = row + dy
@@ -316,35 +335,41 @@ def hidden_returns(
                         continue
                     # What lies straight above or beside counts for both quadrants it touches.
                     if dy <= 0 and dx <= 0:
-                        found |= 1
+                        quadrants |= 1
                     if dy <= 0 and dx >= 0:
-                        found |= 2
+                        quadrants |= 2
                     if dy >= 0 and dx <= 0:
-                        found |= 4
+                        quadrants |= 4
                     if dy >= 0 and dx >= 0:
-                        found |= 8
+                        quadrants |= 8
             if count >= enough:
                 break
-        sides = (found & 1) + (found >> 1 & 1) + (found >> 2 & 1) + (found >> 3 & 1)
+        sides = (quadrants & 1) + (quadrants >> 1 & 1) + (quadrants >> 2 & 1) + (quadrants >> 3 & 1)
         out[i] = sides >= 3
     return out
 
 
-def visible(seen: DepthPixels, camera: Camera) -> np.ndarray:
-    """Which returns the camera sees too, bool [M]: those without clearly nearer ones among their
-    neighbours on three sides. Those hidden just behind an edge are not found."""
+def visible(returns: DepthPixels, camera: Camera) -> np.ndarray:
+    """Mask of the LiDAR's returns that the camera sees too, bool [M].
+
+    A return is hidden if clearly nearer ones lie among its neighbours on three sides. One that is
+    hidden just behind an edge counts as visible."""
     with kernel_threads():
-        hidden = hidden_returns(
-            seen.pixels, seen.depth_m, seen.image(camera), _NEIGHBOURS,
+        is_hidden = hidden_returns(
+            returns.pixels,
+            returns.depth_m,
+            returns.image(camera),
+            _NEIGHBOURS,
             max(2, round(_WIDEST_PART * camera.width)),
-            np.float32(_BEHIND_RATIO), np.float32(_BEHIND_M),
-        )  # fmt: skip
-    return ~hidden
+            np.float32(_BEHIND_RATIO),
+            np.float32(_BEHIND_M),
+        )
+    return ~is_hidden
 
 
 @dataclass(frozen=True)
 class DepthPriors:
-    """Which priors to use. Where several know a pixel, the first of this order is believed.
+    """The depth priors to use; where several have a pixel, the first in the fields' order counts.
 
     lidar: the scene's sweeps. sparse_dir: Street Gaussians' lidar_depth folder. metric_dir: dense
     depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where unknown, as `climategs
@@ -372,7 +397,8 @@ class DepthSource:
         """cameras: every view, at the training resolution. reference: distances that relative
         maps are brought to metres by where the frame has no LiDAR."""
         self.problems: list[str] = []
-        self._scene, self._cameras = scene, cameras
+        self._scene = scene
+        self._cameras = cameras
         self._reference = reference
         self._has_sweeps = options.lidar and _has_sweeps(scene, cameras)
         self._maps = _find_all(scene, cameras, options, self.problems)
@@ -384,7 +410,9 @@ class DepthSource:
             )
 
     def lidar(self, key: ViewKey) -> DepthPixels:
-        """What the sweep of the view's frame says; it is read once for all cameras of the frame."""
+        """Return the depth of the LiDAR's returns that the view shows.
+
+        A frame's sweep is read once for all of its cameras."""
         return self._memo.get(key.frame, lambda: self._read_frame(key.frame))[key.camera]
 
     def _read_frame(self, frame: int) -> dict[str, DepthPixels]:
@@ -393,42 +421,47 @@ class DepthSource:
         }
         returns = read_returns(self._scene, frame, of_surfaces=True) if self._has_sweeps else None
         if returns is None:
-            nothing = DepthPixels.of(np.zeros(0, np.int32), np.zeros(0, np.float32))
-            return dict.fromkeys(cameras, nothing)
-        seen = {name: returns.seen_by(camera) for name, camera in cameras.items()}
-        return {name: seen[name].select(visible(seen[name], cameras[name])) for name in cameras}
+            no_pixels = DepthPixels.of(np.zeros(0, np.int32), np.zeros(0, np.float32))
+            return dict.fromkeys(cameras, no_pixels)
+        pixels_by_camera = {name: returns.seen_by(camera) for name, camera in cameras.items()}
+        return {
+            name: pixels_by_camera[name].select(visible(pixels_by_camera[name], cameras[name]))
+            for name in cameras
+        }
 
     def load(self, key: ViewKey, sky: np.ndarray) -> DepthPixels:
-        """All that is known of the view. sky: bool [H, W], where dense maps are not believed."""
+        """Return the depth prior of the view, joined from LiDAR and depth maps.
+
+        sky: bool [H, W], True where values of dense maps are left out."""
         if not any(self._maps.values()):
             return self.lidar(key)
         return self._memo.get(key, lambda: self._combine(key, sky))
 
     def _combine(self, key: ViewKey, sky: np.ndarray) -> DepthPixels:
         camera = self._cameras[key]
-        known = self.lidar(key)
+        prior = self.lidar(key)
         for kind, maps in self._maps.items():  # in the order in which they are believed
             path = maps.get(key)
             if path is None:
                 continue
             try:
                 if kind == "sparse":
-                    found = sparse_prior(path, camera)
+                    map_prior = sparse_prior(path, camera)
                 elif kind == "metric":
-                    found = metric_prior(path, camera, sky)
+                    map_prior = metric_prior(path, camera, sky)
                 else:
-                    reference = known.image(camera)
-                    if len(known) == 0 and self._reference is not None:
+                    reference = prior.image(camera)
+                    if len(prior) == 0 and self._reference is not None:
                         reference = self._reference(key, camera)
-                    found = beside(relative_prior(path, camera, reference, sky), known, camera)
+                    map_prior = beside(relative_prior(path, camera, reference, sky), prior, camera)
             except AdapterError as error:
                 sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
                 logger.warning("%s", sentence)
                 if sentence not in self.problems:
                     self.problems.append(sentence)
             else:
-                known = join_priors([known, found])
-        return known
+                prior = join_priors([prior, map_prior])
+        return prior
 
 
 def _find_all(
@@ -456,7 +489,7 @@ def _find_all(
 
 
 def _has_sweeps(scene: Scene, keys: Mapping[ViewKey, Camera]) -> bool:
-    """Whether any of the views' frames has a LiDAR sweep."""
+    """Return True if any of the views' frames has a LiDAR sweep."""
     if scene.labels is None:
         return False
     frames = dict.fromkeys(key.frame for key in keys)

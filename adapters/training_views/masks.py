@@ -26,6 +26,6 @@ def read_ego_mask(path: Path, camera: Camera) -> np.ndarray:
             f"{camera.name!r} has the proportions of its images, {camera.width}x{camera.height}"
         )
     size = (camera.width, camera.height)
-    how = cv2.INTER_AREA if image.shape[1] >= camera.width else cv2.INTER_LINEAR
+    interpolation = cv2.INTER_AREA if image.shape[1] >= camera.width else cv2.INTER_LINEAR
     # Any part of a pixel on the car spoils it.
-    return cv2.resize(image, size, interpolation=how) >= _WHITE // 2
+    return cv2.resize(image, size, interpolation=interpolation) >= _WHITE // 2

@@ -44,19 +44,20 @@ _COLUMNS = (160, 320)  # fewest and most splats across a whole image
 _MAX_IMAGES = 48  # that the median is taken over
 _MIN_SPLATS = 16  # a smaller mask is a speck, not a car
 _COVERED = 0.5  # part of a splat's cell that must lie in the mask
-_BODY_FAR_M, _BODY_NEAR_M = 1.6, 0.4  # along the optical axis
+_BODY_FAR_M = 1.6  # largest distance of the body along the optical axis
+_BODY_NEAR_M = 0.4  # smallest distance of the body along the optical axis
 _HALF_WIDTH_M = 0.95  # half a car's width: the body does not reach aside into other cameras' views
 _MIN_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than this
-_MARGIN_M = 0.01
+_MARGIN_M = 0.01  # from the body's outermost splats to its box
 _BODY_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
 _WALLS = (
     SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.VEGETATION, SemanticClass.UNKNOWN,
 )  # fmt: skip
 _WALL_COLUMNS = 240  # of the images in which walls are continued: one disc a pixel
-_MAX_WALL_IMAGES = 48
+_MAX_WALL_IMAGES = 48  # in which walls are continued
 _MAX_WALL_M = 80.0  # beyond, a LiDAR's channels lie so far apart that a surface's end is unknown
-_MAX_WALL_SPLATS = 60_000
+_MAX_WALL_SPLATS = 60_000  # that are added above walls, over all images
 _WALL_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
 # Camera axes (x right, y down, z forward) to an actor's (x forward, y left, z up).
@@ -83,8 +84,8 @@ def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
     for key in spread(views.train, _MAX_WALL_IMAGES):
         view = views.load(key)
         camera = view.camera.scaled(min(1.0, _WALL_COLUMNS / view.camera.width))
-        drawn = dataclasses.replace(scene, background=background).parts_for(camera)
-        raster = rasterize(drawn, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
+        parts = dataclasses.replace(scene, background=background).parts_for(camera)
+        raster = rasterize(parts, camera, buffers=(ALPHA, MEDIAN_DEPTH, SPLAT_IDS))
         assert raster.alpha is not None
         assert raster.median_depth is not None and raster.splat_ids is not None
         ids = raster.splat_ids.numpy()
@@ -92,38 +93,40 @@ def continue_walls(scene: Scene, views: RecordedViews) -> Gaussians:
         semantic = classes[np.where(in_background, ids, 0)]
         size = (camera.width, camera.height)
         closed = view.sky | views.own_car(key)
-        found = _above_walls(
+        above_walls = _above_walls(
             camera,
             np.where(raster.alpha.numpy() >= SURFACE_ALPHA, raster.median_depth.numpy(), np.inf),
             in_background & np.isin(semantic, _WALLS),
             cv2.resize(closed.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0,
             views.lidar_top_rad - TOP_MARGIN_RAD,
         )
-        rows, columns = np.nonzero(found.depth > 0)
+        rows, columns = np.nonzero(above_walls.depth > 0)
         room -= len(rows)
         if room < 0:
             break
         rays = camera.ray_directions(torch.float64).numpy()[rows, columns]
-        depth = found.depth[rows, columns]
+        depth = above_walls.depth[rows, columns]
         normals = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         major = np.cross([0.0, 0.0, 1.0], normals)
         major /= np.maximum(np.linalg.norm(major, axis=1, keepdims=True), 1e-9)
         points = camera.centre.numpy() + depth[:, None] * rays
         rgb = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA)
-        new = gaussians_from_surfels(
+        discs = gaussians_from_surfels(
             Surfels.discs(points, normals, major, depth / camera.fx),
             (rgb[rows, columns] / 255).astype(np.float32),
-            semantic[found.base[rows, columns], columns],
+            semantic[above_walls.base[rows, columns], columns],
             _WALL_SHAPE,
         )
-        background = join_gaussians([background, new])
-        classes = np.append(classes, semantic[found.base[rows, columns], columns])
+        background = join_gaussians([background, discs])
+        classes = np.append(classes, semantic[above_walls.base[rows, columns], columns])
     logger.info("%d splats above walls", len(background) - len(scene.background))
     return background
 
 
 class _AboveWalls(NamedTuple):
-    """depth: float64 [H, W], z of new surface, 0 where there is none. base: int64 [H, W], the row
+    """Surface that is added above walls.
+
+    depth: float64 [H, W], z of the new surface, 0 where there is none. base: int64 [H, W], the row
     of the surface below."""
 
     depth: np.ndarray
@@ -133,17 +136,21 @@ class _AboveWalls(NamedTuple):
 def _above_walls(
     camera: Camera, depth: np.ndarray, is_wall: np.ndarray, closed: np.ndarray, top_rad: float
 ) -> _AboveWalls:
-    """depth: of surfaces, infinite where there is none. closed: sky and the recording car."""
+    """Return the surface to add above walls.
+
+    depth: [H, W], z of surfaces, infinite where there is none. is_wall: bool [H, W]. closed: bool
+    [H, W], sky and the recording car. top_rad: highest elevation of the LiDAR's view."""
     height = camera.height
     row = np.arange(height)[:, None]
     solid = np.isfinite(depth)
 
     def below(mask: np.ndarray) -> np.ndarray:
-        """Of each pixel the nearest row of the mask at or below it; height where there is none."""
+        """Return each pixel's nearest row of the mask at or below it; height where none is."""
         rows = np.where(mask, row, height)
         return np.minimum.accumulate(rows[::-1], axis=0)[::-1]
 
     def above(mask: np.ndarray) -> np.ndarray:
+        """Return each pixel's nearest row of the mask at or above it; -1 where none is."""
         return np.maximum.accumulate(np.where(mask, row, -1), axis=0)
 
     base = below(solid)
@@ -201,10 +208,10 @@ def _median_colours(
     columns: np.ndarray,
 ) -> np.ndarray | None:
     """Median over the images, float32 [N, 3] in [0, 1], or None without any."""
-    own = [k for k in source.train if k.camera == camera_name]
-    every = max(1, math.ceil(len(own) / _MAX_IMAGES))
+    camera_keys = [k for k in source.train if k.camera == camera_name]
+    stride = max(1, math.ceil(len(camera_keys) / _MAX_IMAGES))
     samples = []
-    for key in own[::every]:
+    for key in camera_keys[::stride]:
         rgb = cv2.resize(source.load(key).rgb, size, interpolation=cv2.INTER_AREA)
         samples.append(rgb[rows, columns])
     if not samples:
@@ -213,9 +220,11 @@ def _median_colours(
 
 
 def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the rays through pixels of the grid, float64 [N, 3] in the camera's frame, and the
-    distance from one to the next [N]: on a level surface below the camera, such as a roof, as far
-    as a car's width allows; where a ray does not go down, on an upright one."""
+    """Return points on the rays through pixels of the grid, and the distance to the next point.
+
+    Points: float64 [N, 3], the camera's frame. Distances: [N]. The points lie on a level surface
+    below the camera, such as a roof, as far away as a car's width allows. Where a ray does not go
+    down, its point lies on an upright surface."""
     x = (columns + 0.5 - grid.cx) / grid.fx
     y = (rows + 0.5 - grid.cy) / grid.fy
     far_m = float(np.clip(_HALF_WIDTH_M / max(np.abs(x).max(), 1e-6), _BODY_NEAR_M, _BODY_FAR_M))
@@ -228,26 +237,31 @@ def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndar
 def _body_gaussians(
     points: np.ndarray, spacing: np.ndarray, colours: np.ndarray
 ) -> tuple[Gaussians, np.ndarray, tuple[float, float, float]]:
-    """Discs that face the camera, in the actor's frame; the box's centre in the camera's axes
-    turned to the actor's, float64 [3]; and the box's size."""
-    turned = points @ _ACTOR_FROM_CAMERA.T
-    normals = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    """Return discs that face the camera, and the centre and size of the box around them.
+
+    Discs: in the actor's frame. Centre: float64 [3], metres from the camera, along the actor's
+    axes. Size: metres."""
+    actor_points = points @ _ACTOR_FROM_CAMERA.T
+    normals = actor_points / np.linalg.norm(actor_points, axis=1, keepdims=True)
     major = np.cross([0.0, 0.0, 1.0], normals)
     major /= np.linalg.norm(major, axis=1, keepdims=True)
-    low, high = turned.min(axis=0) - _MARGIN_M, turned.max(axis=0) + _MARGIN_M
+    low = actor_points.min(axis=0) - _MARGIN_M
+    high = actor_points.max(axis=0) + _MARGIN_M
     centre = (low + high) / 2
-    surfels = Surfels.discs(turned - centre, normals, major, spacing)
-    other = np.full(len(points), int(SemanticClass.OTHER), np.int16)
+    surfels = Surfels.discs(actor_points - centre, normals, major, spacing)
+    semantic = np.full(len(points), int(SemanticClass.OTHER), np.int16)
     length, width, height = (float(v) for v in high - low)
     return (
-        gaussians_from_surfels(surfels, colours, other, _BODY_SHAPE),
+        gaussians_from_surfels(surfels, colours, semantic, _BODY_SHAPE),
         centre,
         (length, width, height),
     )
 
 
 def _track(cameras: Sequence[Camera], centre: np.ndarray) -> Track:
-    """The camera's poses as an actor's; of images of one time the first counts."""
+    """Return the track of an actor that moves with the camera.
+
+    Where several images have one time, the first one's pose counts."""
     rotation = torch.from_numpy(_ACTOR_FROM_CAMERA.T.copy())
     camera_from_actor = rigid(rotation, rotation @ torch.from_numpy(centre))
     poses = {}

@@ -33,7 +33,7 @@ _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
 
 def holdout_step(holdout: str) -> int | None:
-    """N of "every-Nth", None of "none"."""
+    """Return N for "every-Nth" and None for "none"."""
     if holdout == NONE:
         return None
     match = _EVERY.fullmatch(holdout)
@@ -97,7 +97,7 @@ class RecordedViews:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What was found wrong and gone on without, one sentence each; loading may add some."""
+        """Return a sentence for each fault that the views do without; loading may add some."""
         return (*self._problems, *self._depth.problems)
 
     def camera(self, key: ViewKey) -> Camera:
@@ -115,8 +115,8 @@ class RecordedViews:
         frame = self._scene.frame(key.frame)
         path = Path(frame.image_paths[key.camera])
         try:
-            read = partial(read_scaled, path, frame.cameras[key.camera], scaled)
-            return self._images.get(key, read)
+            read_image = partial(read_scaled, path, frame.cameras[key.camera], scaled)
+            return self._images.get(key, read_image)
         except ImageFault as fault:
             raise AdapterError(
                 f"camera {key.camera}, frame {key.frame}: image {path} {fault}; it could be read "
@@ -124,7 +124,8 @@ class RecordedViews:
             ) from None
 
     def load(self, key: ViewKey) -> RecordedView:
-        camera, rgb = self.camera(key), self.image(key)
+        camera = self.camera(key)
+        rgb = self.image(key)
         with self._lock:
             sky = self._sky(key, camera, rgb)
             prior = self._depth.load(key, sky)
@@ -135,13 +136,13 @@ class RecordedViews:
         return RecordedView(camera, rgb, weight, sky, prior.pixels, prior.depth_m, prior.weight)
 
     def own_car(self, key: ViewKey) -> np.ndarray:
-        """Where a view shows the recording car, bool [H, W]."""
+        """Mask of the recording car in a view, bool [H, W]."""
         camera = self.camera(key)
         mask = self._ego(camera)
         return np.zeros((camera.height, camera.width), np.bool_) if mask is None else mask
 
     def _ego(self, camera: Camera) -> np.ndarray | None:
-        """Where the camera sees the recording car; None if it does not."""
+        """Mask of the recording car in the camera's images, bool [H, W]; None without one."""
         mask = self.ego_masks.get(camera.name)
         if mask is None or not _is_about(mask.shape[::-1], camera):
             return None
@@ -207,8 +208,10 @@ class RecordedViews:
             )
 
     def _find_ego(self, names: Sequence[str], masks_dir: Path | None) -> dict[str, np.ndarray]:
-        """The masks that are there, from files or else from the images; empty ones left out."""
-        found: dict[str, np.ndarray] = {}
+        """Return each camera's mask of the recording car, without empty ones.
+
+        Masks come from the files in masks_dir, or from the images where masks_dir is None."""
+        masks: dict[str, np.ndarray] = {}
         for name in names:
             views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
             if not views:
@@ -219,22 +222,22 @@ class RecordedViews:
             if masks_dir is not None:
                 path = masks_dir / f"{name}.png"
                 if path.exists():
-                    found[name] = read_ego_mask(path, views[0][1])
+                    masks[name] = read_ego_mask(path, views[0][1])
                 continue
             moving = [views[i] for i in moving_frames([camera for _, camera in views])]
             images = [self.image(key) for key, _ in moving]
-            found[name] = find_ego_mask([camera for _, camera in moving], images)
-        if masks_dir is not None and not found:
+            masks[name] = find_ego_mask([camera for _, camera in moving], images)
+        if masks_dir is not None and not masks:
             raise AdapterError(
                 f"{masks_dir} holds no mask {names[0]}.png or of another camera; expected images "
                 f"named like the cameras ({', '.join(names)}), white on the recording car"
             )
-        return {name: mask for name, mask in found.items() if mask.any()}
+        return {name: mask for name, mask in masks.items() if mask.any()}
 
     def _measure_lidar_top(self) -> float | None:
         frames = list(dict.fromkeys(key.frame for key in self._cameras))
-        some = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
-        top = lidar_top_rad(self._scene, some)
+        sample = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
+        top = lidar_top_rad(self._scene, sample)
         if top is None:
             self._problems.append(
                 "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
@@ -243,14 +246,15 @@ class RecordedViews:
 
 
 def _is_about(size: tuple[int, ...], camera: Camera) -> bool:
-    """True where the camera's width and height differ from others by a few pixels at most, as
-    those of images do that were undistorted one by one."""
+    """Return True if the camera's width and height are those of `size` within 5 %.
+
+    Images that were undistorted one by one differ by a few pixels."""
     ratios = camera.width / size[0], camera.height / size[1]
     return all(abs(ratio - 1) <= _SIZE_SHARE for ratio in ratios)
 
 
 def _check_camera(key: ViewKey, camera: Camera) -> None:
-    """Refuse what a Camera may be but a recording cannot."""
+    """Refuse a position that a Camera may have but no recording has."""
     where = f"camera {key.camera}, frame {key.frame}"
     position = camera.centre.tolist()
     if not all(math.isfinite(x) and abs(x) < _MAX_POSITION_M for x in position):
@@ -261,13 +265,13 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
 
 
 def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...]:
-    known = scene.camera_names
+    scene_cameras = scene.camera_names
     if cameras is None:
-        return known
-    unknown = sorted(set(cameras) - set(known))
-    if unknown or not cameras:
+        return scene_cameras
+    unknown_cameras = sorted(set(cameras) - set(scene_cameras))
+    if unknown_cameras or not cameras:
         raise AdapterError(
-            f"scene {scene.name!r} has no camera {', '.join(map(repr, unknown)) or 'named'}; "
-            f"it has {', '.join(known) or 'none'}"
+            f"scene {scene.name!r} has no camera {', '.join(map(repr, unknown_cameras)) or 'named'}"
+            f"; it has {', '.join(scene_cameras) or 'none'}"
         )
-    return tuple(name for name in known if name in cameras)
+    return tuple(name for name in scene_cameras if name in cameras)

@@ -110,42 +110,50 @@ class Returns(NamedTuple):
 
 
 def frame_returns(segment: Segment, frame: int) -> Returns | None:
-    """The returns of a frame, lasers in their order, each laser's first returns first; None where
-    the table has no row of it."""
+    """Return all returns of a frame; None where the table has no row of the frame.
+
+    Lasers come in the order of their numbers, and each laser's first returns before its second."""
     scans = _read_scans(segment, frame)
     return None if scans is None else scans.returns()
 
 
 class _Scans(NamedTuple):
-    """What the tables have of a frame. images: range images by laser, of both returns. poses: of
-    the TOP laser's car at each pixel. labels, seen: as images, by laser. pictures: classes [h, w]
-    by camera."""
+    """Range images, poses and labels of one frame, as the tables have them.
+
+    images: range images of both returns, by laser. poses: the car's pose at each pixel of the TOP
+    laser's image. labels: objects and classes of the LiDAR segmentation, as `images`. projections:
+    the camera pixels that see each return, as `images`. pictures: classes [h, w] by camera."""
 
     segment: Segment
     frame: int
     images: Mapping[int, tuple[np.ndarray | None, ...]]
     poses: np.ndarray | None
     labels: Mapping[int, tuple[np.ndarray | None, ...]]
-    seen: Mapping[int, tuple[np.ndarray | None, ...]]
+    projections: Mapping[int, tuple[np.ndarray | None, ...]]
     pictures: Mapping[int, np.ndarray]
 
-    def returns(self, every: int = 1) -> Returns | None:
-        """every: take one return in so many, other ones in the next frame."""
-        nothing, parts = (None, None), []
+    def returns(self, stride: int = 1) -> Returns | None:
+        """Return the frame's returns; None where its range images hold none.
+
+        stride: takes one return in so many; the next frame starts at the next return."""
+        no_images = (None, None)
+        parts = []
         for laser, images in sorted(self.images.items()):
             beams = _Beams(self.segment, self.frame, laser, self.poses if laser == TOP else None)
-            labels, seen = self.labels.get(laser, nothing), self.seen.get(laser, nothing)
-            own = zip(images, labels, seen, strict=True)
-            for number, (image, classes, pixels) in enumerate(own, start=1):
+            labels = self.labels.get(laser, no_images)
+            projections = self.projections.get(laser, no_images)
+            images_by_return = zip(images, labels, projections, strict=True)
+            for number, (image, classes, pixels) in enumerate(images_by_return, start=1):
                 if image is not None:
-                    found = beams.returns(image, number, classes, pixels, self.pictures, every)
-                    parts.append(found)
+                    parts.append(
+                        beams.returns(image, number, classes, pixels, self.pictures, stride)
+                    )
         if not parts:
             return None
-        found = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        returns = Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         if not self.labels:
-            found = found._replace(classes=None, objects=None)
-        return found if self.seen else found._replace(camera_classes=None)
+            returns = returns._replace(classes=None, objects=None)
+        return returns if self.projections else returns._replace(camera_classes=None)
 
 
 def _read_scans(segment: Segment, frame: int) -> _Scans | None:
@@ -155,12 +163,14 @@ def _read_scans(segment: Segment, frame: int) -> _Scans | None:
     (poses,) = _range_images(segment, "lidar_pose", frame, 6, returns=(1,)).get(TOP, (None,))
     labels = _range_images(segment, "lidar_segmentation", frame, 2)
     pictures = _label_images(segment, frame)
-    seen = _range_images(segment, "lidar_camera_projection", frame, 6) if pictures else {}
-    return _Scans(segment, frame, images, poses, labels, seen, pictures)
+    projections = _range_images(segment, "lidar_camera_projection", frame, 6) if pictures else {}
+    return _Scans(segment, frame, images, poses, labels, projections, pictures)
 
 
 class _Beams(NamedTuple):
-    """One laser's beams of one frame. poses: of the TOP laser's car at each pixel, [H, W, 6]."""
+    """The beams of one laser in one frame.
+
+    poses: [H, W, 6], the car's pose at each pixel of the TOP laser's image."""
 
     segment: Segment
     frame: int
@@ -174,11 +184,15 @@ class _Beams(NamedTuple):
         labels: np.ndarray | None,
         pixels: np.ndarray | None,
         pictures: Mapping[int, np.ndarray],
-        every: int,
+        stride: int,
     ) -> Returns:
-        """Those of a range image [H, W, 4]. labels: objects and classes [H, W, 2]. pixels: camera,
-        x, y of two cameras that see a return [H, W, 6]. pictures: classes [h, w] by camera."""
-        segment, rows, columns = self.segment, *image.shape[:2]
+        """Return the returns of a range image.
+
+        image: [H, W, 4]. number: 1 or 2, which return of its beam. labels: [H, W, 2], objects and
+        classes. pixels: [H, W, 6], camera, x and y of two cameras that see the return. pictures:
+        classes [h, w] by camera. stride: takes one return in so many."""
+        segment = self.segment
+        rows, columns = image.shape[:2]
         name = LASERS[self.laser - 1]
         where = f"{segment.files.path('lidar')}: frame {segment.stamps_us[self.frame]}, {name}"
         laser = segment.lasers.get(name)
@@ -189,24 +203,24 @@ class _Beams(NamedTuple):
                 f"{where}: its range image has {rows} rows, its calibration "
                 f"{len(laser.inclinations_rad)} inclinations. Copy both again"
             )
-        for component, other in (
+        for component, label_image in (
             ("lidar_segmentation", labels),
             ("lidar_camera_projection", pixels),
         ):
-            if other is not None and other.shape[:2] != (rows, columns):
+            if label_image is not None and label_image.shape[:2] != (rows, columns):
                 raise AdapterError(
                     f"{where}: {component} must be of {rows} x {columns} pixels; it is of "
-                    f"{list(other.shape[:2])}. Copy it again"
+                    f"{list(label_image.shape[:2])}. Copy it again"
                 )
         directions = _directions(laser, rows, columns)
         with np.errstate(invalid="ignore"):
-            hit = np.flatnonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
-        hit = hit[self.frame % every :: every]
-        values = image.reshape(-1, 4)[hit]
+            pixel_ids = np.flatnonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+        pixel_ids = pixel_ids[self.frame % stride :: stride]
+        values = image.reshape(-1, 4)[pixel_ids]
         mount = laser.vehicle_from_laser[:3, 3]
-        offsets = values[:, :1].astype(np.float64) * directions.reshape(-1, 3)[hit]
+        offsets = values[:, :1].astype(np.float64) * directions.reshape(-1, 3)[pixel_ids]
         pose = segment.world_from_vehicle[self.frame]
-        times = np.full(len(hit), segment.pose_times_ns[self.frame])
+        times = np.full(len(pixel_ids), segment.pose_times_ns[self.frame])
         if self.laser != TOP:
             # Moved by the dataset to where the car was at the vehicle pose's time.
             points = (offsets + mount) @ pose[:3, :3].T + pose[:3, 3]
@@ -218,41 +232,43 @@ class _Beams(NamedTuple):
                     f"{where}: lidar_pose must have a pose for each of {rows} x {columns} "
                     f"pixels; it has {size}. Copy it again"
                 )
-            turns, places = _car_at(self.poses.reshape(-1, 6)[hit])
+            turns, places = _car_at(self.poses.reshape(-1, 6)[pixel_ids])
             points = np.einsum("nij,nj->ni", turns, offsets + mount) + places
             origins = turns @ mount + places
-            share = (hit % columns + 0.5) / columns
+            share = (pixel_ids % columns + 0.5) / columns
             times = segment.stamps_us[self.frame] * 1000 + np.round(share * _SPIN_NS).astype(int)
-        none = np.zeros((len(hit), 2), np.int32)
-        objects, classes = (none if labels is None else labels.reshape(-1, 2)[hit]).T
+        no_labels = np.zeros((len(pixel_ids), 2), np.int32)
+        objects, classes = (no_labels if labels is None else labels.reshape(-1, 2)[pixel_ids]).T
         return Returns(
             points,
             origins,
             times,
             values[:, 1],
             values[:, 2],
-            np.full(len(hit), self.laser, np.uint8),
-            np.full(len(hit), number, np.uint8),
+            np.full(len(pixel_ids), self.laser, np.uint8),
+            np.full(len(pixel_ids), number, np.uint8),
             values[:, 3] > 0,
             classes,
             objects,
-            _seen_classes(pixels.reshape(-1, 6)[hit], pictures)
+            _classes_in_images(pixels.reshape(-1, 6)[pixel_ids], pictures)
             if pixels is not None
-            else np.zeros(len(hit), np.uint8),
+            else np.zeros(len(pixel_ids), np.uint8),
         )
 
 
-def _seen_classes(pixels: np.ndarray, pictures: Mapping[int, np.ndarray]) -> np.ndarray:
-    """The classes, uint8 [N], at camera, x, y, camera, x, y [N, 6]: the first camera's that has
-    one."""
-    found = np.zeros(len(pixels), np.uint8)
+def _classes_in_images(pixels: np.ndarray, pictures: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Return the camera segmentation's class of each return, uint8 [N], 0 where there is none.
+
+    pixels: [N, 6], camera, x and y of two cameras; the first of them that has a class counts.
+    pictures: classes [h, w] by camera."""
+    classes = np.zeros(len(pixels), np.uint8)
     places = np.nan_to_num(pixels).clip(0, MAX_SIDE).astype(np.int64)
     for camera, x, y in (places[:, :3].T, places[:, 3:].T):
         for number, picture in pictures.items():
-            own = (camera == number) & (found == 0)
-            own &= (x < picture.shape[1]) & (y < picture.shape[0])
-            found[own] = picture[y[own], x[own]]
-    return found
+            mask = (camera == number) & (classes == 0)
+            mask &= (x < picture.shape[1]) & (y < picture.shape[0])
+            classes[mask] = picture[y[mask], x[mask]]
+    return classes
 
 
 @lru_cache(maxsize=8)
@@ -261,10 +277,12 @@ def _directions(laser: Any, rows: int, columns: int) -> np.ndarray:
 
 
 def _car_at(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations [N, 3, 3] and places [N, 3] of world_from_vehicle from rows of roll, pitch, yaw, x,
-    y, z, float64: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return rotations [N, 3, 3] and positions [N, 3] of world_from_vehicle, float64.
+
+    poses: [N, 6], rows of roll, pitch, yaw, x, y, z. R = Rz(yaw) Ry(pitch) Rx(roll)."""
     values = poses.astype(np.float64)
-    (cr, cp, cy), (sr, sp, sy) = np.cos(values[:, :3].T), np.sin(values[:, :3].T)
+    cr, cp, cy = np.cos(values[:, :3].T)
+    sr, sp, sy = np.sin(values[:, :3].T)
     turns = np.empty((len(values), 3, 3))
     turns[:, 0] = np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], axis=1)
     turns[:, 1] = np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], axis=1)
@@ -275,25 +293,28 @@ def _car_at(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _range_images(
     segment: Segment, component: str, frame: int, channels: int, returns: tuple[int, ...] = (1, 2)
 ) -> dict[int, tuple[np.ndarray | None, ...]]:
-    """The images [H, W, channels] of a frame by laser, one a return, None for null; their memory
-    is the table's. Empty without the component or a row of the frame."""
+    """Return the range images of a frame by laser, one for each return, None for null.
+
+    Each is [H, W, channels] and shares the table's memory. The result is empty without the
+    component or a row of the frame."""
     if not segment.files.has(component):
         return {}
-    own = _index(segment, component, "key.laser_name", LASERS).get(frame, {})
+    rows_by_laser = _index(segment, component, "key.laser_name", LASERS).get(frame, {})
     names = [f"[{COMPONENTS[component]}].range_image_return{n}" for n in returns]
     columns = tuple(
         (f"{name}.{part}", NUMBER_LISTS) for name in names for part in ("values", "shape")
     )
-    cells = _reader(segment, component, columns).read(list(own.values()))
+    cells = _reader(segment, component, columns).read(list(rows_by_laser.values()))
     where = f"{segment.files.path(component)}: frame {segment.stamps_us[frame]}"
     return {
         laser: tuple(_range_image(cells[row], name, channels, where) for name in names)
-        for laser, row in own.items()
+        for laser, row in rows_by_laser.items()
     }
 
 
 def _range_image(cells: dict[str, Any], name: str, channels: int, where: str) -> np.ndarray | None:
-    values, shape = cells[f"{name}.values"].values, cells[f"{name}.shape"].as_py()
+    values = cells[f"{name}.values"].values
+    shape = cells[f"{name}.shape"].as_py()
     if values is None or shape is None:
         return None
     is_size = len(shape) == 3 and all(isinstance(n, int) and 1 <= n <= MAX_SIDE for n in shape)
@@ -312,17 +333,19 @@ def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
     component = "camera_segmentation"
     if not (segment.files.has(component) and segment.files.has("lidar_camera_projection")):
         return {}
-    own = _index(segment, component, "key.camera_name", CAMERAS).get(frame, {})
+    rows_by_camera = _index(segment, component, "key.camera_name", CAMERAS).get(frame, {})
     image, divisor = (
         f"[{COMPONENTS[component]}].{name}" for name in ("panoptic_label", "panoptic_label_divisor")
     )
     columns = ((image, FILE_BYTES), (divisor, WHOLE_NUMBERS))
-    cells = _reader(segment, component, columns).read(list(own.values()))
-    found = {}
-    for number, row in own.items():
-        name, path = CAMERAS[number - 1], segment.files.path(component)
+    cells = _reader(segment, component, columns).read(list(rows_by_camera.values()))
+    classes_by_camera = {}
+    for number, row in rows_by_camera.items():
+        name = CAMERAS[number - 1]
+        path = segment.files.path(component)
         lens = segment.cameras[name].lens if name in segment.cameras else None
-        data, step = cells[row][image].as_py(), cells[row][divisor].as_py()
+        data = cells[row][image].as_py()
+        step = cells[row][divisor].as_py()
         header = image_header(data) if isinstance(data, bytes) else None
         size = None if header is None else (header.width, header.height)
         panoptic = None
@@ -335,8 +358,10 @@ def _label_images(segment: Segment, frame: int) -> dict[int, np.ndarray]:
                 f"a grey PNG of the camera's size with a divisor of 1 to {_MAX_DIVISOR}; got size "
                 f"{size}, divisor {step}. Copy it again"
             )
-        found[number] = (panoptic.astype(np.int64) // step).clip(0, 255).astype(np.uint8)
-    return found
+        classes_by_camera[number] = (
+            (panoptic.astype(np.int64) // step).clip(0, 255).astype(np.uint8)
+        )
+    return classes_by_camera
 
 
 def _reader(segment: Segment, component: str, columns: _Columns) -> RowReader:
@@ -356,12 +381,12 @@ def _index(
     """Row numbers by frame and by laser or camera."""
     rows = Rows(segment.files, component, [STAMP, key])
     frames = segment.frames_of(rows.stamps(), rows.path)
-    found: dict[int, dict[int, int]] = {}
+    rows_by_frame: dict[int, dict[int, int]] = {}
     for frame, number, row in zip(frames, rows.enum(key, words), rows.numbers, strict=True):
-        own = found.setdefault(int(frame), {})
-        if own.setdefault(int(number), int(row)) != row:
+        frame_rows = rows_by_frame.setdefault(int(frame), {})
+        if frame_rows.setdefault(int(number), int(row)) != row:
             raise rows.fault(key, f"has two rows of {words[number - 1]} in one frame")
-    return found
+    return rows_by_frame
 
 
 # ---- Labels --------------------------------------------------------------------------------------
@@ -393,14 +418,19 @@ _CAMERA_CLASSES = dict(
 )  # fmt: skip
 
 
-def _semantic(classes: np.ndarray | None, seen: np.ndarray | None, count: int) -> np.ndarray:
-    """SemanticClass int16 [count] by the LiDAR's segmentation and, where that says nothing, by the
-    cameras'."""
-    known = np.zeros(count, np.int16) if classes is None else world_classes(classes, _CLASSES)
-    if seen is None:
-        return known
-    by_camera = world_classes(seen, _CAMERA_CLASSES)
-    return np.where(known == SemanticClass.UNKNOWN, by_camera, known)
+def _semantic(
+    classes: np.ndarray | None, camera_classes: np.ndarray | None, count: int
+) -> np.ndarray:
+    """Return the SemanticClass of each return, int16 [count].
+
+    The LiDAR's segmentation decides; where it has no class, the cameras' segmentation does."""
+    lidar_semantic = (
+        np.zeros(count, np.int16) if classes is None else world_classes(classes, _CLASSES)
+    )
+    if camera_classes is None:
+        return lidar_semantic
+    camera_semantic = world_classes(camera_classes, _CAMERA_CLASSES)
+    return np.where(lidar_semantic == SemanticClass.UNKNOWN, camera_semantic, lidar_semantic)
 
 
 _BOX = (*(f"box.{n}.{axis}" for n in ("center", "size") for axis in "xyz"), "box.heading")
@@ -433,7 +463,7 @@ class WaymoLabels:
 
     @property
     def lidar_top_rad(self) -> float:
-        """That of TOP: the others look 30 degrees up, and 20 m far."""
+        """Highest elevation of the TOP laser; the other lasers look 30 degrees up, but 20 m far."""
         top = self.segment.lasers.get("TOP")
         return 0.0 if top is None else float(top.highest_rad)
 
@@ -461,14 +491,18 @@ class WaymoLabels:
         return LidarSweep({name: np.array(column) for name, column in columns.items()})
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        numbers, seen = sweep.columns.get("semantic"), sweep.columns.get("camera_class")
-        if numbers is None and seen is None:
+        classes = sweep.columns.get("semantic")
+        camera_classes = sweep.columns.get("camera_class")
+        if classes is None and camera_classes is None:
             return None
-        return _semantic(numbers, seen, len(sweep))
+        return _semantic(classes, camera_classes, len(sweep))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """Where the TOP laser was as each beam left it, by the dataset's pose of each pixel; the
-        other lasers at the time of the vehicle pose, to which their returns were moved."""
+        """Return the laser's position of each return, float64 [N, 3], the dataset's world.
+
+        The TOP laser's is that at the time of each beam, by the dataset's pose of each pixel. The
+        other lasers' is that at the time of the vehicle pose, to which the dataset moved their
+        returns."""
         returns = _last_returns(self.segment, frame_index)
         if returns is None:
             return None
@@ -499,29 +533,30 @@ def _all_boxes(segment: Segment) -> dict[int, Boxes]:
     frames = segment.frames_of(rows.stamps(), rows.path)
     order = np.lexsort((names.astype(str), frames))  # rows have no order of their own
     starts = np.flatnonzero(np.diff(frames[order], prepend=-1))
-    found = {}
-    for own in np.split(order, starts[1:]):
-        pose = segment.world_from_vehicle[frames[own[0]]]
-        heading = Rotation.from_rotvec(np.nan_to_num(values[own, 6:]) * [0, 0, 1])
+    boxes_by_frame = {}
+    for box_rows in np.split(order, starts[1:]):
+        pose = segment.world_from_vehicle[frames[box_rows[0]]]
+        heading = Rotation.from_rotvec(np.nan_to_num(values[box_rows, 6:]) * [0, 0, 1])
         quats = (Rotation.from_matrix(pose[:3, :3]) * heading).as_quat()[:, [3, 0, 1, 2]]
-        quats[~np.isfinite(values[own, 6])] = np.nan
-        found[int(frames[own[0]])] = Boxes(
-            tuple(names[own]),
-            tuple(types[i] for i in own),
-            values[own, :3] @ pose[:3, :3].T + pose[:3, 3],
-            values[own, 3:6].astype(np.float64),
+        quats[~np.isfinite(values[box_rows, 6])] = np.nan
+        boxes_by_frame[int(frames[box_rows[0]])] = Boxes(
+            tuple(names[box_rows]),
+            tuple(types[i] for i in box_rows),
+            values[box_rows, :3] @ pose[:3, :3].T + pose[:3, 3],
+            values[box_rows, 3:6].astype(np.float64),
             quats,
-            {name: column[own] for name, column in attributes.items()},
+            {name: column[box_rows] for name, column in attributes.items()},
         )
-    return found
+    return boxes_by_frame
 
 
 def moving_boxes(
     segment: Segment, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Any, ...], tuple[str, ...]]:
-    """The boxes of moving objects in the frames, and a sentence for each fault. When the labels
-    stand for is not published: a box is taken to be where its object was as the TOP laser's turn
-    came past it."""
+    """Return the boxes of moving objects in the frames, and a sentence for each fault.
+
+    The dataset does not state the time of a box. It is taken to be the time at which the TOP
+    laser's turn passed the box."""
     timed = []
     for n in numbers:
         boxes = _all_boxes(segment).get(n, Boxes.empty())
@@ -605,7 +640,7 @@ def waymo_labels(path: str, query: dict[str, str]) -> WaymoLabels:
 
 
 def waymo_files(path: Path | str, query: dict[str, str]) -> list[Path]:
-    """The files that are read of a segment, whether they are there or not."""
+    """Return the paths of all files that a segment may have; they need not exist."""
     files = find_segment(Path(path), query.get("segment"))
     return [files.path(component) for component in COMPONENTS]
 
@@ -624,8 +659,8 @@ def _notes(segment: Segment, numbers: Sequence[int]) -> list[str]:
             f"cameras and weather go with"
         )
     if len(numbers) > 1 and longest_s:
-        places, times = segment.world_from_vehicle[:, :3, 3], segment.pose_times_ns
-        speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (np.diff(times) * 1e-9)
+        steps_m = np.linalg.norm(np.diff(segment.world_from_vehicle[:, :3, 3], axis=0), axis=1)
+        speeds = steps_m / (np.diff(segment.pose_times_ns) * 1e-9)
         half_m = float(speeds.max()) * longest_s / 2
         notes.append(
             f"images are read out in {longest_s * 1e3:.0f} ms and stand where the car was halfway: "
@@ -661,28 +696,31 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
 def read_sweeps(
     segment: Segment, numbers: Sequence[int], origin: np.ndarray
 ) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """The usable returns of the frames in the scene's world, and what was missing. Of long drives
-    every second return is taken, or every third, and so on, so that there are at most
-    _MAX_RETURNS."""
+    """Return the usable returns of the frames in the scene's world, and a sentence for each fault.
+
+    Long drives are thinned: every second return is taken, or every third, and so on, so that there
+    are at most _MAX_RETURNS."""
     sweeps: dict[int, Sweep] = {}
-    missing, faults, step = [], {}, 0
+    missing: list[int] = []
+    faults: dict[int, AdapterError] = {}
+    step = 0  # of the returns that are taken, 0 until the first sweep is read
     has_returns = segment.files.has("lidar")
     rows = _index(segment, "lidar", "key.laser_name", LASERS) if has_returns else {}
     in_file = sorted(numbers, key=lambda n: min(rows.get(n, {0: 0}).values()))
     waiting: deque[tuple[int, Future[Sweep | None]]] = deque()
 
-    def finish(n: int, sweep: Future[Sweep | None]) -> None:
+    def finish(n: int, future: Future[Sweep | None]) -> None:
         try:
-            found = sweep.result()
+            sweep = future.result()
         except AdapterError as error:
             faults[n] = error
         else:
-            missing.extend([n] if found is None else [])
-            sweeps.update({} if found is None else {n: found})
+            missing.extend([n] if sweep is None else [])
+            sweeps.update({} if sweep is None else {n: sweep})
 
     with ThreadPoolExecutor(_THREADS) as pool:
         for n in tqdm(in_file, desc="LiDAR", unit="sweep", disable=None):
-            try:  # in the file's order; only what is made of it is made in turns
+            try:  # read in the file's order; the threads only convert what was read
                 scans = _read_scans(segment, n)
                 first = None if scans is None or step else scans.returns()
                 if first is not None:  # as if all frames had as many as the first
@@ -713,8 +751,8 @@ def read_sweeps(
     return tuple(sweeps[n] for n in sorted(sweeps)), tuple(problems)
 
 
-def _usable_sweep(scans: _Scans, every: int, origin: np.ndarray) -> Sweep | None:
-    returns = scans.returns(every)
+def _usable_sweep(scans: _Scans, stride: int, origin: np.ndarray) -> Sweep | None:
+    returns = scans.returns(stride)
     if returns is None:
         return None
     points = returns.points_m

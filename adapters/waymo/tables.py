@@ -44,7 +44,8 @@ COMPONENTS = {
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # numbered from 1
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")  # numbered from 1
 TOP = 1
-SEGMENT, STAMP = "key.segment_context_name", "key.frame_timestamp_micros"
+SEGMENT = "key.segment_context_name"  # column of a row's segment
+STAMP = "key.frame_timestamp_micros"  # column of a row's frame, Unix time in microseconds
 MAX_SIDE = 10_000  # of a range image; published ones have 2650 columns
 # Axes of the dataset's cameras (x out of the lens, y left, z up) from OpenCV's.
 _CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -74,42 +75,44 @@ class SegmentFiles:
         return self.path(component).is_file()
 
 
-def find_segment(path: Path, wanted: str | None) -> SegmentFiles:
-    """The segment at a path: the only one, or the one of that name or first part of a name."""
-    alone = SegmentFiles("", path, is_alone=True)
-    if alone.has(WAYMO_REQUIRED[0]):
-        file = alone.path(WAYMO_REQUIRED[0])
+def find_segment(path: Path, segment_name: str | None) -> SegmentFiles:
+    """Return the files of one segment at a path.
+
+    segment_name: the segment's name or the first part of it; None for the only one."""
+    files = SegmentFiles("", path, is_alone=True)
+    if files.has(WAYMO_REQUIRED[0]):
+        file = files.path(WAYMO_REQUIRED[0])
         with reading(file):
             table = read_table(file, str(file), [SEGMENT])
         names = set(_segment_names(table, file))
-        found = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
+        segments = {str(name): SegmentFiles(str(name), path, is_alone=True) for name in names}
     else:
-        found = {
+        segments = {
             file.stem: SegmentFiles(file.stem, folder)
             for folder in (path, *(path / split for split in WAYMO_SPLITS))
             for file in sorted((folder / WAYMO_REQUIRED[0]).glob("*.parquet"))
         }
-    if not found:
+    if not segments:
         raise AdapterError(
             f"{path} holds no segment of the Waymo Open Dataset v2; expected "
             f"{WAYMO_REQUIRED[0]}/SEGMENT.parquet in it or in its {', '.join(WAYMO_SPLITS)}"
         )
-    names = sorted(found)
-    if wanted is not None:
-        wanted = wanted.removeprefix("segment-").removesuffix("_with_camera_labels")
-        names = [n for n in names if n == wanted] or [
-            n for n in names if n.startswith(f"{wanted}_")
+    names = sorted(segments)
+    if segment_name is not None:
+        segment_name = segment_name.removeprefix("segment-").removesuffix("_with_camera_labels")
+        names = [n for n in names if n == segment_name] or [
+            n for n in names if n.startswith(f"{segment_name}_")
         ]
     if len(names) == 1:
-        return found[names[0]]
-    first = ", ".join(names[:3] or sorted(found)[:3])
+        return segments[names[0]]
+    examples = ", ".join(names[:3] or sorted(segments)[:3])
     if not names:
         raise AdapterError(
-            f"{path} has no segment {wanted!r}; it has {len(found)}, such as {first}"
+            f"{path} has no segment {segment_name!r}; it has {len(segments)}, such as {examples}"
         )
     raise AdapterError(
         f"{path} has {len(names)} segments; a scene is one of them, give ?segment={names[0]} "
-        f"(there are {first})"
+        f"(there are {examples})"
     )
 
 
@@ -130,20 +133,23 @@ def _segment_names(table: pa.Table, path: Path) -> list[str]:
 
 
 class Rows:
-    """The rows of a segment in one component; columns go by their fields' names, keys by theirs."""
+    """The rows of one segment in one component.
+
+    A column is named by its field, such as `type`, or by its key, such as `key.laser_name`."""
 
     def __init__(self, files: SegmentFiles, component: str, fields: Sequence[str]) -> None:
         self.path = files.path(component)
         self._class = COMPONENTS[component]
-        wanted = [field if field == STAMP else self.name(field) for field in fields]
+        columns = [field if field == STAMP else self.name(field) for field in fields]
         with reading(self.path):
-            table = read_table(self.path, str(self.path), [SEGMENT, *wanted])
+            table = read_table(self.path, str(self.path), [SEGMENT, *columns])
             names = _segment_names(table, self.path)
-            same = pa.array([name == files.name for name in names], pa.bool_())
-            self._table = table.append_column("row", pa.array(np.arange(len(table)))).filter(same)
+            is_segment = pa.array([name == files.name for name in names], pa.bool_())
+            numbered = table.append_column("row", pa.array(np.arange(len(table))))
+            self._table = numbered.filter(is_segment)
         if not len(self._table):
-            held = ", ".join(map(repr, list(dict.fromkeys(names))[:3])) or "none"
-            raise self.fault(SEGMENT, f"must be {files.name!r} in some rows; got {held}")
+            other_names = ", ".join(map(repr, list(dict.fromkeys(names))[:3])) or "none"
+            raise self.fault(SEGMENT, f"must be {files.name!r} in some rows; got {other_names}")
 
     def __len__(self) -> int:
         return len(self._table)
@@ -168,8 +174,10 @@ class Rows:
         return self._table[self.name(field)].combine_chunks()
 
     def values(self, field: str, *, or_else: float | None = None) -> np.ndarray:
-        """A number for each row, as the file has it. or_else: for nulls, which are refused without,
-        and for all rows where there is no such column."""
+        """Return a number for each row, in the file's type.
+
+        or_else: value for nulls, and for all rows where there is no such column; without it, both
+        are refused."""
         if or_else is not None and not self.has(field):
             return np.full(len(self), or_else)
         column = self.column(field)
@@ -208,21 +216,23 @@ class Rows:
         return values
 
     def enum(self, field: str, words: Sequence[str]) -> np.ndarray:
-        """Numbers from 1 of the words, which the file may have in their place, int64."""
-        of = {word: number for number, word in enumerate(words, start=1)}
-        of |= {number: number for number in of.values()}
+        """Return the number of each row's word, from 1, int64; the file may hold either."""
+        number_of = {word: number for number, word in enumerate(words, start=1)}
+        number_of |= {number: number for number in number_of.values()}
         values = self._words(field)
-        if strange := [value for value in values if value not in of]:
+        if unknown_values := [value for value in values if value not in number_of]:
             expected = f"numbers from 1 to {len(words)} or {', '.join(words)}"
-            raise self.fault(field, f"must hold {expected}; got {strange[0]!r}")
-        return np.array([of[value] for value in values], np.int64)
+            raise self.fault(field, f"must hold {expected}; got {unknown_values[0]!r}")
+        return np.array([number_of[value] for value in values], np.int64)
 
     def box_types(self, field: str, words: Sequence[str]) -> list[str]:
-        """The words that the rows' numbers from 1, or the dataset's names such as TYPE_VEHICLE,
-        stand for; else Unknown."""
-        of = {number: word for number, word in enumerate(words, start=1)}
-        of |= {f"TYPE_{word.upper()}": word for word in words}
-        return [of.get(value, "Unknown") for value in self._words(field)]
+        """Return the word of each row; Unknown where the row has another value.
+
+        A row holds the word's number, from 1, or the dataset's name of it, such as
+        TYPE_VEHICLE."""
+        word_of = {number: word for number, word in enumerate(words, start=1)}
+        word_of |= {f"TYPE_{word.upper()}": word for word in words}
+        return [word_of.get(value, "Unknown") for value in self._words(field)]
 
     def _words(self, field: str) -> list[Any]:
         """Numbers, texts or None."""
@@ -249,10 +259,10 @@ class Rows:
         column = self.column(field)
         if not NUMBER_LISTS.matches(column.type):
             raise self.fault(field, f"must hold {NUMBER_LISTS.words}; it holds {column.type}")
-        found = [None if cell.values is None else _flat(cell) for cell in column]
-        if any(values is not None and not np.isfinite(values).all() for values in found):
+        lists = [None if cell.values is None else _flat(cell) for cell in column]
+        if any(values is not None and not np.isfinite(values).all() for values in lists):
             raise self.fault(field, "holds numbers that are not finite")
-        return found
+        return lists
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -323,7 +333,8 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """What a segment's small tables say. Frames are numbered from 0 in order of time.
+    """Calibration, poses and image times of one segment. Frames are numbered from 0 in order of
+    time.
 
     stamps_us: int64 [F], the frames' keys: when the TOP laser begins its turn. world_from_vehicle:
     float64 [F, 4, 4], at pose_times_ns, int64 [F], about the middle of that turn. cameras, lasers:
@@ -340,41 +351,45 @@ class Segment:
 
     def frames_of(self, stamps_us: np.ndarray, path: Path) -> np.ndarray:
         """The frames' numbers of a table's rows, int64."""
-        at = np.clip(np.searchsorted(self.stamps_us, stamps_us), 0, len(self.stamps_us) - 1)
-        if (unknown := self.stamps_us[at] != stamps_us).any():
+        frames = np.clip(np.searchsorted(self.stamps_us, stamps_us), 0, len(self.stamps_us) - 1)
+        if (is_unknown := self.stamps_us[frames] != stamps_us).any():
             raise AdapterError(
-                f"{path}: {unknown.sum()} rows are of frames without a row in vehicle_pose, such "
-                f"as {stamps_us[unknown][0]}; {_ADVICE}"
+                f"{path}: {is_unknown.sum()} rows are of frames without a row in vehicle_pose, "
+                f"such as {stamps_us[is_unknown][0]}; {_ADVICE}"
             )
-        return at
+        return frames
 
 
 def read_segment(files: SegmentFiles) -> Segment:
-    """All but images, range images and labels; what its components say that are there."""
+    """Read the poses, calibration and image times of a segment, from the components it has."""
     rows = Rows(files, "vehicle_pose", [STAMP, "world_from_vehicle.transform"])
-    stamps, poses = rows.stamps(), rows.poses("world_from_vehicle.transform")
+    stamps = rows.stamps()
+    poses = rows.poses("world_from_vehicle.transform")
     order = np.argsort(stamps, kind="stable")
-    stamps, poses = stamps[order], poses[order]
+    stamps = stamps[order]
+    poses = poses[order]
     if not (np.abs(stamps.astype(np.float64)) <= _LATEST_S * 1e6).all():
         raise rows.fault(
             STAMP, f"must be Unix time in microseconds; got {stamps[0]} to {stamps[-1]}"
         )
     if (np.diff(stamps) <= 0).any():
-        twice = stamps[1:][np.diff(stamps) <= 0][0]
-        raise rows.fault(STAMP, f"must name each frame once; {twice} stands twice")
+        repeated_stamp = stamps[1:][np.diff(stamps) <= 0][0]
+        raise rows.fault(STAMP, f"must name each frame once; {repeated_stamp} stands twice")
     cameras = _read_cameras(files) if files.has("camera_calibration") else {}
     lasers = _read_lasers(files) if files.has("lidar_calibration") else {}
     segment = Segment(files, stamps, poses, stamps * 1000 + _SPIN_NS // 2, cameras, lasers, {}, ())
     shots, problems = _read_shots(segment) if cameras and files.has("camera_image") else ({}, ())
     if missing := [name for name in WAYMO_REQUIRED if not files.has(name)]:
-        lacks = (
+        sentence = (
             f"the segment lacks {', '.join(str(files.path(name)) for name in missing)}; a scene "
             f"needs the components {', '.join(WAYMO_REQUIRED)}, download them too"
         )
-        problems = (lacks, *problems)
+        problems = (sentence, *problems)
     times = [
-        own["FRONT"].pose_ns if "FRONT" in (own := shots.get(n, {})) else int(usual)
-        for n, usual in enumerate(segment.pose_times_ns)
+        frame_shots["FRONT"].pose_ns
+        if "FRONT" in (frame_shots := shots.get(n, {}))
+        else int(pose_time_ns)
+        for n, pose_time_ns in enumerate(segment.pose_times_ns)
     ]
     times_ns = np.array(times, np.int64)
     return replace(segment, pose_times_ns=times_ns, shots=shots, problems=problems)
@@ -382,14 +397,15 @@ def read_segment(files: SegmentFiles) -> Segment:
 
 def _read_cameras(files: SegmentFiles) -> dict[str, Mount]:
     numbers = [f"intrinsic.{n}" for n in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
-    key, pose = "key.camera_name", "extrinsic.transform"
+    key = "key.camera_name"
+    pose = "extrinsic.transform"
     rows = Rows(files, "camera_calibration", [key, *numbers, pose, "width", "height"])
     vehicle_from_camera = rows.poses(pose) @ _CAMERA_FROM_OPENCV
     sizes = np.stack([rows.finite("width"), rows.finite("height")], axis=1)
     if not ((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all():
         raise rows.fault("width", f"and height must be 1 to {MAX_SIDE_PX} pixels; got {sizes[0]}")
     values = np.stack([rows.finite(name) for name in numbers], axis=1)
-    found = {}
+    mounts = {}
     for i, number in enumerate(rows.enum(key, CAMERAS)):
         name = CAMERAS[number - 1]
         lens = Lens(*map(int, sizes[i]), *map(float, values[i]))
@@ -399,29 +415,38 @@ def _read_cameras(files: SegmentFiles) -> dict[str, Mount]:
             _ = lens.pinhole
         except ValueError as error:
             raise rows.fault("intrinsic.f_u", f"and the others: camera {name}, {error}") from None
-        found[name] = Mount(lens, vehicle_from_camera[i])
-    return {name: found[name] for name in CAMERAS if name in found}
+        mounts[name] = Mount(lens, vehicle_from_camera[i])
+    return {name: mounts[name] for name in CAMERAS if name in mounts}
 
 
 def _read_lasers(files: SegmentFiles) -> dict[str, Laser]:
-    key, pose = "key.laser_name", "extrinsic.transform"
+    key = "key.laser_name"
+    pose = "extrinsic.transform"
     low, high, values = (f"beam_inclination.{name}" for name in ("min", "max", "values"))
     rows = Rows(files, "lidar_calibration", [key, pose, low, high, values])
-    poses, lows, highs = rows.poses(pose), rows.finite(low), rows.finite(high)
-    given = rows.lists(values)
-    found = {}
+    poses = rows.poses(pose)
+    lows = rows.finite(low)
+    highs = rows.finite(high)
+    inclinations = rows.lists(values)
+    lasers = {}
     for i, number in enumerate(rows.enum(key, LASERS)):
-        own = given[i] if given[i] is not None and len(given[i]) else None
+        inclinations_rad = (
+            inclinations[i] if inclinations[i] is not None and len(inclinations[i]) else None
+        )
         name = LASERS[number - 1]
-        found[name] = Laser(name, poses[i], (float(lows[i]), float(highs[i])), own)
-    return {name: found[name] for name in LASERS if name in found}
+        lasers[name] = Laser(name, poses[i], (float(lows[i]), float(highs[i])), inclinations_rad)
+    return {name: lasers[name] for name in LASERS if name in lasers}
 
 
 def _read_shots(segment: Segment) -> tuple[dict[int, dict[str, Shot]], tuple[str, ...]]:
-    """Poses at the middle of each image's readout. The dataset's own are up to some milliseconds
-    off it, so they go on with the velocities: position along the linear one, world axes, rotation
-    by the angular one, vehicle axes."""
-    key, pose, time = "key.camera_name", "pose.transform", "pose_timestamp"
+    """Return the shots by frame and camera, and a sentence for each problem.
+
+    A shot's pose is that at the middle of its readout. The dataset's poses are up to some
+    milliseconds off it, so each is carried on with the velocities: the position by the linear
+    velocity (world axes), the rotation by the angular velocity (vehicle axes)."""
+    key = "key.camera_name"
+    pose = "pose.transform"
+    time = "pose_timestamp"
     speeds = [
         f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz"
     ]
@@ -430,40 +455,46 @@ def _read_shots(segment: Segment) -> tuple[dict[int, dict[str, Shot]], tuple[str
     fields = [STAMP, key, pose, time, *speeds, *shutter]
     rows = Rows(segment.files, "camera_image", fields)
     frames = segment.frames_of(rows.stamps(), rows.path)
-    poses, pose_s = rows.poses(pose), rows.finite(time, _LATEST_S)
+    poses = rows.poses(pose)
+    pose_s = rows.finite(time, _LATEST_S)
     velocity = np.stack([rows.values(name, or_else=0) for name in speeds], axis=1)
     begun_s, done_s, open_s = (rows.values(name, or_else=0) for name in shutter)
     if np.abs(pose_s - segment.stamps_us[frames] * 1e-6).max(initial=0) > _NEAR_S:
         raise rows.fault(time, f"must be seconds of Unix time within {_NEAR_S} s of its frame's")
     with np.errstate(all="ignore"):
         offset_s = (begun_s + done_s) / 2 - pose_s
-        known = (np.abs(offset_s) < _NEAR_S) & np.isfinite(velocity).all(axis=1)
-    offset_s[~known] = 0
-    moved = poses.copy()
-    moved[known, :3, 3] += (velocity[:, :3] * offset_s[:, None])[known]
-    turns = Rotation.from_rotvec((velocity[:, 3:] * offset_s[:, None])[known]).as_matrix()
-    moved[known, :3, :3] = poses[known, :3, :3] @ turns
+        has_motion = (np.abs(offset_s) < _NEAR_S) & np.isfinite(velocity).all(axis=1)
+    offset_s[~has_motion] = 0
+    middle_poses = poses.copy()
+    middle_poses[has_motion, :3, 3] += (velocity[:, :3] * offset_s[:, None])[has_motion]
+    turns = Rotation.from_rotvec((velocity[:, 3:] * offset_s[:, None])[has_motion]).as_matrix()
+    middle_poses[has_motion, :3, :3] = poses[has_motion, :3, :3] @ turns
     pose_ns = np.round(pose_s * 1e9).astype(np.int64)
     times_ns = pose_ns + np.round(offset_s * 1e9).astype(np.int64)
-    took_s = np.where(known, done_s - begun_s - open_s, 0)
-    found: dict[int, dict[str, Shot]] = {}
+    readout_s = np.where(has_motion, done_s - begun_s - open_s, 0)
+    shots: dict[int, dict[str, Shot]] = {}
     for i, number in enumerate(rows.enum(key, CAMERAS)):
-        name, frame = CAMERAS[number - 1], int(frames[i])
+        name = CAMERAS[number - 1]
+        frame = int(frames[i])
         if name not in segment.cameras:
             raise rows.fault(key, f"names camera {name}, which camera_calibration has not")
         shot = Shot(
-            int(times_ns[i]), moved[i], int(pose_ns[i]), float(took_s[i]), int(rows.numbers[i])
+            int(times_ns[i]),
+            middle_poses[i],
+            int(pose_ns[i]),
+            float(readout_s[i]),
+            int(rows.numbers[i]),
         )
-        if name in found.setdefault(frame, {}):
+        if name in shots.setdefault(frame, {}):
             raise rows.fault(key, f"has two images of {name} at {segment.stamps_us[frame]}")
-        found[frame][name] = shot
+        shots[frame][name] = shot
     problems = []
-    if not known.all():
+    if not has_motion.all():
         problems.append(
-            f"{(~known).sum()} images have no times of their shutter or no velocity; their cameras "
-            f"stand where the car was at {time}"
+            f"{(~has_motion).sum()} images have no times of their shutter or no velocity; their "
+            f"cameras stand where the car was at {time}"
         )
-    return found, tuple(problems)
+    return shots, tuple(problems)
 
 
 # ---- Images --------------------------------------------------------------------------------------
@@ -474,17 +505,19 @@ _MAX_FAULTS = 3  # images with a sentence of their own
 def extract_images(
     segment: Segment, numbers: Sequence[int], now: Collection[int]
 ) -> tuple[dict[int, dict[str, str]], tuple[str, ...]]:
-    """Paths of the frames' images without lens distortion, by frame and camera, and a sentence for
-    what cannot be used. They lie in the user's cache (`adapters.scene_cache.image_folder`): those
-    of the frames in `now` at once, the others from when they are read on."""
+    """Return the paths of the frames' undistorted images by frame and camera, and the problems.
+
+    The images lie in the user's cache (`adapters.scene_cache.image_folder`). Those of the frames in
+    `now` are written at once, each other one when it is first read. A problem is a sentence about
+    images that cannot be used."""
     if not segment.shots:
         return {n: {} for n in numbers}, ()
     files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
     folder = image_folder(segment.files.name, files)
     shots = {
         f"{name}/{segment.stamps_us[n]}.jpg": (n, name, shot.row)
-        for n, own in segment.shots.items()
-        for name, shot in own.items()
+        for n, frame_shots in segment.shots.items()
+        for name, shot in frame_shots.items()
     }
     packed = PackedImages(
         table=os.path.abspath(files[0]),
@@ -492,23 +525,28 @@ def extract_images(
         lenses={name: mount.lens for name, mount in segment.cameras.items()},
         rows={file: row for file, (_, _, row) in shots.items()},
     )
-    wanted = set(numbers)
-    asked = {file: shot for file, shot in shots.items() if shot[0] in wanted}
-    faults = packed.put(folder, list(asked), [f for f, shot in asked.items() if shot[0] in now])
-    said = [
+    frames = set(numbers)
+    requested = {file: shot for file, shot in shots.items() if shot[0] in frames}
+    faults = packed.put(
+        folder, list(requested), [f for f, shot in requested.items() if shot[0] in now]
+    )
+    sentences = [
         f"camera {name}, frame {n}: its image {faults[file]}; left out"
-        for file, (n, name, _) in asked.items()
+        for file, (n, name, _) in requested.items()
         if file in faults
     ]
-    problems = said[:_MAX_FAULTS]
-    if len(said) > _MAX_FAULTS:
-        problems.append(f"{len(said) - _MAX_FAULTS} more images cannot be used")
-    found: dict[int, dict[str, str]] = {n: {} for n in numbers}
-    for file, (n, name, _) in asked.items():
+    problems = sentences[:_MAX_FAULTS]
+    if len(sentences) > _MAX_FAULTS:
+        problems.append(f"{len(sentences) - _MAX_FAULTS} more images cannot be used")
+    paths: dict[int, dict[str, str]] = {n: {} for n in numbers}
+    for file, (n, name, _) in requested.items():
         if file not in faults:
-            found[n][name] = str(folder / file)
+            paths[n][name] = str(folder / file)
     for name in segment.cameras:
         if without := [n for n in numbers if name not in segment.shots.get(n, {})]:
             problems.append(f"camera {name}: no image of {some(without)}")
-    ordered = {n: {name: own[name] for name in CAMERAS if name in own} for n, own in found.items()}
+    ordered = {
+        n: {name: frame_paths[name] for name in CAMERAS if name in frame_paths}
+        for n, frame_paths in paths.items()
+    }
     return ordered, tuple(problems)
