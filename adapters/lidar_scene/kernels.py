@@ -14,12 +14,12 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 
 import cv2
-import numba
 import numpy as np
 import torch
 
 from augment.cameras import Camera
 from augment.jobs.processes import available_cores
+from augment.render.cpu.jit import cached_njit
 from augment.sky import CubemapSky, directions_of_cubemap
 
 _FEATHER = 0.12  # images fade over this part of their width, so that exposures meet softly
@@ -146,7 +146,7 @@ def _widen(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return out + missing[..., None] * mean
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _gather(
     directions, rotation, intrinsics, free, sure, image, feather, unsure, sums, weights, sure_out
 ):  # pragma: no cover - compiled
@@ -182,7 +182,7 @@ def _gather(
         weights[i] += weight
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def draw_depth(
     centres, normals, major, extent, rotation, translation, fx, fy, cx, cy, depth
 ):  # pragma: no cover - compiled
@@ -238,7 +238,7 @@ def draw_depth(
                     depth[y, x] = zt
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def observe(
     centres, normals, extent, rotation, translation, fx, fy, cx, cy,
     depth, cover, levels, level_sizes, used_rows, camera, scores, colours, cameras,
@@ -298,7 +298,7 @@ def observe(
         cameras[i, worst] = camera
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _sample(image, size, u, v, out):  # pragma: no cover - compiled
     """Bilinear colour at relative coordinates, clamped at the border."""
     y = min(max(v * size[0] - 0.5, 0.0), size[0] - 1.0)
@@ -312,7 +312,7 @@ def _sample(image, size, u, v, out):  # pragma: no cover - compiled
         out[c] = np.uint8(top * (1 - fy) + bottom * fy + 0.5)
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def blended_colours(scores, colours, cameras, keep, power):  # pragma: no cover - compiled
     """Per surfel and camera the median, channel by channel, of observations whose score is at least
     `keep` of that camera's best; cameras are averaged with weights (best score)^power.

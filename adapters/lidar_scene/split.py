@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import torch
 
 from adapters.raw_drive import BoxSample, Sweep
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
+from augment.render.cpu.jit import cached_njit
 from augment.scene import Track
 from augment.semantics import SemanticClass
 
@@ -224,7 +224,7 @@ def split_sweeps(
     return PointSet.join(static), tuple(map(PointSet.join, actors))
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
     """Linear in position, slerp in rotation, held before the first and after the last knot."""
     last = len(knots) - 1
@@ -266,7 +266,7 @@ def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
         out[k, 3] = (1.0 - f) * centres[i, k] + f * centres[j, k]
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _into(knots, quats, centres, points, times, out):  # pragma: no cover - compiled
     pose = np.eye(4)
     for i in range(len(points)):

@@ -12,7 +12,6 @@ import dataclasses
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
@@ -21,6 +20,7 @@ from scipy.spatial import cKDTree
 from adapters.lidar_scene.kernels import in_parts
 from adapters.lidar_scene.split import PointSet, is_flat
 from augment.geometry import quat_from_rotmat
+from augment.render.cpu.jit import cached_njit
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass as Class
@@ -83,7 +83,7 @@ def _edges(voxel_m: float) -> np.ndarray:
     return voxel_m * 2.0 ** (_STEP * GROWTH * np.arange(_MAX_LEVEL + 1))
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _levels(points, path, out):  # pragma: no cover - compiled
     for i in range(len(points)):
         best = np.inf
@@ -103,7 +103,7 @@ def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarra
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _fill_keys(points, level, edges, out):  # pragma: no cover - compiled
     for i in range(len(points)):
         key = np.uint64(level[i])
@@ -113,7 +113,7 @@ def _fill_keys(points, level, edges, out):  # pragma: no cover - compiled
         out[i] = key
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _reduce(points, semantic, keys, level, order):  # pragma: no cover - compiled
     """Runs of equal keys to their mean, commonest class (the lower of equals) and level."""
     runs = 1
@@ -237,7 +237,7 @@ def _is_upright(semantic: np.ndarray) -> np.ndarray:
     return np.isin(semantic, _UPRIGHT)
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _covariances(points, index):  # pragma: no cover - compiled
     out = np.zeros((len(points), 3, 3))
     k = index.shape[1]
@@ -255,7 +255,7 @@ def _covariances(points, index):  # pragma: no cover - compiled
     return out / k
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _tangent(offset, e1, n):  # pragma: no cover - compiled
     """An offset along e1, along n x e1 and along n; and which half axis it lies nearest to:
     e1, -e1, n x e1 or its opposite."""
@@ -270,12 +270,12 @@ def _tangent(offset, e1, n):  # pragma: no cover - compiled
     return u, v, w, side
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _offset(points, i, j):  # pragma: no cover - compiled
     return (points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2])
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma: no cover - compiled
     """Mean over both sides of the gap to the nearest neighbour on the plane within 45 degrees of
     each tangent half axis. With one side far emptier this is the surface's rim, or one of two
@@ -451,7 +451,7 @@ def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> Point
     return PointSet(new, points.semantic[a[pair]])
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _find_bridges(
     points, semantic, normals, major, index, edge_m, widest
 ):  # pragma: no cover - compiled

@@ -23,6 +23,7 @@ from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.memo import SceneMemo
 from augment.reconstruct.view import ViewKey
+from augment.render.cpu.jit import cached_njit
 from augment.render.threads import kernel_threads
 from augment.scene import Scene
 
@@ -300,7 +301,7 @@ def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, None], columns[None]
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+@cached_njit(parallel=True, nogil=True, error_model="numpy")
 def hidden_returns(
     pixels, depth_m, grid, enough, most_radius, ratio, margin_m
 ):  # pragma: no cover - compiled

@@ -82,6 +82,29 @@ def _compiled(function: FunctionType, *, parallel: bool) -> Any:
     return compiled
 
 
+def cached_njit(**options: Any) -> Callable[[FunctionType], Any]:
+    """Return a decorator as `numba.njit(cache=True, **options)`, for functions beside the kernels.
+
+    What is compiled lies in the user's cache folder, and is compiled again when any file in the
+    function's folder changes.
+    """
+
+    def decorate(function: FunctionType) -> Any:
+        compiled = numba.njit(**options)(function)
+        folder = str(Path(function.__code__.co_filename).parent)
+        if (cache := cache_of_kernel(function, _hash_folder(folder))) is not None:
+            compiled._cache = cache
+        return compiled
+
+    return decorate
+
+
+@functools.cache
+def _hash_folder(folder: str) -> str:
+    sources = sorted(Path(folder).glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+
+
 def _compile_alone(compile_kernel: Callable[[Any], Any], name: str, sig: Any) -> Any:
     # In this order: a kernel's compilation compiles those that it calls, under numba's lock.
     with global_compiler_lock, compiling(name, sig), _CLOCK.running():
