@@ -127,12 +127,12 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
     out = Path(out).absolute()
     folder = path_below(out, (LABELS,))
     store = open_store(out)
-    asked = asked or _last_request(folder)
-    if wrong := [part for part in asked.split if folder_name(part) != part]:
+    request = asked or _last_request(folder)
+    if wrong := [part for part in request.split if folder_name(part) != part]:
         raise ValueError(f"parts are names of files: letters, digits, -, _ and .; got {wrong[0]!r}")
     with hold(store, LABELS):
         table = read_finished(store)
-        parts = split_by_scene(table, asked.split, asked.seed)
+        parts = split_by_scene(table, request.split, request.seed)
         of_scene = {
             s: part
             for part, part_table in parts.items()
@@ -144,7 +144,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
                 f"{out} has images of a scene called {LABELS!r}, whose folder the labels would "
                 f"take: render it under another name into another output"
             )
-        policies = _policies(out, rows, asked.changes)
+        policies = _policies(out, rows, request.changes)
         rows = [row for row in rows if (row["scene"], row["variant"]) in policies]
         if not rows:
             raise NothingLabelled(
@@ -152,7 +152,7 @@ def write_labels(out: Path | str, asked: LabelsAsked | None = None) -> LabelsWri
                 f"has boxes with output.labels: [{', '.join(FORMATS)}], or some of them"
             )
         names = _categories(out, rows, policies)
-        run = _Writing(out, RowReader(store, verify=False), asked, policies, names)
+        run = _Writing(out, RowReader(store, verify=False), request, policies, names)
         with replaced_folder(folder, (*FORMATS, INDEX, RECORD)) as new:
             return replace(run.go(new, rows, of_scene), folder=folder)
 

@@ -70,18 +70,20 @@ _TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_
 
 
 def buffers() -> dict[str, Buffer]:
-    """By name: depth, semantic, instance, and the masks."""
+    """Return the buffers by name: depth, semantic, instance, and the masks."""
     return _BUFFERS | dict.fromkeys(mask_names(), _MASK) | {TRUST: _TRUST}
 
 
 def loadable() -> tuple[str, ...]:
-    """What samples can hold, by the names of `load`."""
+    """Return the names that `load` may have: all that samples can hold."""
     return ("image", *buffers(), "boxes", "lidar")
 
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """What samples hold and how. load: of `loadable`. box_frame: of boxes and LiDAR points."""
+    """Content and form of samples. load: some names of `loadable`. box_frame: the frame of boxes
+    and LiDAR points.
+    """
 
     image_type: ImageType
     load: frozenset[str]
@@ -91,8 +93,8 @@ class SampleOptions:
     def checked(
         image_type: str = "float32", load: Collection[str] | None = None, box_frame: str = "world"
     ) -> SampleOptions:
-        """The options of these values. load: None for all but sweeps, which are large, and few
-        train on both. Raises ValueError: a value that there is not.
+        """Return checked options. load: None takes all but sweeps, which are large and which few
+        users train on together with images. Raises ValueError: a value that does not exist.
         """
         if load is None:
             load = set(loadable()) - {"lidar"}
@@ -119,8 +121,8 @@ def check_index(index: int, count: int, what: str = "sample") -> int:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What a frame has beside its images, in the dataset's world. box_weather: for the boxes.
-    instances: uint16 [B], their numbers.
+    """Labels of a frame, in the dataset's world. box_weather: numbers of the weather at each box.
+    instances: uint16 [B], the boxes' numbers in instance images.
     """
 
     boxes: Boxes | None = None
@@ -138,23 +140,24 @@ def make_sample(
     labels: Labels,
     described: Mapping[str, Any],
 ) -> Sample:
-    """One sample as the module describes it. images: as files store them, RGB [H, W, 3] and [H, W],
-    by the names of `load`. described: weather, paths and NAMES.
+    """Return one sample, a dictionary as the head of this module lists it. images: by the names of
+    `load`, RGB [H, W, 3] or [H, W], with the pixels that files store. described: weather, paths and
+    NAMES.
     """
-    made: Sample = dict.fromkeys(loadable())
+    sample: Sample = dict.fromkeys(loadable())
     for name, image in images.items():
         if name == "image":
-            made[name] = image_tensor(image, options.image_type)
+            sample[name] = image_tensor(image, options.image_type)
         else:
-            made[name] = buffers()[name].tensor(image)
+            sample[name] = buffers()[name].tensor(image)
     origins = {"ego": world_from_ego, "camera": camera.world_from_camera}
-    placed = (options.box_frame, origins.get(options.box_frame, torch.eye(4)).numpy())
+    axes = (options.box_frame, origins.get(options.box_frame, torch.eye(4)).numpy())
     if labels.boxes is not None:
         weather = labels.box_weather or {}
-        made["boxes"] = box_tensors(labels.boxes, weather, *placed, instances=labels.instances)
+        sample["boxes"] = box_tensors(labels.boxes, weather, *axes, instances=labels.instances)
     if labels.lidar is not None:
-        made["lidar"] = lidar_tensors(labels.lidar, *placed)
-    return {**made, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **described}
+        sample["lidar"] = lidar_tensors(labels.lidar, *axes)
+    return {**sample, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **described}
 
 
 def image_tensor(rgb: np.ndarray, image_type: ImageType) -> torch.Tensor:
@@ -199,7 +202,8 @@ def box_tensors(
     world_from_frame: float64 [4, 4]; unused where the frame is the world, whose numbers keep their
     bits.
     """
-    centers_m, quats = boxes.centers_m.copy(), boxes.quats.copy()
+    centers_m = boxes.centers_m.copy()
+    quats = boxes.quats.copy()
     if box_frame != "world":
         centers_m = moved_points(centers_m, world_from_frame)
         quats = turned_quats(quats, world_from_frame)
@@ -223,13 +227,13 @@ def box_tensors(
 
 
 def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
-    """Points of the world [N, 3] in another frame."""
+    """Return points of the world [N, 3] in the coordinates of another frame."""
     with np.errstate(invalid="ignore"):  # of points that are not finite, and stay so
         return (points_m - world_from_frame[:3, 3]) @ world_from_frame[:3, :3]
 
 
 def turned_quats(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
-    """Rotations world_from_box as frame_from_box; the quaternions keep their norms."""
+    """Return rotations world_from_box as frame_from_box; the quaternions keep their norms."""
     x, y, z, w = Rotation.from_matrix(world_from_frame[:3, :3].T).as_quat()
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     with np.errstate(invalid="ignore"):
@@ -246,10 +250,13 @@ def lidar_tensors(
     points_m = sweep.points_m
     if frame != "world":
         points_m = moved_points(points_m, world_from_frame)
-    rest = {name: column for name, column in sweep.columns.items() if name not in "xyz"}
+    other_columns = {name: column for name, column in sweep.columns.items() if name not in "xyz"}
     return {
         "points_m": torch.from_numpy(points_m),
-        **{n: torch.from_numpy(c) if c.dtype.kind in "biuf" else c for n, c in rest.items()},
+        **{
+            n: torch.from_numpy(c) if c.dtype.kind in "biuf" else c
+            for n, c in other_columns.items()
+        },
     }
 
 
@@ -307,14 +314,17 @@ def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
 
 
 def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
-    """In memory that a worker process shares with its parent: the queue to the parent would copy
-    the batch once more, as torch's own collate knows.
+    """Stack tensors in memory that a worker process shares with its parent. Otherwise the queue to
+    the parent would copy the batch once more; torch's own collate function does the same.
     """
     if get_worker_info() is None:
         return torch.stack(tensors)
-    first, size = tensors[0], (len(tensors), *tensors[0].shape)
-    storage = first._typed_storage()._new_shared(first.numel() * len(tensors), device=first.device)
-    return torch.stack(tensors, out=first.new(storage).resize_(size))
+    example = tensors[0]
+    size = (len(tensors), *tensors[0].shape)
+    storage = example._typed_storage()._new_shared(
+        example.numel() * len(tensors), device=example.device
+    )
+    return torch.stack(tensors, out=example.new(storage).resize_(size))
 
 
 def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[str, Any]:

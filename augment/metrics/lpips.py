@@ -157,9 +157,9 @@ def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
     from_torchvision = "features.0.weight" in tensors
     metric_tensors = {}
     for name, shape in expected_shapes(architecture).items():
-        file_name = _torchvision_name(name) if from_torchvision else name
+        stored_name = _torchvision_name(name) if from_torchvision else name
         metric_tensors[name] = _checked(
-            tensors.get(file_name), file_name, shape, file_of_name.get(file_name, weights)
+            tensors.get(stored_name), stored_name, shape, file_of_name.get(stored_name, weights)
         )
     for name, expected in (("shift", SHIFT), ("scale", SCALE)):
         tensor = tensors.get(f"scaling_layer.{name}")
@@ -210,10 +210,10 @@ def _recognised(tensors: Mapping[str, Tensor], path: Path) -> Architecture:
         expected_shape = expected_shapes(architecture)["net.slice1.0.weight"]
         if first_conv is not None and tuple(first_conv.shape) == expected_shape:
             return architecture
-    shape = f"it is {list(first_conv.shape)}" if first_conv is not None else "there is none"
+    text = f"it is {list(first_conv.shape)}" if first_conv is not None else "there is none"
     raise MetricError(
         f"{path}: expected a first convolution net.slice1.0.weight (LPIPS) or features.0.weight "
-        f"(torchvision) of AlexNet [64, 3, 11, 11] or VGG-16 [64, 3, 3, 3]; {shape}. The file holds "
+        f"(torchvision) of AlexNet [64, 3, 11, 11] or VGG-16 [64, 3, 3, 3]; {text}. The file holds "
         f"{', '.join(list(tensors)[:4]) or 'nothing'}"
     )
 
