@@ -84,7 +84,7 @@ def torchvision_sample(
     min_side_px: float = 1.0,
     min_pixels: int = 1,
 ) -> tuple[torch.Tensor, dict[str, Any]]:
-    """(image, target) of a sample, for `WeatherDataset(transform=torchvision_sample)`.
+    """Return (image, target) of a sample, for `WeatherDataset(transform=torchvision_sample)`.
 
     The image is [3, H, W] of the sample's type. The target holds, of the N boxes that are kept:
 
@@ -168,9 +168,15 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
         )
     K = camera["K"].numpy()
     view = Camera(
-        camera["name"], camera["width"], camera["height"], K[0, 0], K[1, 1], K[0, 2], K[1, 2],
+        camera["name"],
+        camera["width"],
+        camera["height"],
+        K[0, 0],
+        K[1, 1],
+        K[0, 2],
+        K[1, 2],
         torch.eye(4, dtype=torch.float64),
-    )  # fmt: skip
+    )
     centers_m, quats = boxes_in_camera(boxes, camera)
     names = tuple(boxes["track_ids"])
     camera_boxes = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)

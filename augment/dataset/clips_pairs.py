@@ -191,15 +191,15 @@ def _place(scene: str, seed: int) -> float:
 
 
 def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
-    """The images without weather and style, or those of one variant. Without a variant's name:
-    those whose manifest says that no effect is there, and whose other numbers of weather are all
-    zero or absent. Raises ValueError: there is no such variant.
+    """Select the images without weather and style, or those of one variant. Without a variant's
+    name: images whose manifest lists no effect, and whose other weather numbers are all zero or
+    absent. Raises ValueError: the variant does not exist.
     """
     return dataset.select(clean_mask(dataset.rows, variant))
 
 
 def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
-    """bool [N]: rows without weather and style, or of one variant. Raises ValueError, as above."""
+    """Return the rows that `clean_frames` selects, bool [N]. Raises ValueError likewise."""
     if variant is None:
         return ~np.logical_or.reduce(list(masks_of(rows).values()))
     codes, names = rows.codes("variant")
@@ -209,7 +209,7 @@ def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
 
 
 def masks_of(rows: Rows) -> dict[str, np.ndarray]:
-    """bool [N] by the effects' names: rows that have them."""
+    """Return by the effects' names the mask of rows, bool [N], that have the effect."""
     return effect_masks({name: rows.numbers(name) for name in rows.weather}, len(rows))
 
 
@@ -312,11 +312,11 @@ class MixedDataset(Dataset):
 
 def _check_alike(**sides: WeatherDataset) -> None:
     """Raise ValueError where the first dataset lacks what the second one's samples have."""
-    (name, poor), (other, rich) = sides.items()
-    if lacking := sorted(rich.given() - poor.given()):
+    (name, first), (other, second) = sides.items()
+    if names := sorted(second.given() - first.given()):
         raise ValueError(
-            f"samples of `{name}` ({', '.join(poor.uris)}) have no {', '.join(lacking)}, those of "
-            f"`{other}` ({', '.join(rich.uris)}) have: batches would not stack. Open both with a "
+            f"samples of `{name}` ({', '.join(first.uris)}) have no {', '.join(names)}, those of "
+            f"`{other}` ({', '.join(second.uris)}) have: batches would not stack. Open both with a "
             f"`load` without it, or render it for `{name}` too"
         )
 
@@ -422,7 +422,7 @@ class ClipDataset(Dataset):
 
 
 def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
-    """Samples [T][C] as one clip."""
+    """Join samples [T][C] to one clip."""
     first = [frame[0] for frame in frames]
     clip = dict(first[0])
     for key in ("image", *buffers()):
@@ -438,11 +438,11 @@ def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
 
 
 def _joined(values: list[list[Any]]) -> Any:
-    """[T][C] tensors as one; None where there are only None; else the lists."""
-    joined = stack_alike([value for frame in values for value in frame])
-    if isinstance(joined, torch.Tensor):
-        return joined.unflatten(0, (len(values), -1))
-    return None if joined is None else values
+    """Stack tensors [T][C]. Returns None if all are None, and the lists if they differ in shape."""
+    stack = stack_alike([value for frame in values for value in frame])
+    if isinstance(stack, torch.Tensor):
+        return stack.unflatten(0, (len(values), -1))
+    return None if stack is None else values
 
 
 def _boxes(camera_boxes: list[dict[str, Any]]) -> dict[str, Any]:
@@ -457,9 +457,9 @@ def _boxes(camera_boxes: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _cameras(cameras: list[list[Mapping[str, Any]]]) -> dict[str, Any]:
-    joined = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
-    ego = joined["world_from_ego"][:, 0]
-    return {**joined, "name": joined["name"][0], "world_from_ego": ego}
+    stack = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
+    ego = stack["world_from_ego"][:, 0]
+    return {**stack, "name": stack["name"][0], "world_from_ego": ego}
 
 
 def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
@@ -501,7 +501,7 @@ def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
 
 def _late(clock_ns: np.ndarray) -> np.ndarray:
     """Return True where any camera's next image is late, bool [F - 1]. clock_ns: int64 [F, C]."""
-    waits = np.diff(clock_ns, axis=0)
-    usual = np.median(waits, axis=0) if len(waits) else np.zeros(clock_ns.shape[1])
-    late = (waits > MAX_LATE * usual) | (waits < 0)
-    return np.logical_or.reduce(late, axis=1)
+    waits_ns = np.diff(clock_ns, axis=0)
+    interval_ns = np.median(waits_ns, axis=0) if len(waits_ns) else np.zeros(clock_ns.shape[1])
+    is_late = (waits_ns > MAX_LATE * interval_ns) | (waits_ns < 0)
+    return np.logical_or.reduce(is_late, axis=1)

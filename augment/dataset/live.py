@@ -191,9 +191,14 @@ class SceneDataset(Dataset):
             return view, Labels()
         boxes = self.scene.boxes(frame.index)
         view, measured = label_view(
-            boxes, index.instances, index.world_origin_m, camera, view, recipe,
+            boxes,
+            index.instances,
+            index.world_origin_m,
+            camera,
+            view,
+            recipe,
             evidence=lambda: evidence_of(self.scene, frame.index),
-        )  # fmt: skip
+        )
         if not (recipe.output.labels and "boxes" in load):
             return view, Labels()
         return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))

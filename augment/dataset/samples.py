@@ -113,7 +113,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
 
 def check_index(index: int, count: int, what: str = "sample") -> int:
-    """The index counted from 0. Raises IndexError, as a list does."""
+    """Return the index counted from 0, as a list counts it. Raises IndexError: it is outside."""
     if not -count <= index < count:
         raise IndexError(f"{what} {index} of a dataset of {count}")
     return index % count
@@ -161,7 +161,7 @@ def make_sample(
 
 
 def image_tensor(rgb: np.ndarray, image_type: ImageType) -> torch.Tensor:
-    """uint8 [H, W, 3] as [3, H, W] of the type."""
+    """Return an image, uint8 [H, W, 3], as a tensor [3, H, W] of the type."""
     planes: Any = np.empty((3, *rgb.shape[:2]), np.uint8)
     cv2.split(rgb, list(planes))  # a third of the time of NumPy's transposed copy
     image = torch.from_numpy(planes)
@@ -292,11 +292,11 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _check_in_all(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
-    lacking = [sample for sample in samples if sample[key] is None]
-    if 0 < len(lacking) < len(samples):
-        names = dict.fromkeys(f"{sample['scene']}/{sample['variant']}" for sample in lacking)
+    gaps = [sample for sample in samples if sample[key] is None]
+    if 0 < len(gaps) < len(samples):
+        names = dict.fromkeys(f"{sample['scene']}/{sample['variant']}" for sample in gaps)
         raise ValueError(
-            f"{len(lacking)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
+            f"{len(gaps)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
             f"{', '.join(names)}. Leave {key!r} out of `load` in all datasets that are mixed, or "
             f"mix only outputs that have it"
         )
@@ -306,7 +306,7 @@ Stack = Callable[[list[torch.Tensor]], torch.Tensor]
 
 
 def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
-    """Tensors of one shape as one tensor; None where there are only None; else the list."""
+    """Stack tensors of one shape. Returns None if all values are None, the list if they differ."""
     shapes = {None if value is None else value.shape for value in values}
     if shapes == {None}:
         return None
@@ -328,14 +328,14 @@ def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
 
 
 def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[str, Any]:
-    """Matrices and numbers as tensors, those of unlike clips as lists, with one dimension more;
-    names as a list.
+    """Stack the matrices and numbers of cameras. Names become a list; so do matrices and numbers
+    of clips that differ in shape.
     """
     values = {key: [camera[key] for camera in cameras] for key in cameras[0]}
     return {k: v if k == "name" else _stack_numbers(v, stack) for k, v in values.items()}
 
 
 def _stack_numbers(values: list[Any], stack: Stack) -> Any:
-    """Whole numbers as int64 [N]; tensors stacked."""
+    """Stack tensors, or make a tensor int64 [N] of whole numbers."""
     is_tensor = isinstance(values[0], torch.Tensor)
     return stack_alike(values, stack) if is_tensor else torch.tensor(values)

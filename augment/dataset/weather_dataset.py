@@ -58,12 +58,12 @@ pc: Any = pyarrow.compute  # type checkers do not see the functions that it make
 # that repeat. Here every column is dictionary-encoded with the smallest codes; paths are split into
 # folder and file name, of which there are few. Arrow's buffers are shared by forked workers.
 
-_PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
-_FOLDERS = "/folders"  # what follows a path's name in the name of its column of folders
-_DIGEST = pa.binary(32)  # a SHA-256
-_MANY = 1 << 16  # values of a column
-_FEW = 1 << 12
-_OUTPUT = "output"
+_PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # pattern of a path; the folder has its slash
+_FOLDERS = "/folders"  # suffix of the name of a path's column of folders
+_DIGEST = pa.binary(32)  # type of a SHA-256
+_MAX_CODED_NUMBERS = 1 << 16  # number of distinct values above which numbers are not encoded
+_MAX_PYTHON_VALUES = 1 << 12  # number of values above which a column's values stay Arrow's
+_OUTPUT = "output"  # name of the column that holds an output's URI
 
 Row = Mapping[str, Any]
 
@@ -151,7 +151,7 @@ class Rows:
                 indices: Any = column.indices.to_numpy()
                 codes = memoryview(indices)
                 values = column.dictionary
-            if values is column or len(values) > _FEW:
+            if values is column or len(values) > _MAX_PYTHON_VALUES:
                 arrow_columns.append((name, codes, values))
             else:
                 object_columns.append((name, codes, values.to_pylist()))
@@ -174,7 +174,7 @@ class Rows:
         return np.unique(group, return_index=True)[1], group
 
     def has(self, kind: str) -> np.ndarray:
-        """bool [N]: the rows that name a file of a kind of `samples.loadable`."""
+        """Return the rows that name a file of a kind of `samples.loadable`, bool [N]."""
         codes, names = self.codes(f"{'labels' if kind == 'boxes' else kind}_path")
         is_file = np.array([name is not None for name in names], bool)
         return is_file[codes] if len(is_file) else np.zeros(len(self), bool)
@@ -185,8 +185,8 @@ class Rows:
 
 
 def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """int64 [N]: a number for the values that a row has in all columns, from 0 without gaps, in the
-    order of the first column, then of the second ...
+    """Number the combinations of values that rows have in all columns, int64 [N]. Numbers go from 0
+    without gaps, in the order of the first column, then of the second, and so on.
     """
     group = np.zeros(len(columns[0]), np.int64)
     for codes in columns:
@@ -196,18 +196,23 @@ def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _encoded(column: pa.ChunkedArray) -> pa.Array:
-    """By its distinct values; numbers that hardly repeat as they are."""
+    """Encode a column by its distinct values. Numbers that hardly repeat stay as they are."""
     is_coded = pa.types.is_dictionary(column.type)
-    coded: Any = (column if is_coded else column.dictionary_encode("encode")).combine_chunks()
-    count = len(coded.dictionary)
-    if count > _MANY and pa.types.is_primitive(column.type):
+    encoding: Any = (column if is_coded else column.dictionary_encode("encode")).combine_chunks()
+    count = len(encoding.dictionary)
+    if count > _MAX_CODED_NUMBERS and pa.types.is_primitive(column.type):
         return column.combine_chunks()
-    smallest = pa.uint8() if count <= 1 << 8 else pa.uint16() if count <= _MANY else pa.int32()
-    return pa.DictionaryArray.from_arrays(coded.indices.cast(smallest), coded.dictionary)
+    if count <= 1 << 8:
+        code_type = pa.uint8()
+    elif count <= 1 << 16:
+        code_type = pa.uint16()
+    else:
+        code_type = pa.int32()
+    return pa.DictionaryArray.from_arrays(encoding.indices.cast(code_type), encoding.dictionary)
 
 
 def _digests(column: pa.ChunkedArray) -> pa.Array:
-    """SHA-256 in lower-case digits as bytes; other texts as they are."""
+    """Return SHA-256 digests in lower-case digits as bytes; a column with other texts unchanged."""
     if column.null_count or not pc.all(pc.match_substring_regex(column, "^[0-9a-f]{64}$")).as_py():
         return column.combine_chunks()
     digests = pa.py_buffer(bytes.fromhex("".join(column.to_pylist())))
@@ -223,8 +228,8 @@ CACHED_ENTRIES = 4096  # of parsed files, each a frame's or an image's: tens of 
 
 
 class RowReader:
-    """Reads what the rows of a manifest name, from one store; picklable. verify: compare images
-    with their checksums.
+    """Reader of the files that rows of a manifest name, from one store; picklable. verify: compare
+    images with their checksums.
     """
 
     def __init__(self, store: Store, *, verify: bool) -> None:
@@ -532,19 +537,23 @@ def _read_rows(
 
 
 def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
-    """Raise ValueError where some variants have what is to be loaded, and others have none of it. A
-    single frame without labels or a sweep is no fault: a dataset may lack its file.
+    """Raise ValueError if a kind of file to load exists for some variants and not for others. A
+    single frame without labels or a sweep is no fault, as the recording may lack it.
     """
     first, group = rows.groups()
-    lacking = {}
+    variants_without_kind = {}
     for kind in sorted(set(load).difference(mask_names(), ["image"])):
         has_kind = np.bincount(group[rows.has(kind)], minlength=len(first)) > 0
         if has_kind.any() and not has_kind.all():
-            lacking[kind] = _listed([rows.row(int(row)) for row in first[~has_kind]], uris[0])
-    if not lacking:
+            variants_without_kind[kind] = _listed(
+                [rows.row(int(row)) for row in first[~has_kind]], uris[0]
+            )
+    if not variants_without_kind:
         return
-    message = "; ".join(f"{kind}: none in {variants}" for kind, variants in lacking.items())
-    names = tuple(kind for kind in loadable() if kind in load and kind not in lacking)
+    message = "; ".join(
+        f"{kind}: none in {variants}" for kind, variants in variants_without_kind.items()
+    )
+    names = tuple(kind for kind in loadable() if kind in load and kind not in variants_without_kind)
     raise ValueError(
         f"load asks for what only a part of the outputs has, so that batches would not stack. "
         f"{message}. Leave it out (load={names!r}), choose outputs, scenes or variants that are "
@@ -553,7 +562,7 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
 
 
 def _listed(variants: list[dict[str, Any]], uri: str) -> str:
-    """Variants by their outputs, as a text; the first three of each. uri: where there is one."""
+    """Return a text that lists variants by output, three of each. uri: the only output."""
     names = defaultdict(list)
     for row in variants:
         names[row.get(_OUTPUT, uri)].append(f"{row['scene']}/{row['variant']}")

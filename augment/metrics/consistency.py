@@ -66,9 +66,10 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Consistency:
-    """rmse: over the pixels that count, NaN where there are none. spread: standard deviation of
-    A's colours over the same pixels, about each channel's mean. share: of A's pixels that count.
-    noise: of the cameras, root of the mean square; taken out of rmse and spread.
+    """Agreement of two views. rmse: error over the pixels that count, NaN if none counts. spread:
+    standard deviation of A's colours over the same pixels, about each channel's mean. share:
+    fraction of A's pixels that count. noise: root mean square of the cameras' noise, which rmse and
+    spread do not include.
     """
 
     rmse: float
@@ -78,7 +79,7 @@ class Consistency:
 
     @property
     def relative(self) -> float:
-        """rmse over spread; NaN where the picture has one colour only."""
+        """Ratio of rmse to spread; NaN if the picture has one colour only."""
         return self.rmse / self.spread if self.spread > 0 else math.nan
 
 
@@ -148,8 +149,8 @@ def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) ->
     """
     points = world_points(a) if points_m is None else points_m
     column, row, depth_m = _places(points, b.camera)
-    filled = (a.alpha >= MIN_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
-    inside = filled & (depth_m > 0)  # false for NaN
+    has_surface = (a.alpha >= MIN_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
+    inside = has_surface & (depth_m > 0)  # false for NaN
     # All four neighbours are in the picture.
     inside &= (column >= 0) & (column < b.camera.width - 1)
     inside &= (row >= 0) & (row < b.camera.height - 1)
@@ -184,8 +185,12 @@ def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
     """
     pose = camera.camera_from_world.numpy()
     x, y, z = np.moveaxis(world @ pose[:3, :3].T + pose[:3, 3], -1, 0)
-    safe = np.where(z > 0, z, 1.0)
-    return camera.fx * x / safe + camera.cx - 0.5, camera.fy * y / safe + camera.cy - 0.5, z
+    positive_z = np.where(z > 0, z, 1.0)
+    return (
+        camera.fx * x / positive_z + camera.cx - 0.5,
+        camera.fy * y / positive_z + camera.cy - 0.5,
+        z,
+    )
 
 
 # ---- Where things inside labelled boxes go from the time of one picture to that of another -------
@@ -360,9 +365,9 @@ def _shown(
     )
     low = placed_boxes.low_m - margin_m
     high = placed_boxes.high_m + margin_m
-    grown = dataclasses.replace(placed_boxes, low_m=low, high_m=high)
+    wide_boxes = dataclasses.replace(placed_boxes, low_m=low, high_m=high)
     depth = np.where(np.isfinite(view.depth_m), view.depth_m, 0.0).astype(np.float32)
-    return shown_pixels(grown, view.camera, depth)
+    return shown_pixels(wide_boxes, view.camera, depth)
 
 
 def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

@@ -122,9 +122,9 @@ def depth_errors(
 
 def _quantile(values: np.ndarray, weight: np.ndarray, part: float) -> float:
     order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order])
+    weight_sums = np.cumsum(weight[order])
     # Sums of weights round: an exact half must count as reached.
-    first = int(np.searchsorted(reached, part * reached[-1] * (1 - 1e-12)))
+    first = int(np.searchsorted(weight_sums, part * weight_sums[-1] * (1 - 1e-12)))
     return float(values[order[min(first, len(order) - 1)]])
 
 
