@@ -29,12 +29,13 @@ class Boxes2d:
 
 
 def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
-    """A sample's boxes as the image shows them: bounds of what lies inside the image, tight. They
-    enclose the projected box cut off at the image's borders, not the projected corners, whose
-    bounds are wider for a box that a border cuts. Weather and what hides a box change nothing. A
-    box whose numbers are not finite is out of view. Raises ValueError: the sample has no boxes.
+    """Return the tight bounds of a sample's boxes in the image. The bounds enclose the projected
+    box, cut off at the image's borders. (Bounds of the projected corners would be wider for a box
+    that a border cuts.) Weather and objects that hide a box do not change them. A box whose numbers
+    are not finite is out of view. Raises ValueError: the sample has no boxes.
     """
-    boxes, camera = sample["boxes"], sample["camera"]
+    boxes = sample["boxes"]
+    camera = sample["camera"]
     if boxes is None:
         raise ValueError(
             f"scene {sample['scene']!r}, frame {sample['frame']}: the sample has no boxes; open "
@@ -54,10 +55,11 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
 def boxes_in_camera(
     boxes: Mapping[str, Any], camera: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """centers_m [B, 3] and quats [B, 4] of a sample's boxes in its camera's frame, float64,
-    whatever frame they are in.
+    """Return centers_m [B, 3] and quats [B, 4], float64, of a sample's boxes in its camera's frame.
+    The sample's boxes may be in any frame.
     """
-    centers_m, quats = boxes["centers_m"].numpy(), boxes["quats"].numpy()
+    centers_m = boxes["centers_m"].numpy()
+    quats = boxes["quats"].numpy()
     if boxes["frame"] == "camera":
         return centers_m, quats
     frame_from_camera = camera["world_from_camera"].numpy()
@@ -82,7 +84,7 @@ def torchvision_sample(
     min_side_px: float = 1.0,
     min_pixels: int = 1,
 ) -> tuple[torch.Tensor, dict[str, Any]]:
-    """(image, target) of a sample, for `WeatherDataset(transform=torchvision_sample)`.
+    """Return (image, target) of a sample, for `WeatherDataset(transform=torchvision_sample)`.
 
     The image is [3, H, W] of the sample's type. The target holds, of the N boxes that are kept:
 
@@ -111,7 +113,8 @@ def torchvision_sample(
     if sample["image"] is None:
         raise ValueError("the sample has no image; open the dataset with 'image' in load")
     check_choice("bounds", bounds, Bounds)
-    flat, boxes = boxes_2d(sample), sample["boxes"]
+    outlines = boxes_2d(sample)
+    boxes = sample["boxes"]
     visible = boxes["visible_fraction"]
     if visible is None and (bounds == "modal" or min_visible_fraction > 0):
         raise ValueError(
@@ -119,43 +122,45 @@ def torchvision_sample(
             f"{sample['scene']!r}, variant {sample['variant']!r}, frame {sample['frame']} is of an "
             f"output without it: overwrite the variant, or take amodal bounds and no threshold"
         )
-    xyxy = boxes["modal_xyxy"] if bounds == "modal" else flat.xyxy
+    xyxy = boxes["modal_xyxy"] if bounds == "modal" else outlines.xyxy
     find_id = label_ids.get if isinstance(label_ids, Mapping) else label_ids
     ids = [find_id(label) for label in boxes["labels"]]
-    kept = flat.in_view & (boxes["visibility"] >= min_visibility) & xyxy.isfinite().all(dim=1)
-    kept &= (xyxy[:, 2:] - xyxy[:, :2] >= min_side_px).all(dim=1)
-    kept &= torch.tensor([number is not None for number in ids], dtype=torch.bool)
-    if (
-        visible is not None and min_visible_fraction > 0
-    ):  # where it is not known (NaN), the box is left out
-        kept &= visible >= min_visible_fraction
-    shown = box_masks(sample) if masks else None
-    if shown is not None:
-        kept &= shown.flatten(1).sum(dim=1) >= min_pixels
-    chosen = kept.nonzero()[:, 0]
+    mask = outlines.in_view & (boxes["visibility"] >= min_visibility) & xyxy.isfinite().all(dim=1)
+    mask &= (xyxy[:, 2:] - xyxy[:, :2] >= min_side_px).all(dim=1)
+    mask &= torch.tensor([number is not None for number in ids], dtype=torch.bool)
+    if visible is not None and min_visible_fraction > 0:
+        # A box whose visible fraction is not known (NaN) is left out.
+        mask &= visible >= min_visible_fraction
+    pixel_masks = box_masks(sample) if masks else None
+    if pixel_masks is not None:
+        mask &= pixel_masks.flatten(1).sum(dim=1) >= min_pixels
+    box_numbers = mask.nonzero()[:, 0]
     wrap = _wrappers(tuple(sample["image"].shape[-2:]))
     target: dict[str, Any] = {
-        "boxes": wrap["boxes"](xyxy[chosen]),
-        "labels": torch.tensor([ids[k] for k in chosen.tolist()], dtype=torch.int64),
-        "visibility": boxes["visibility"][chosen],
-        "track_ids": [boxes["track_ids"][k] for k in chosen.tolist()],
+        "boxes": wrap["boxes"](xyxy[box_numbers]),
+        "labels": torch.tensor([ids[k] for k in box_numbers.tolist()], dtype=torch.int64),
+        "visibility": boxes["visibility"][box_numbers],
+        "track_ids": [boxes["track_ids"][k] for k in box_numbers.tolist()],
         **{key: sample[key] for key in ("frame", "scene", "variant")},
     }
     if visible is not None:
-        target["visible_fraction"] = visible[chosen]
-    if shown is not None:
-        target["masks"] = wrap["mask"](shown[chosen])
+        target["visible_fraction"] = visible[box_numbers]
+    if pixel_masks is not None:
+        target["masks"] = wrap["mask"](pixel_masks[box_numbers])
     target |= {k: wrap["mask"](sample[k]) for k in buffers() if sample[k] is not None}
     return wrap["image"](sample["image"]), target
 
 
 def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
-    """bool [B, H, W]: the pixels that show each of a sample's boxes. A pixel does if the surface of
-    the depth image there lies inside the box, its lowest centimetres left out and the other sides
-    10 cm wider (`augment.boxes`); so what hides a box is not in its mask. Where boxes overlap a
-    pixel is in both. Raises ValueError: the sample has no boxes or no depth.
+    """Return the pixels that show each of a sample's boxes, bool [B, H, W]. A pixel shows a box if
+    its surface, by the depth image, lies inside the box without its lowest centimetres and with the
+    other sides 10 cm wider (`augment.boxes`). An object in front of a box is therefore not in the
+    mask of the box. Where boxes overlap, a pixel is in both masks. Raises ValueError: the sample
+    has no boxes or no depth.
     """
-    boxes, depth, camera = sample["boxes"], sample["depth"], sample["camera"]
+    boxes = sample["boxes"]
+    depth = sample["depth"]
+    camera = sample["camera"]
     if boxes is None or depth is None:
         raise ValueError(
             f"masks need boxes and depth; the sample of scene {sample['scene']!r}, frame "
@@ -163,22 +168,30 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
         )
     K = camera["K"].numpy()
     view = Camera(
-        camera["name"], camera["width"], camera["height"], K[0, 0], K[1, 1], K[0, 2], K[1, 2],
+        camera["name"],
+        camera["width"],
+        camera["height"],
+        K[0, 0],
+        K[1, 1],
+        K[0, 2],
+        K[1, 2],
         torch.eye(4, dtype=torch.float64),
-    )  # fmt: skip
+    )
     centers_m, quats = boxes_in_camera(boxes, camera)
     names = tuple(boxes["track_ids"])
-    there = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)
+    camera_boxes = Boxes(names, tuple(boxes["labels"]), centers_m, boxes["sizes_m"].numpy(), quats)
     masks = np.zeros((len(names), camera["height"], camera["width"]), bool)
     for number, rows, columns in shown_pixels(
-        PlacedBoxes.of(there, np.zeros(3)), view, depth.numpy()
+        PlacedBoxes.of(camera_boxes, np.zeros(3)), view, depth.numpy()
     ):
         masks[number, rows, columns] = True
     return torch.from_numpy(masks)
 
 
 def _wrappers(size: tuple[int, ...]) -> dict[str, Callable[[torch.Tensor], torch.Tensor]]:
-    """What makes torchvision's kinds of tensors, or leaves them as they are. size: (H, W)."""
+    """Return functions that make torchvision's kinds of tensors; without torchvision they return
+    the tensor unchanged. size: (H, W) of the image.
+    """
     try:
         from torchvision import tv_tensors  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -59,45 +59,51 @@ class ShardedSampler(Sampler[int]):
         seed: int = 0,
         uneven: Uneven = "exact",
     ) -> None:
-        own_rank, own_ranks = _process_rank()
-        self.rank = own_rank if rank is None else rank
-        self.ranks = own_ranks if ranks is None else ranks
+        process_rank, num_processes = _process_rank()
+        self.rank = process_rank if rank is None else rank
+        self.ranks = num_processes if ranks is None else ranks
         self.count = samples if isinstance(samples, int) else len(samples)
-        self.shuffle, self.seed, self.uneven = shuffle, seed, uneven
+        self.shuffle = shuffle
+        self.seed = seed
+        self.uneven = uneven
         if not 0 <= self.rank < self.ranks:
             raise ValueError(f"rank must be 0 to {self.ranks - 1} of {self.ranks}; got {self.rank}")
         check_choice("uneven", uneven, Uneven)
         self.epoch = 0
-        self._done = 0  # of all ranks' samples: where the epoch goes on
-        self._given = 0
+        self._num_done = 0  # samples of all ranks before the place where the epoch goes on
+        self._num_yielded = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Begin another epoch: another order, from its start."""
-        self.epoch, self._done, self._given = epoch, 0, 0
+        """Begin another epoch, which has another order, at its start."""
+        self.epoch = epoch
+        self._num_done = 0
+        self._num_yielded = 0
 
     def __iter__(self) -> Iterator[int]:
-        self._given = 0
+        self._num_yielded = 0
         for sample in self._share():
-            self._given += 1
+            self._num_yielded += 1
             yield sample
 
     def __len__(self) -> int:
         """Samples of this rank that the epoch still has."""
-        left = max(self.count - self._done, 0)
+        num_remaining = max(self.count - self._num_done, 0)
         if self.uneven == "exact":
-            return len(range(self.rank, left, self.ranks))
-        return -(-left // self.ranks) if self.uneven == "pad" else left // self.ranks
+            return len(range(self.rank, num_remaining, self.ranks))
+        return (
+            -(-num_remaining // self.ranks) if self.uneven == "pad" else num_remaining // self.ranks
+        )
 
     def state_dict(self, given: int | None = None) -> dict[str, Any]:
-        """Where the epoch stands, in plain numbers that JSON holds. given: samples of this rank
-        that were trained on since the epoch began or the last state was loaded: batches times their
-        size. None: those that this sampler gave out, which is right where no worker reads ahead.
-        Every rank has given as many.
+        """Return the place in the epoch, in plain numbers that JSON holds. given: number of samples
+        of this rank that were trained on since the epoch began or the last state was loaded:
+        batches times their size. None takes the number that this sampler yielded, which is right if
+        no worker reads ahead. Every rank must have trained on the same number.
         """
-        ahead = (self._given if given is None else given) * self.ranks
+        ahead = (self._num_yielded if given is None else given) * self.ranks
         return {
             "epoch": self.epoch,
-            "done": min(self._done + ahead, self.count),
+            "done": min(self._num_done + ahead, self.count),
             "seed": self.seed,
             "shuffle": self.shuffle,
             "count": self.count,
@@ -107,23 +113,28 @@ class ShardedSampler(Sampler[int]):
         """Go on where `state_dict` stood. Raises ValueError: the state is of another seed, order or
         number of samples.
         """
-        own = {"seed": self.seed, "shuffle": self.shuffle, "count": self.count}
-        if wrong := {k: (state.get(k), v) for k, v in own.items() if state.get(k) != v}:
+        expected_state = {"seed": self.seed, "shuffle": self.shuffle, "count": self.count}
+        if wrong := {k: (state.get(k), v) for k, v in expected_state.items() if state.get(k) != v}:
             message = ", ".join(
                 f"{name} {was} there and {now} here" for name, (was, now) in wrong.items()
             )
             raise ValueError(f"the state is of another sampler: {message}")
-        self.epoch, self._done, self._given = int(state["epoch"]), int(state["done"]), 0
+        # Both numbers are read before either is stored: a damaged state changes nothing.
+        epoch = int(state["epoch"])
+        num_done = int(state["done"])
+        self.epoch = epoch
+        self._num_done = num_done
+        self._num_yielded = 0
 
     def _share(self) -> list[int]:
         order = np.arange(self.count)
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(order)
-        left = order[self._done :]
-        if self.uneven == "pad" and len(left):
-            missing = -len(left) % self.ranks
-            left = np.concatenate([left, np.resize(order, missing)])
-        return left[self.rank :: self.ranks][: len(self)].tolist()
+        remaining_samples = order[self._num_done :]
+        if self.uneven == "pad" and len(remaining_samples):
+            num_missing = -len(remaining_samples) % self.ranks
+            remaining_samples = np.concatenate([remaining_samples, np.resize(order, num_missing)])
+        return remaining_samples[self.rank :: self.ranks][: len(self)].tolist()
 
 
 def _process_rank() -> tuple[int, int]:
@@ -134,7 +145,7 @@ def _process_rank() -> tuple[int, int]:
 
 # ---- splits --------------------------------------------------------------------------------------
 
-_MOMENT = ("scene", "frame", "camera")
+_MOMENT = ("scene", "frame", "camera")  # columns that name the moment of an image
 Splittable = TypeVar("Splittable", WeatherDataset, pa.Table)
 DEFAULT_FRACTIONS: Mapping[str, float] = {"train": 0.8, "val": 0.2}
 
@@ -158,20 +169,20 @@ def split_by_scene(
     shares = list(fractions.values())
     if not shares or min(shares) < 0 or not math.isclose(sum(shares), 1, abs_tol=1e-9):
         raise ValueError(f"fractions must be >= 0 and add up to 1; got {dict(fractions)}")
-    of: Any = whole
+    source: Any = whole
     is_dataset = isinstance(whole, WeatherDataset)
-    column = of.rows["scene"] if is_dataset else of["scene"].combine_chunks()
+    column = source.rows["scene"] if is_dataset else source["scene"].combine_chunks()
     scenes = column.dictionary_encode()
     places = np.array([_place(name, seed) for name in scenes.dictionary.to_pylist()])
     if exact:
         places = (np.argsort(np.argsort(places, kind="stable")) + 0.5) / max(len(places), 1)
     part = np.searchsorted(np.cumsum(shares)[:-1], places, side="right")[scenes.indices.to_numpy()]
-    select = of.select if is_dataset else lambda rows: of.filter(pa.array(rows))
+    select = source.select if is_dataset else lambda rows: source.filter(pa.array(rows))
     return {name: select(part == number) for number, name in enumerate(fractions)}
 
 
 def _place(scene: str, seed: int) -> float:
-    """Where a scene stands between 0 and 1."""
+    """Return a number in [0, 1) that depends on the scene's name and the seed only."""
     digest = hashlib.sha256(f"climategs split 1 {seed} {scene}".encode()).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
 
@@ -180,15 +191,15 @@ def _place(scene: str, seed: int) -> float:
 
 
 def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
-    """The images without weather and style, or those of one variant. Without a variant's name:
-    those whose manifest says that no effect is there, and whose other numbers of weather are all
-    zero or absent. Raises ValueError: there is no such variant.
+    """Select the images without weather and style, or those of one variant. Without a variant's
+    name: images whose manifest lists no effect, and whose other weather numbers are all zero or
+    absent. Raises ValueError: the variant does not exist.
     """
     return dataset.select(clean_mask(dataset.rows, variant))
 
 
 def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
-    """bool [N]: rows without weather and style, or of one variant. Raises ValueError, as above."""
+    """Return the rows that `clean_frames` selects, bool [N]. Raises ValueError likewise."""
     if variant is None:
         return ~np.logical_or.reduce(list(masks_of(rows).values()))
     codes, names = rows.codes("variant")
@@ -198,7 +209,7 @@ def clean_mask(rows: Rows, variant: str | None = None) -> np.ndarray:
 
 
 def masks_of(rows: Rows) -> dict[str, np.ndarray]:
-    """bool [N] by the effects' names: rows that have them."""
+    """Return by the effects' names the mask of rows, bool [N], that have the effect."""
     return effect_masks({name: rows.numbers(name) for name in rows.weather}, len(rows))
 
 
@@ -218,7 +229,8 @@ class PairedDataset(Dataset):
     """
 
     def __init__(self, clean: WeatherDataset, weathered: WeatherDataset) -> None:
-        self.clean, self.weathered = clean, weathered
+        self.clean = clean
+        self.weathered = weathered
         partner = _partners(clean.rows, weathered.rows)
         self._weathered_rows = np.flatnonzero(partner >= 0)
         self._clean_rows = partner[self._weathered_rows]
@@ -239,7 +251,8 @@ class PairedDataset(Dataset):
         return len(self._weathered_rows)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        clean, weathered = int(self._clean_rows[index]), int(self._weathered_rows[index])
+        clean = int(self._clean_rows[index])
+        weathered = int(self._weathered_rows[index])
         return {"clean": self.clean[clean], "weathered": self.weathered[weathered]}
 
 
@@ -261,7 +274,10 @@ class MixedDataset(Dataset):
         if len(clean) and len(weathered):
             _check_alike(clean=clean, weathered=weathered)
             _check_alike(weathered=weathered, clean=clean)
-        self.clean, self.weathered, self.fraction, self.seed = clean, weathered, fraction, seed
+        self.clean = clean
+        self.weathered = weathered
+        self.fraction = fraction
+        self.seed = seed
         partner = _partners(clean.rows, weathered.rows)
         # The weathered rows of clean row i are _rows[_ends[i]:_ends[i + 1]].
         self._rows = np.argsort(partner, kind="stable")[np.count_nonzero(partner < 0) :]
@@ -283,8 +299,9 @@ class MixedDataset(Dataset):
         return self.clean[index] if row is None else self.weathered[row]
 
     def weathered_row(self, index: int) -> int | None:
-        """Which weathered image this epoch has in place of a clean one; None: the clean one."""
-        start, end = self._ends[index], self._ends[index + 1]
+        """Return the weathered row that replaces a clean image in this epoch; None: no row does."""
+        start = self._ends[index]
+        end = self._ends[index + 1]
         if start == end:
             return None
         rng = np.random.default_rng([self.seed, int(self._epoch), index])
@@ -295,24 +312,27 @@ class MixedDataset(Dataset):
 
 def _check_alike(**sides: WeatherDataset) -> None:
     """Raise ValueError where the first dataset lacks what the second one's samples have."""
-    (name, poor), (other, rich) = sides.items()
-    if lacking := sorted(rich.given() - poor.given()):
+    (name, first), (other, second) = sides.items()
+    if names := sorted(second.given() - first.given()):
         raise ValueError(
-            f"samples of `{name}` ({', '.join(poor.uris)}) have no {', '.join(lacking)}, those of "
-            f"`{other}` ({', '.join(rich.uris)}) have: batches would not stack. Open both with a "
+            f"samples of `{name}` ({', '.join(first.uris)}) have no {', '.join(names)}, those of "
+            f"`{other}` ({', '.join(second.uris)}) have: batches would not stack. Open both with a "
             f"`load` without it, or render it for `{name}` too"
         )
 
 
 def _partners(clean: Rows, weathered: Rows) -> np.ndarray:
-    """int64: of each weathered row the clean row of its scene, frame and camera, or -1."""
-    both = [pa.concat_arrays([clean[name], weathered[name]]) for name in _MOMENT]
-    moments = number_groups([column.dictionary_encode().indices.to_numpy() for column in both])
-    own, numbers = moments[: len(clean)], np.arange(len(clean))
+    """Return for each weathered row the clean row of its scene, frame and camera or -1, int64."""
+    moment_columns = [pa.concat_arrays([clean[name], weathered[name]]) for name in _MOMENT]
+    moments = number_groups(
+        [column.dictionary_encode().indices.to_numpy() for column in moment_columns]
+    )
+    clean_moments = moments[: len(clean)]
+    clean_rows = np.arange(len(clean))
     row_of = np.full(moments.max(initial=-1) + 1, -1)
-    row_of[own] = numbers
-    if (twice := np.flatnonzero(row_of[own] != numbers)).size:
-        row = clean.row(int(twice[0]))
+    row_of[clean_moments] = clean_rows
+    if (repeated_rows := np.flatnonzero(row_of[clean_moments] != clean_rows)).size:
+        row = clean.row(int(repeated_rows[0]))
         raise ValueError(
             f"scene {row['scene']!r}, frame {row['frame']}, camera {row['camera']!r} has more than "
             f"one clean image; choose a variant: clean_frames(dataset, variant)"
@@ -322,9 +342,9 @@ def _partners(clean: Rows, weathered: Rows) -> np.ndarray:
 
 # ---- clips ---------------------------------------------------------------------------------------
 
-MAX_LATE = 1.5  # a frame later than this many usual intervals comes after a gap
-_PER_FRAME = ("sizes_m", "labels", "track_ids", "attributes", "frame")
-_PLACED = ("centers_m", "quats")
+MAX_LATE = 1.5  # longest time between frames without a gap, in usual intervals
+_PER_FRAME = ("sizes_m", "labels", "track_ids", "attributes", "frame")  # keys equal for all cameras
+_POSES = ("centers_m", "quats")  # keys equal for all cameras unless in the camera's frame
 
 
 class ClipDataset(Dataset):
@@ -372,10 +392,11 @@ class ClipDataset(Dataset):
         numbers = {"length": length, "step": step, "stride": stride}
         if min(numbers.values()) < 1:
             raise ValueError(f"length, step and stride must be >= 1; got {numbers}")
-        self.frames, self.transform = frames, transform
+        self.frames = frames
+        self.transform = transform
         self._runs = list(_runs(frames.rows, cameras))
         self._steps = np.arange(length) * step
-        # Of each clip: its run, and the place of its first frame there.
+        # Each clip has the number of its run and the place of its first frame in the run.
         starts = [
             (run, start)
             for run in range(len(self._runs))
@@ -401,7 +422,7 @@ class ClipDataset(Dataset):
 
 
 def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
-    """Samples [T][C] as one clip."""
+    """Join samples [T][C] to one clip."""
     first = [frame[0] for frame in frames]
     clip = dict(first[0])
     for key in ("image", *buffers()):
@@ -417,49 +438,58 @@ def join_clip(frames: Sequence[Sequence[Sample]]) -> dict[str, Any]:
 
 
 def _joined(values: list[list[Any]]) -> Any:
-    """[T][C] tensors as one; None where there are only None; else the lists."""
-    joined = stack_alike([value for frame in values for value in frame])
-    if isinstance(joined, torch.Tensor):
-        return joined.unflatten(0, (len(values), -1))
-    return None if joined is None else values
+    """Stack tensors [T][C]. Returns None if all are None, and the lists if they differ in shape."""
+    stack = stack_alike([value for frame in values for value in frame])
+    if isinstance(stack, torch.Tensor):
+        return stack.unflatten(0, (len(values), -1))
+    return None if stack is None else values
 
 
-def _boxes(every: list[dict[str, Any]]) -> dict[str, Any]:
-    """A frame's boxes: what does not depend on the image once, the rest for every camera."""
-    once = _PER_FRAME if every[0]["frame"] == "camera" else (*_PER_FRAME, *_PLACED)
+def _boxes(camera_boxes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Join a frame's boxes. Values that depend on the camera gain a dimension of C cameras."""
+    shared_keys = _PER_FRAME if camera_boxes[0]["frame"] == "camera" else (*_PER_FRAME, *_POSES)
     return {
-        key: value if key in once or value is None else torch.stack([b[key] for b in every])
-        for key, value in every[0].items()
+        key: value
+        if key in shared_keys or value is None
+        else torch.stack([b[key] for b in camera_boxes])
+        for key, value in camera_boxes[0].items()
     }
 
 
 def _cameras(cameras: list[list[Mapping[str, Any]]]) -> dict[str, Any]:
-    joined = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
-    ego = joined["world_from_ego"][:, 0]
-    return {**joined, "name": joined["name"][0], "world_from_ego": ego}
+    stack = stack_cameras([stack_cameras(frame, torch.stack) for frame in cameras], torch.stack)
+    ego = stack["world_from_ego"][:, 0]
+    return {**stack, "name": stack["name"][0], "world_from_ego": ego}
 
 
 def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
     """Row numbers int64 [F, C] of frames that follow each other without a gap."""
     camera, names = rows.codes("camera")
-    frames, times = rows.numbers("frame"), rows.numbers("timestamp_ns")
-    known = {names[code]: code for code in np.unique(camera)}
-    if cameras is not None and (unknown := [name for name in cameras if name not in known]):
-        raise ValueError(f"no camera {unknown}; there are {', '.join(known) or 'none'}")
+    frames = rows.numbers("frame")
+    times = rows.numbers("timestamp_ns")
+    code_of_camera = {names[code]: code for code in np.unique(camera)}
+    if cameras is not None and (
+        unknown := [name for name in cameras if name not in code_of_camera]
+    ):
+        raise ValueError(f"no camera {unknown}; there are {', '.join(code_of_camera) or 'none'}")
     for numbers in _by_variant(rows):
         codes = camera[numbers]
-        wanted = np.unique(codes) if cameras is None else [known[name] for name in cameras]
-        present, place = np.unique(frames[numbers], return_inverse=True)
-        table = np.full((len(present), len(wanted)), -1, np.int64)
-        for column, code in enumerate(wanted):
-            own = codes == code
-            table[place[own], column] = numbers[own]
-        whole = (table >= 0).all(axis=1)
-        if whole.any():
+        camera_codes = (
+            np.unique(codes) if cameras is None else [code_of_camera[name] for name in cameras]
+        )
+        frame_numbers, place = np.unique(frames[numbers], return_inverse=True)
+        table = np.full((len(frame_numbers), len(camera_codes)), -1, np.int64)
+        for column, code in enumerate(camera_codes):
+            camera_mask = codes == code
+            table[place[camera_mask], column] = numbers[camera_mask]
+        is_complete = (table >= 0).all(axis=1)
+        if is_complete.any():
             # Frame numbers farther apart than the variant's closest ones, and late images.
-            usual = np.diff(present).min(initial=np.iinfo(np.int64).max)
-            breaks = (np.diff(present[whole]) > usual) | _late(times[table[whole]])
-            yield from np.split(table[whole], np.flatnonzero(breaks) + 1)
+            frame_step = np.diff(frame_numbers).min(initial=np.iinfo(np.int64).max)
+            breaks = (np.diff(frame_numbers[is_complete]) > frame_step) | _late(
+                times[table[is_complete]]
+            )
+            yield from np.split(table[is_complete], np.flatnonzero(breaks) + 1)
 
 
 def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
@@ -470,8 +500,8 @@ def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
 
 
 def _late(clock_ns: np.ndarray) -> np.ndarray:
-    """bool [F - 1]: where any camera's next image comes late. clock_ns: int64 [F, C]."""
-    waits = np.diff(clock_ns, axis=0)
-    usual = np.median(waits, axis=0) if len(waits) else np.zeros(clock_ns.shape[1])
-    late = (waits > MAX_LATE * usual) | (waits < 0)
-    return np.logical_or.reduce(late, axis=1)
+    """Return True where any camera's next image is late, bool [F - 1]. clock_ns: int64 [F, C]."""
+    waits_ns = np.diff(clock_ns, axis=0)
+    interval_ns = np.median(waits_ns, axis=0) if len(waits_ns) else np.zeros(clock_ns.shape[1])
+    is_late = (waits_ns > MAX_LATE * interval_ns) | (waits_ns < 0)
+    return np.logical_or.reduce(is_late, axis=1)

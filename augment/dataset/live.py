@@ -95,13 +95,14 @@ class SceneDataset(Dataset):
                 "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
                 "and read it with WeatherDataset"
             )
-        self.scene, self.transform = scene, transform
+        self.scene = scene
+        self.transform = transform
         self._backend = choose_backend(backend, scene, gpu=False) if renderer is None else backend
         self._process = os.getpid()
-        chosen = resolve_quality(
+        quality = resolve_quality(
             with_digest(recipe), scene, backend=self._backend, renderer=renderer
         )
-        self.recipe = chosen.recipe
+        self.recipe = quality.recipe
         self._renderer = renderer
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)
@@ -111,7 +112,7 @@ class SceneDataset(Dataset):
         self._memo = memo_of(scene).shared()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """In another process the scene is another object, whose memo is empty."""
+        """Restore the state; fill the memo of the scene, which is a new object in this process."""
         self.__dict__.update(state)
         self._process = os.getpid()
         memo_of(self.scene).update(self._memo)
@@ -123,7 +124,7 @@ class SceneDataset(Dataset):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        """The samples of a batch, as a DataLoader asks for them; their views are drawn at once."""
+        """Return the samples of a batch, rendered together; a DataLoader calls this method."""
         items = [self._items[check_index(index, len(self))] for index in indices]
         views = self._views([frame.cameras[name] for frame, name in items])
         transform = self.transform or (lambda sample: sample)
@@ -139,11 +140,12 @@ class SceneDataset(Dataset):
             from augment.views import render_views  # which brings the rasteriser
 
             return render_views(self.scene, cameras, self.recipe, backend=self._backend)
-        own = {"backend": self._backend}
-        return (self._renderer(self.scene, camera, self.recipe, **own) for camera in cameras)
+        options = {"backend": self._backend}
+        return (self._renderer(self.scene, camera, self.recipe, **options) for camera in cameras)
 
     def _sample(self, frame: Frame, name: str, view: View) -> Sample:
-        recipe, origin_m = self.recipe, self._index.world_origin_m
+        recipe = self.recipe
+        origin_m = self._index.world_origin_m
         camera = frame.cameras[name].scaled(recipe.render.scale)
         check_view(view, camera, recipe)
         view, labels = self._label(frame, camera, view)
@@ -167,29 +169,36 @@ class SceneDataset(Dataset):
         )
 
     def _images(self, view: View) -> dict[str, np.ndarray]:
-        """What of a view the samples hold, as files would."""
+        """Return the images of a view that samples hold, with the pixels that files would have."""
         output = self.recipe.output
-        found = {"semantic": view.semantic, "instance": view.instance, **view.masks}
+        images = {"semantic": view.semantic, "instance": view.instance, **view.masks}
         if "image" in self.options.load:
             is_exact = output.image == "png"
-            found["image"] = view.rgb if is_exact else decode_image(encode_image(view.rgb, output))
+            images["image"] = view.rgb if is_exact else decode_image(encode_image(view.rgb, output))
         if view.depth_m is not None:
-            found["depth"] = quantise_depth(view.depth_m)
-        return {k: v for k, v in found.items() if k in self.options.load and v is not None}
+            images["depth"] = quantise_depth(view.depth_m)
+        return {k: v for k, v in images.items() if k in self.options.load and v is not None}
 
     def _label(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
-        """A view with the boxes of its frame, and these as the files of a job would have them.
-        camera: as written.
+        """Return the view with the frame's boxes in its instance image, and the frame's labels as
+        the files of a job would hold them. camera: the camera that a job would write.
         """
-        load, recipe, index = self.options.load, self.recipe, self._index
+        load = self.options.load
+        recipe = self.recipe
+        index = self._index
         requested = uses_boxes(recipe) and ("boxes" in load or "instance" in load)
         if not requested or frame.index not in index.labelled:
             return view, Labels()
         boxes = self.scene.boxes(frame.index)
         view, measured = label_view(
-            boxes, index.instances, index.world_origin_m, camera, view, recipe,
+            boxes,
+            index.instances,
+            index.world_origin_m,
+            camera,
+            view,
+            recipe,
             evidence=lambda: evidence_of(self.scene, frame.index),
-        )  # fmt: skip
+        )
         if not (recipe.output.labels and "boxes" in load):
             return view, Labels()
         return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))

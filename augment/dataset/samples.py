@@ -70,18 +70,20 @@ _TRUST = Buffer(np.uint8, lambda mask: torch.from_numpy(mask).float() / 255, in_
 
 
 def buffers() -> dict[str, Buffer]:
-    """By name: depth, semantic, instance, and the masks."""
+    """Return the buffers by name: depth, semantic, instance, and the masks."""
     return _BUFFERS | dict.fromkeys(mask_names(), _MASK) | {TRUST: _TRUST}
 
 
 def loadable() -> tuple[str, ...]:
-    """What samples can hold, by the names of `load`."""
+    """Return the names that `load` may have: all that samples can hold."""
     return ("image", *buffers(), "boxes", "lidar")
 
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """What samples hold and how. load: of `loadable`. box_frame: of boxes and LiDAR points."""
+    """Content and form of samples. load: some names of `loadable`. box_frame: the frame of boxes
+    and LiDAR points.
+    """
 
     image_type: ImageType
     load: frozenset[str]
@@ -91,8 +93,8 @@ class SampleOptions:
     def checked(
         image_type: str = "float32", load: Collection[str] | None = None, box_frame: str = "world"
     ) -> SampleOptions:
-        """The options of these values. load: None for all but sweeps, which are large, and few
-        train on both. Raises ValueError: a value that there is not.
+        """Return checked options. load: None takes all but sweeps, which are large and which few
+        users train on together with images. Raises ValueError: a value that does not exist.
         """
         if load is None:
             load = set(loadable()) - {"lidar"}
@@ -111,7 +113,7 @@ def check_choice(name: str, value: str, choices: Any) -> None:
 
 
 def check_index(index: int, count: int, what: str = "sample") -> int:
-    """The index counted from 0. Raises IndexError, as a list does."""
+    """Return the index counted from 0, as a list counts it. Raises IndexError: it is outside."""
     if not -count <= index < count:
         raise IndexError(f"{what} {index} of a dataset of {count}")
     return index % count
@@ -119,8 +121,8 @@ def check_index(index: int, count: int, what: str = "sample") -> int:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What a frame has beside its images, in the dataset's world. box_weather: for the boxes.
-    instances: uint16 [B], their numbers.
+    """Labels of a frame, in the dataset's world. box_weather: numbers of the weather at each box.
+    instances: uint16 [B], the boxes' numbers in instance images.
     """
 
     boxes: Boxes | None = None
@@ -138,27 +140,28 @@ def make_sample(
     labels: Labels,
     described: Mapping[str, Any],
 ) -> Sample:
-    """One sample as the module describes it. images: as files store them, RGB [H, W, 3] and [H, W],
-    by the names of `load`. described: weather, paths and NAMES.
+    """Return one sample, a dictionary as the head of this module lists it. images: by the names of
+    `load`, RGB [H, W, 3] or [H, W], with the pixels that files store. described: weather, paths and
+    NAMES.
     """
-    made: Sample = dict.fromkeys(loadable())
+    sample: Sample = dict.fromkeys(loadable())
     for name, image in images.items():
         if name == "image":
-            made[name] = image_tensor(image, options.image_type)
+            sample[name] = image_tensor(image, options.image_type)
         else:
-            made[name] = buffers()[name].tensor(image)
+            sample[name] = buffers()[name].tensor(image)
     origins = {"ego": world_from_ego, "camera": camera.world_from_camera}
-    placed = (options.box_frame, origins.get(options.box_frame, torch.eye(4)).numpy())
+    axes = (options.box_frame, origins.get(options.box_frame, torch.eye(4)).numpy())
     if labels.boxes is not None:
         weather = labels.box_weather or {}
-        made["boxes"] = box_tensors(labels.boxes, weather, *placed, instances=labels.instances)
+        sample["boxes"] = box_tensors(labels.boxes, weather, *axes, instances=labels.instances)
     if labels.lidar is not None:
-        made["lidar"] = lidar_tensors(labels.lidar, *placed)
-    return {**made, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **described}
+        sample["lidar"] = lidar_tensors(labels.lidar, *axes)
+    return {**sample, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **described}
 
 
 def image_tensor(rgb: np.ndarray, image_type: ImageType) -> torch.Tensor:
-    """uint8 [H, W, 3] as [3, H, W] of the type."""
+    """Return an image, uint8 [H, W, 3], as a tensor [3, H, W] of the type."""
     planes: Any = np.empty((3, *rgb.shape[:2]), np.uint8)
     cv2.split(rgb, list(planes))  # a third of the time of NumPy's transposed copy
     image = torch.from_numpy(planes)
@@ -199,7 +202,8 @@ def box_tensors(
     world_from_frame: float64 [4, 4]; unused where the frame is the world, whose numbers keep their
     bits.
     """
-    centers_m, quats = boxes.centers_m.copy(), boxes.quats.copy()
+    centers_m = boxes.centers_m.copy()
+    quats = boxes.quats.copy()
     if box_frame != "world":
         centers_m = moved_points(centers_m, world_from_frame)
         quats = turned_quats(quats, world_from_frame)
@@ -223,13 +227,13 @@ def box_tensors(
 
 
 def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
-    """Points of the world [N, 3] in another frame."""
+    """Return points of the world [N, 3] in the coordinates of another frame."""
     with np.errstate(invalid="ignore"):  # of points that are not finite, and stay so
         return (points_m - world_from_frame[:3, 3]) @ world_from_frame[:3, :3]
 
 
 def turned_quats(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
-    """Rotations world_from_box as frame_from_box; the quaternions keep their norms."""
+    """Return rotations world_from_box as frame_from_box; the quaternions keep their norms."""
     x, y, z, w = Rotation.from_matrix(world_from_frame[:3, :3].T).as_quat()
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     with np.errstate(invalid="ignore"):
@@ -246,10 +250,13 @@ def lidar_tensors(
     points_m = sweep.points_m
     if frame != "world":
         points_m = moved_points(points_m, world_from_frame)
-    rest = {name: column for name, column in sweep.columns.items() if name not in "xyz"}
+    other_columns = {name: column for name, column in sweep.columns.items() if name not in "xyz"}
     return {
         "points_m": torch.from_numpy(points_m),
-        **{n: torch.from_numpy(c) if c.dtype.kind in "biuf" else c for n, c in rest.items()},
+        **{
+            n: torch.from_numpy(c) if c.dtype.kind in "biuf" else c
+            for n, c in other_columns.items()
+        },
     }
 
 
@@ -285,11 +292,11 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _check_in_all(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
-    lacking = [sample for sample in samples if sample[key] is None]
-    if 0 < len(lacking) < len(samples):
-        names = dict.fromkeys(f"{sample['scene']}/{sample['variant']}" for sample in lacking)
+    gaps = [sample for sample in samples if sample[key] is None]
+    if 0 < len(gaps) < len(samples):
+        names = dict.fromkeys(f"{sample['scene']}/{sample['variant']}" for sample in gaps)
         raise ValueError(
-            f"{len(lacking)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
+            f"{len(gaps)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
             f"{', '.join(names)}. Leave {key!r} out of `load` in all datasets that are mixed, or "
             f"mix only outputs that have it"
         )
@@ -299,7 +306,7 @@ Stack = Callable[[list[torch.Tensor]], torch.Tensor]
 
 
 def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
-    """Tensors of one shape as one tensor; None where there are only None; else the list."""
+    """Stack tensors of one shape. Returns None if all values are None, the list if they differ."""
     shapes = {None if value is None else value.shape for value in values}
     if shapes == {None}:
         return None
@@ -307,25 +314,28 @@ def stack_alike(values: list[Any], stack: Stack = torch.stack) -> Any:
 
 
 def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
-    """In memory that a worker process shares with its parent: the queue to the parent would copy
-    the batch once more, as torch's own collate knows.
+    """Stack tensors in memory that a worker process shares with its parent. Otherwise the queue to
+    the parent would copy the batch once more; torch's own collate function does the same.
     """
     if get_worker_info() is None:
         return torch.stack(tensors)
-    first, size = tensors[0], (len(tensors), *tensors[0].shape)
-    storage = first._typed_storage()._new_shared(first.numel() * len(tensors), device=first.device)
-    return torch.stack(tensors, out=first.new(storage).resize_(size))
+    example = tensors[0]
+    size = (len(tensors), *tensors[0].shape)
+    storage = example._typed_storage()._new_shared(
+        example.numel() * len(tensors), device=example.device
+    )
+    return torch.stack(tensors, out=example.new(storage).resize_(size))
 
 
 def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[str, Any]:
-    """Matrices and numbers as tensors, those of unlike clips as lists, with one dimension more;
-    names as a list.
+    """Stack the matrices and numbers of cameras. Names become a list; so do matrices and numbers
+    of clips that differ in shape.
     """
     values = {key: [camera[key] for camera in cameras] for key in cameras[0]}
     return {k: v if k == "name" else _stack_numbers(v, stack) for k, v in values.items()}
 
 
 def _stack_numbers(values: list[Any], stack: Stack) -> Any:
-    """Whole numbers as int64 [N]; tensors stacked."""
+    """Stack tensors, or make a tensor int64 [N] of whole numbers."""
     is_tensor = isinstance(values[0], torch.Tensor)
     return stack_alike(values, stack) if is_tensor else torch.tensor(values)

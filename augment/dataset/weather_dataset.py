@@ -58,12 +58,12 @@ pc: Any = pyarrow.compute  # type checkers do not see the functions that it make
 # that repeat. Here every column is dictionary-encoded with the smallest codes; paths are split into
 # folder and file name, of which there are few. Arrow's buffers are shared by forked workers.
 
-_PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
-_FOLDERS = "/folders"  # what follows a path's name in the name of its column of folders
-_DIGEST = pa.binary(32)  # a SHA-256
-_MANY = 1 << 16  # values of a column
-_FEW = 1 << 12
-_OUTPUT = "output"
+_PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # pattern of a path; the folder has its slash
+_FOLDERS = "/folders"  # suffix of the name of a path's column of folders
+_DIGEST = pa.binary(32)  # type of a SHA-256
+_MAX_CODED_NUMBERS = 1 << 16  # number of distinct values above which numbers are not encoded
+_MAX_PYTHON_VALUES = 1 << 12  # number of values above which a column's values stay Arrow's
+_OUTPUT = "output"  # name of the column that holds an output's URI
 
 Row = Mapping[str, Any]
 
@@ -98,7 +98,7 @@ class Rows:
 
     @property
     def names(self) -> list[str]:
-        """Of the manifest's columns."""
+        """Names of the manifest's columns."""
         return [name for name in self.batch.schema.names if not name.endswith(_FOLDERS)]
 
     def __getitem__(self, name: str) -> pa.Array:
@@ -117,7 +117,7 @@ class Rows:
         return self[name].to_numpy(zero_copy_only=False)
 
     def codes(self, name: str) -> tuple[np.ndarray, list[Any]]:
-        """Which of a column's values each row has, [N], and these."""
+        """Return a column's code of every row, [N], and the values; a code is a place in them."""
         column = self.batch.column(name)
         if not pa.types.is_dictionary(column.type):
             column = column.dictionary_encode("encode")
@@ -125,32 +125,37 @@ class Rows:
 
     def row(self, index: int) -> dict[str, Any]:
         """A row as the manifest has it, by columns."""
-        few, many = self._lookups
-        row = {name: values[codes[index]] for name, codes, values in few}
-        for name, codes, values in many:
+        object_columns, arrow_columns = self._lookups
+        row = {name: values[codes[index]] for name, codes, values in object_columns}
+        for name, codes, values in arrow_columns:
             value = values[codes[index]].as_py()
             row[name] = value.hex() if isinstance(value, bytes) else value
         for name in self._paths:
-            folder, file = row.pop(name + _FOLDERS), row[name]
+            folder = row.pop(name + _FOLDERS)
+            file = row[name]
             row[name] = None if file is None else folder + file
         return row
 
     @cached_property
     def _lookups(self) -> tuple[list[tuple[str, Any, Any]], list[tuple[str, Any, Any]]]:
-        """Of every column the rows' codes and the codes' values: as Python's objects, which are ten
-        times as fast; as Arrow's where there are many, for each worker has its own objects.
+        """Name, codes of the rows and values of every column, in two lists. In the first list the
+        values are Python objects, which are ten times as fast. Columns of the second list have too
+        many values for that, as each worker has its own objects: they stay Arrow's.
         """
-        few, many = [], []
+        object_columns = []
+        arrow_columns = []
         for name, column in zip(self.batch.schema.names, self.batch.columns, strict=True):
-            codes, values = range(len(self)), column
+            codes = range(len(self))
+            values = column
             if pa.types.is_dictionary(column.type):
                 indices: Any = column.indices.to_numpy()
-                codes, values = memoryview(indices), column.dictionary
-            if values is column or len(values) > _FEW:
-                many.append((name, codes, values))
+                codes = memoryview(indices)
+                values = column.dictionary
+            if values is column or len(values) > _MAX_PYTHON_VALUES:
+                arrow_columns.append((name, codes, values))
             else:
-                few.append((name, codes, values.to_pylist()))
-        return few, many
+                object_columns.append((name, codes, values.to_pylist()))
+        return object_columns, arrow_columns
 
     @cached_property
     def _paths(self) -> list[str]:
@@ -161,18 +166,18 @@ class Rows:
         return Rows(self.batch.take(pa.array(np.arange(len(self))[rows])), self.weather)
 
     def groups(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of every variant of a scene in an output its first row, int64 [G], and which of them each
-        row is of, int64 [N].
+        """Group the rows by output, scene and variant. Returns the first row of every group, int64
+        [G], and the group's number of every row, int64 [N].
         """
         names = [n for n in (_OUTPUT, "scene", "variant") if n in self.batch.schema.names]
         group = number_groups([self.codes(name)[0] for name in names])
         return np.unique(group, return_index=True)[1], group
 
     def has(self, kind: str) -> np.ndarray:
-        """bool [N]: the rows that name a file of a kind of `samples.loadable`."""
+        """Return the rows that name a file of a kind of `samples.loadable`, bool [N]."""
         codes, names = self.codes(f"{'labels' if kind == 'boxes' else kind}_path")
-        there = np.array([name is not None for name in names], bool)
-        return there[codes] if len(there) else np.zeros(len(self), bool)
+        is_file = np.array([name is not None for name in names], bool)
+        return is_file[codes] if len(is_file) else np.zeros(len(self), bool)
 
     def to_arrow(self) -> pa.Table:
         """The manifest's rows again."""
@@ -180,8 +185,8 @@ class Rows:
 
 
 def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """int64 [N]: a number for the values that a row has in all columns, from 0 without gaps, in the
-    order of the first column, then of the second ...
+    """Number the combinations of values that rows have in all columns, int64 [N]. Numbers go from 0
+    without gaps, in the order of the first column, then of the second, and so on.
     """
     group = np.zeros(len(columns[0]), np.int64)
     for codes in columns:
@@ -191,18 +196,23 @@ def number_groups(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _encoded(column: pa.ChunkedArray) -> pa.Array:
-    """By its distinct values; numbers that hardly repeat as they are."""
+    """Encode a column by its distinct values. Numbers that hardly repeat stay as they are."""
     is_coded = pa.types.is_dictionary(column.type)
-    coded: Any = (column if is_coded else column.dictionary_encode("encode")).combine_chunks()
-    count = len(coded.dictionary)
-    if count > _MANY and pa.types.is_primitive(column.type):
+    encoding: Any = (column if is_coded else column.dictionary_encode("encode")).combine_chunks()
+    count = len(encoding.dictionary)
+    if count > _MAX_CODED_NUMBERS and pa.types.is_primitive(column.type):
         return column.combine_chunks()
-    smallest = pa.uint8() if count <= 1 << 8 else pa.uint16() if count <= _MANY else pa.int32()
-    return pa.DictionaryArray.from_arrays(coded.indices.cast(smallest), coded.dictionary)
+    if count <= 1 << 8:
+        code_type = pa.uint8()
+    elif count <= 1 << 16:
+        code_type = pa.uint16()
+    else:
+        code_type = pa.int32()
+    return pa.DictionaryArray.from_arrays(encoding.indices.cast(code_type), encoding.dictionary)
 
 
 def _digests(column: pa.ChunkedArray) -> pa.Array:
-    """SHA-256 in lower-case digits as bytes; other texts as they are."""
+    """Return SHA-256 digests in lower-case digits as bytes; a column with other texts unchanged."""
     if column.null_count or not pc.all(pc.match_substring_regex(column, "^[0-9a-f]{64}$")).as_py():
         return column.combine_chunks()
     digests = pa.py_buffer(bytes.fromhex("".join(column.to_pylist())))
@@ -218,16 +228,20 @@ CACHED_ENTRIES = 4096  # of parsed files, each a frame's or an image's: tens of 
 
 
 class RowReader:
-    """Reads what the rows of a manifest name, from one store; picklable. verify: compare images
-    with their checksums.
+    """Reader of the files that rows of a manifest name, from one store; picklable. verify: compare
+    images with their checksums.
     """
 
     def __init__(self, store: Store, *, verify: bool) -> None:
-        self.store, self.verify = store, verify
+        self.store = store
+        self.verify = verify
         root, mark, query = store.uri.partition("?")
         if store.local_dir is not None:
-            root, mark, query = str(store.local_dir), "", ""
-        self._before, self._after = root.rstrip("/") + "/", mark + query
+            root = str(store.local_dir)
+            mark = ""
+            query = ""
+        self._name_head = root.rstrip("/") + "/"
+        self._name_tail = mark + query
         self._folders: dict[str, str] = {}
         self._parsed: defaultdict[str, OrderedDict[str, Any]] = defaultdict(OrderedDict)
 
@@ -235,8 +249,8 @@ class RowReader:
         return {**self.__dict__, "_folders": {}, "_parsed": defaultdict(OrderedDict)}
 
     def name(self, path: str) -> str:
-        """What a file is called in messages and samples: its path here, or its URI."""
-        return f"{self._before}{path}{self._after}"
+        """Return the name of a file in messages and samples: its path here, or its URI."""
+        return f"{self._name_head}{path}{self._name_tail}"
 
     def images(self, row: Row, load: Collection[str]) -> dict[str, np.ndarray]:
         """The row's image and buffers, those of `load`, as files store them: RGB and [H, W]."""
@@ -271,19 +285,24 @@ class RowReader:
             return read_camera(entry, row["camera"]), ego
 
     def labels(self, row: Row, load: Collection[str]) -> Labels:
-        """The boxes of the row's frame, what is measured of them in its image, and the sweep."""
-        of_boxes, sweep = {}, None
+        """Return the boxes of the row's frame, their measures in the row's image, and the sweep."""
+        box_fields = {}
+        sweep = None
         if "boxes" in load and (path := row["labels_path"]) is not None:
             frames = self.parsed("labels", path, read_boxes)
             with self._named(path):
                 if row["frame"] not in frames:
                     raise ValueError(f"it lacks frame {row['frame']}")
-            found = frames[row["frame"]]
-            weather = dict(self._box_weather(row, len(found.boxes)))
-            of_boxes = {"boxes": found.boxes, "instances": found.instances, "box_weather": weather}
+            frame_boxes = frames[row["frame"]]
+            weather = dict(self._box_weather(row, len(frame_boxes.boxes)))
+            box_fields = {
+                "boxes": frame_boxes.boxes,
+                "instances": frame_boxes.instances,
+                "box_weather": weather,
+            }
         if "lidar" in load and (path := row["lidar_path"]) is not None:
             sweep = self.parsed("lidar", path, read_lidar)
-        return Labels(**of_boxes, lidar=sweep)
+        return Labels(**box_fields, lidar=sweep)
 
     def _box_weather(self, row: Row, count: int) -> Iterator[tuple[str, BoxNumbers]]:
         for kind, table in box_tables().items():
@@ -299,28 +318,28 @@ class RowReader:
                     )
             yield kind, numbers
 
-    def parsed(self, kind: str, path: str, read: Callable[[Path], Any]) -> Any:
-        """What `read` makes of a file of a kind. The last used are kept: one of each kind, and more
-        as long as they have no more than CACHED_ENTRIES together.
+    def parsed(self, kind: str, path: str, parse_file: Callable[[Path], Any]) -> Any:
+        """Return the result of `parse_file` for a file of a kind. Results are cached for each kind:
+        the last used one, and more of them while they have at most CACHED_ENTRIES together.
         """
-        kept = self._parsed[kind]
-        if path not in kept:
-            kept[path] = self._parse(path, read)
-            held = sum(map(len, kept.values()))
-            while held > CACHED_ENTRIES and len(kept) > 1:
-                held -= len(kept.popitem(last=False)[1])
-        kept.move_to_end(path)
-        return kept[path]
+        parsed_files = self._parsed[kind]
+        if path not in parsed_files:
+            parsed_files[path] = self._parse(path, parse_file)
+            num_entries = sum(map(len, parsed_files.values()))
+            while num_entries > CACHED_ENTRIES and len(parsed_files) > 1:
+                num_entries -= len(parsed_files.popitem(last=False)[1])
+        parsed_files.move_to_end(path)
+        return parsed_files[path]
 
-    def _parse(self, path: str, read: Callable[[Path], Any]) -> Any:
+    def _parse(self, path: str, parse_file: Callable[[Path], Any]) -> Any:
         if self.store.local_dir is not None:
-            return read(resolve_inside(self.store.local_dir, path))
+            return parse_file(resolve_inside(self.store.local_dir, path))
         data = self._read(path)
         with tempfile.TemporaryDirectory(prefix="climategs-") as scratch:
             copy = Path(scratch) / PurePosixPath(path).name
             copy.write_bytes(data)
             try:
-                return read(copy)
+                return parse_file(copy)
             except OutputError as error:
                 raise OutputError(str(error).replace(str(copy), self.name(path))) from error
 
@@ -354,7 +373,7 @@ class RowReader:
 
     @contextmanager
     def _named(self, path: str, where: str = "") -> Iterator[None]:
-        """While what a file holds is taken apart, what goes wrong names the file."""
+        """Add the name of the file to errors that are raised while its content is read."""
         try:
             yield
         except (ArithmeticError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -371,9 +390,13 @@ def _check_digest(data: bytes, checksum: str) -> None:
 
 
 def _check_size(image: np.ndarray, row: Row) -> None:
-    (height, width), said = image.shape[:2], (row["width"], row["height"])
-    if (width, height) != said:
-        raise ValueError(f"it is {width}x{height}, the manifest says {said[0]}x{said[1]}")
+    height, width = image.shape[:2]
+    expected_width = row["width"]
+    expected_height = row["height"]
+    if (width, height) != (expected_width, expected_height):
+        raise ValueError(
+            f"it is {width}x{height}, the manifest says {expected_width}x{expected_height}"
+        )
 
 
 def _item_text(row: Row) -> str:
@@ -435,7 +458,7 @@ class WeatherDataset(Dataset):
         _check_all_have(self.rows, self.options.load, self.uris)
 
     def given(self) -> frozenset[str]:
-        """What of `load` the samples have, the masks left out."""
+        """Return the names of `load` that the samples have, without the masks."""
         load = self.options.load.difference(mask_names())
         return frozenset(k for k in load if k == "image" or self.rows.has(k).any())
 
@@ -452,7 +475,7 @@ class WeatherDataset(Dataset):
         return sample if self.transform is None else self.transform(sample)
 
     def sample(self, index: int, *, without: Collection[str] = ()) -> Sample:
-        """One sample as it is before `transform`. without: what of `load` to leave out."""
+        """Return one sample before `transform`. without: names of `load` to leave out."""
         row = self.rows.row(check_index(index, len(self)))
         if get_worker_info() is not None:
             # The workers are the parallelism. Not 1: a worker forked after its parent used OpenCV's
@@ -477,64 +500,69 @@ class WeatherDataset(Dataset):
 
     def select(self, rows: np.ndarray) -> WeatherDataset:
         """The dataset of some samples: their numbers int64 [K], or a mask bool [N]."""
-        chosen = object.__new__(WeatherDataset)
-        chosen.__dict__.update(self.__dict__, rows=self.rows.take(rows))
-        return chosen
+        selection = object.__new__(WeatherDataset)
+        selection.__dict__.update(self.__dict__, rows=self.rows.take(rows))
+        return selection
 
 
 def _read_rows(
     stores: Sequence[Store], where: Expression | None, requested: dict[str, Collection | None]
 ) -> Rows:
     """The finished rows of the stores that a filter keeps."""
-    tables, uris = [read_finished(store) for store in stores], [store.uri for store in stores]
+    tables = [read_finished(store) for store in stores]
+    uris = [store.uri for store in stores]
     table = tables[0]
     if len(stores) > 1:
         codes = np.repeat(np.arange(len(stores)), [len(table) for table in tables])
         outputs = pa.DictionaryArray.from_arrays(codes, uris)
         table = concat_rows(tables).append_column(_OUTPUT, outputs)
     rows = Rows.of(table)
-    finished = keep = pc.equal(rows["status"], OK)
+    finished = mask = pc.equal(rows["status"], OK)
     for name, values in requested.items():
         if values is None:
             continue
         if isinstance(values, str):
             raise ValueError(f"{name}s must be a collection of names; got the string {values!r}")
-        known = pc.unique(rows[name].filter(finished))
-        if unknown := sorted(set(values).difference(known.to_pylist())):
-            message = ", ".join(map(str, sorted(known.to_pylist()))) or "none"
+        finished_values = pc.unique(rows[name].filter(finished))
+        if unknown := sorted(set(values).difference(finished_values.to_pylist())):
+            message = ", ".join(map(str, sorted(finished_values.to_pylist()))) or "none"
             raise ValueError(f"{', '.join(uris)}: no {name} {unknown}; finished are: {message}")
-        keep = pc.and_(keep, pc.is_in(rows[name], pa.array(list(values), known.type)))
+        mask = pc.and_(mask, pc.is_in(rows[name], pa.array(list(values), finished_values.type)))
     if where is not None:
         columns = {"fits": where}
         fits = pyarrow.dataset.dataset(table).scanner(columns, use_threads=False).to_table()["fits"]
-        keep = pc.and_(keep, fits.fill_null(False).combine_chunks())
-    keep = keep.to_numpy(zero_copy_only=False)
-    return rows if keep.all() else rows.take(keep)
+        mask = pc.and_(mask, fits.fill_null(False).combine_chunks())
+    mask = mask.to_numpy(zero_copy_only=False)
+    return rows if mask.all() else rows.take(mask)
 
 
 def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
-    """Raise ValueError where some variants have what is to be loaded, and others have none of it. A
-    single frame without labels or a sweep is no fault: a dataset may lack its file.
+    """Raise ValueError if a kind of file to load exists for some variants and not for others. A
+    single frame without labels or a sweep is no fault, as the recording may lack it.
     """
     first, group = rows.groups()
-    lacking = {}
+    variants_without_kind = {}
     for kind in sorted(set(load).difference(mask_names(), ["image"])):
-        given = np.bincount(group[rows.has(kind)], minlength=len(first)) > 0
-        if given.any() and not given.all():
-            lacking[kind] = _listed([rows.row(int(row)) for row in first[~given]], uris[0])
-    if not lacking:
+        has_kind = np.bincount(group[rows.has(kind)], minlength=len(first)) > 0
+        if has_kind.any() and not has_kind.all():
+            variants_without_kind[kind] = _listed(
+                [rows.row(int(row)) for row in first[~has_kind]], uris[0]
+            )
+    if not variants_without_kind:
         return
-    message = "; ".join(f"{kind}: none in {variants}" for kind, variants in lacking.items())
-    kept = tuple(kind for kind in loadable() if kind in load and kind not in lacking)
+    message = "; ".join(
+        f"{kind}: none in {variants}" for kind, variants in variants_without_kind.items()
+    )
+    names = tuple(kind for kind in loadable() if kind in load and kind not in variants_without_kind)
     raise ValueError(
         f"load asks for what only a part of the outputs has, so that batches would not stack. "
-        f"{message}. Leave it out (load={kept!r}), choose outputs, scenes or variants that are "
+        f"{message}. Leave it out (load={names!r}), choose outputs, scenes or variants that are "
         f"alike, or render those again with it under the recipe's `output`"
     )
 
 
 def _listed(variants: list[dict[str, Any]], uri: str) -> str:
-    """Variants by their outputs, as a text; the first three of each. uri: where there is one."""
+    """Return a text that lists variants by output, three of each. uri: the only output."""
     names = defaultdict(list)
     for row in variants:
         names[row.get(_OUTPUT, uri)].append(f"{row['scene']}/{row['variant']}")

@@ -8,9 +8,8 @@ where depths are mixtures. B's colour there is bilinear. The error is the root o
 of the differences of display-encoded colours over all pixels that count and all three channels.
 
 The world has to stand still between the two: render both at one time stamp, or say where A's points
-have gone until B (`augment.metrics.consistency` carries those of actors along). The sky is not
-part of
-it. Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours
+are when B is taken (`carry` computes it for the points of actors). The sky is not part of it.
+Warping is no exact inverse of rendering (bilinear colours, depths of blended surfaces, colours
 that truly depend on the direction), so the error of a perfect scene is small and not 0.
 
 A linear map of colours scales the error with the contrast, consistent or not, which is why the
@@ -35,15 +34,18 @@ from augment.jobs.tables import FrameBoxes
 from augment.labels import Boxes
 from augment.scene import Track
 
-MIN_ALPHA = 0.95
-RELATIVE_TOLERANCE, TOLERANCE_M = 0.01, 0.05  # of depth; the sum of both is allowed
-_NEIGHBOURS = ((0, 0), (0, 1), (1, 0), (1, 1))
+MIN_ALPHA = 0.95  # smallest alpha of a pixel that the scene fills, 0 to 1
+# Two depths agree if they differ by at most the sum of the two tolerances.
+RELATIVE_TOLERANCE = 0.01  # tolerance of a depth, as a fraction of the depth
+TOLERANCE_M = 0.05  # tolerance of a depth at any distance, metres
+_NEIGHBOURS = ((0, 0), (0, 1), (1, 0), (1, 1))  # offsets of the four pixels: rows, columns
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """What a pinhole camera saw. picture: floats [H, W, 3], display-encoded, in [0, 1]. depth_m:
-    z along the optical axis [H, W]. alpha [H, W]: in [0, 1]; depth counts where it is high.
+    """Picture and depth of a pinhole camera. picture: floats [H, W, 3], display-encoded, in [0, 1].
+    depth_m: z along the optical axis [H, W]. alpha [H, W]: in [0, 1]; depth counts where it is
+    high.
     """
 
     camera: Camera
@@ -64,9 +66,10 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Consistency:
-    """rmse: over the pixels that count, NaN where there are none. spread: standard deviation of
-    A's colours over the same pixels, about each channel's mean. share: of A's pixels that count.
-    noise: of the cameras, root of the mean square; taken out of rmse and spread.
+    """Agreement of two views. rmse: error over the pixels that count, NaN if none counts. spread:
+    standard deviation of A's colours over the same pixels, about each channel's mean. share:
+    fraction of A's pixels that count. noise: root mean square of the cameras' noise, which rmse and
+    spread do not include.
     """
 
     rmse: float
@@ -76,14 +79,15 @@ class Consistency:
 
     @property
     def relative(self) -> float:
-        """rmse over spread; NaN where the picture has one colour only."""
+        """Ratio of rmse to spread; NaN if the picture has one colour only."""
         return self.rmse / self.spread if self.spread > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where pixels of view A lie in view B. counts: bool [H, W] of A. columns, rows: float64 [K],
-    the places in B of the K pixels that count, in A's order, from the centre of B's first pixel.
+    """Places in view B of the pixels of view A. counts: bool [H, W], the pixels of A that count.
+    columns, rows: float64 [K], the places in B of these K pixels, in A's order, pixels from the
+    centre of B's first pixel.
     """
 
     counts: np.ndarray
@@ -94,8 +98,10 @@ class Warp:
         """An image of B's [Hb, Wb, C] as A would see it, float64 [H, W, C]: bilinear, and 0 where A
         does not count.
         """
-        c0, r0 = np.floor(self.columns).astype(np.int64), np.floor(self.rows).astype(np.int64)
-        fc, fr = (self.columns - c0)[:, None], (self.rows - r0)[:, None]
+        c0 = np.floor(self.columns).astype(np.int64)
+        r0 = np.floor(self.rows).astype(np.int64)
+        fc = (self.columns - c0)[:, None]
+        fr = (self.rows - r0)[:, None]
         values = np.zeros((len(c0), image.shape[2]))
         for dr, dc in _NEIGHBOURS:
             weight = (fr if dr else 1 - fr) * (fc if dc else 1 - fc)
@@ -120,11 +126,11 @@ def consistency_of(
     share = float(counts.mean())
     if not counts.any():
         return Consistency(math.nan, math.nan, share)
-    own = a.picture[counts].astype(np.float64)
+    colors = a.picture[counts].astype(np.float64)
     in_a, in_b = (0.0, 0.0) if noise is None else noise[counts].mean(0)
-    square = float(((warped[counts] - own) ** 2).mean()) - in_a - in_b
-    variance = float(own.var(axis=0).mean()) - in_a
-    rmse, spread = (math.sqrt(max(0.0, own)) for own in (square, variance))
+    square = float(((warped[counts] - colors) ** 2).mean()) - in_a - in_b
+    variance = float(colors.var(axis=0).mean()) - in_a
+    rmse, spread = (math.sqrt(max(0.0, mean)) for mean in (square, variance))
     return Consistency(rmse, spread, share, math.sqrt(in_a + in_b))
 
 
@@ -137,25 +143,28 @@ def warp_view(a: DepthView, b: DepthView) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) -> Warp:
-    """Which pixels of A count, and where they lie in B. points_m: float64 [H, W, 3], where A's
-    surfaces are in the world when B is taken, NaN where that is not known (such pixels do not
-    count); by default where they are when A is taken. Raises ValueError: a camera is orthographic.
+    """Return the pixels of A that count and their places in B. points_m: float64 [H, W, 3],
+    positions in the world of A's surfaces when B is taken; NaN where not known (such pixels do not
+    count). None takes the positions when A is taken. Raises ValueError: a camera is orthographic.
     """
     points = world_points(a) if points_m is None else points_m
     column, row, depth_m = _places(points, b.camera)
-    filled = (a.alpha >= MIN_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
-    inside = filled & (depth_m > 0)  # false for NaN
+    has_surface = (a.alpha >= MIN_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
+    inside = has_surface & (depth_m > 0)  # false for NaN
     # All four neighbours are in the picture.
     inside &= (column >= 0) & (column < b.camera.width - 1)
     inside &= (row >= 0) & (row < b.camera.height - 1)
-    c, r, z = column[inside], row[inside], depth_m[inside]
-    c0, r0 = np.floor(c).astype(np.int64), np.floor(r).astype(np.int64)
+    c = column[inside]
+    r = row[inside]
+    z = depth_m[inside]
+    c0 = np.floor(c).astype(np.int64)
+    r0 = np.floor(r).astype(np.int64)
     agrees = np.ones(len(z), bool)
     tolerance = RELATIVE_TOLERANCE * z + TOLERANCE_M
     for dr, dc in _NEIGHBOURS:
-        at = r0 + dr, c0 + dc
-        agrees &= b.alpha[at] >= MIN_ALPHA
-        agrees &= np.abs(b.depth_m[at] - z) <= tolerance
+        place = r0 + dr, c0 + dc
+        agrees &= b.alpha[place] >= MIN_ALPHA
+        agrees &= np.abs(b.depth_m[place] - z) <= tolerance
     counts = np.zeros(a.depth_m.shape, bool)
     counts[inside] = agrees
     return Warp(counts, c[agrees], r[agrees])
@@ -171,13 +180,17 @@ def world_points(view: DepthView) -> np.ndarray:
 
 
 def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where points [H, W, 3] lie in a camera's picture: column and row counted from the first
-    pixel's centre, and depth, metres; float64 [H, W] each.
+    """Project points [H, W, 3] of the world into a camera's picture. Returns column and row, pixels
+    from the first pixel's centre, and depth, metres; float64 [H, W] each.
     """
     pose = camera.camera_from_world.numpy()
     x, y, z = np.moveaxis(world @ pose[:3, :3].T + pose[:3, 3], -1, 0)
-    safe = np.where(z > 0, z, 1.0)
-    return camera.fx * x / safe + camera.cx - 0.5, camera.fy * y / safe + camera.cy - 0.5, z
+    positive_z = np.where(z > 0, z, 1.0)
+    return (
+        camera.fx * x / positive_z + camera.cx - 0.5,
+        camera.fy * y / positive_z + camera.cy - 0.5,
+        z,
+    )
 
 
 # ---- Where things inside labelled boxes go from the time of one picture to that of another -------
@@ -192,16 +205,17 @@ def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
 # last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is further away than
 # that is not there.
 
-MARGIN_M = 0.5
-STILL_M = 0.03  # of any corner; labels of parked cars tremble, and depths may differ by more
-HOLD_NS = 1_000_000  # clocks are rounded
-MAX_GAP_NS = 600_000_000  # some datasets label twice a second
+MARGIN_M = 0.5  # width of the strip around a moving box that is left out, metres
+# Labels of parked cars tremble, and the tolerance of depths is larger than this.
+STILL_M = 0.03  # largest motion of a corner of a box that stands still, metres
+HOLD_NS = 1_000_000  # time before the first and after the last label, as clocks are rounded
+MAX_GAP_NS = 600_000_000  # longest time between labels, as some datasets label twice a second
 
 
 @dataclass(frozen=True, eq=False)
 class PosedBox:
     """A box at one time. world_from_box: float64 [4, 4]. size_m: float64 [3]. known: false where
-    the pose is that of the label nearest in time. restless: whether the box moves between that
+    the pose is that of the label nearest in time. restless: true if the box moves between that
     label and the next one; false where the pose is known.
     """
 
@@ -212,7 +226,7 @@ class PosedBox:
 
 
 class ActorPaths:
-    """Where the boxes of a drive are at any time. Boxes without finite numbers are left out."""
+    """Poses of a drive's boxes at any time. Boxes whose numbers are not finite are left out."""
 
     def __init__(self, frames: Mapping[int, FrameBoxes]) -> None:
         times: dict[str, list[int]] = {}
@@ -225,38 +239,43 @@ class ActorPaths:
                 times.setdefault(name, []).append(frame.timestamp_ns)
                 poses.setdefault(name, []).append(pose)
                 self._sizes[name] = np.maximum(size, self._sizes.get(name, 0.0))
-        self._poses = {name: np.stack(each) for name, each in poses.items()}
-        self._times = {name: np.array(each, np.int64) for name, each in times.items()}
+        self._poses = {name: np.stack(box_poses) for name, box_poses in poses.items()}
+        self._times = {name: np.array(box_times, np.int64) for name, box_times in times.items()}
         self._tracks = {
             name: Track(
-                torch.from_numpy(self._times[name]), torch.from_numpy(each), HOLD_NS, MAX_GAP_NS
+                torch.from_numpy(self._times[name]),
+                torch.from_numpy(track_poses),
+                HOLD_NS,
+                MAX_GAP_NS,
             )
-            for name, each in self._poses.items()
+            for name, track_poses in self._poses.items()
         }
 
     def at(self, timestamp_ns: int) -> dict[str, PosedBox]:
-        """The boxes that are there, by their tracks."""
-        found = {}
+        """Return the boxes of that time, by their track ids."""
+        boxes = {}
         for name, track in self._tracks.items():
             gaps_ns = np.abs(self._times[name] - timestamp_ns)
             nearest = int(gaps_ns.argmin())
             if gaps_ns[nearest] > MAX_GAP_NS:
                 continue
-            pose, size = track.pose_at(timestamp_ns), self._sizes[name]
+            pose = track.pose_at(timestamp_ns)
+            size = self._sizes[name]
             if pose is not None:
-                found[name] = PosedBox(pose.numpy(), size, known=True, restless=False)
+                boxes[name] = PosedBox(pose.numpy(), size, known=True, restless=False)
                 continue
             poses = self._poses[name]
-            other = nearest - 1 if nearest else min(1, len(poses) - 1)
-            restless = _distance(poses[nearest], poses[other], size) > STILL_M
-            found[name] = PosedBox(poses[nearest], size, known=False, restless=restless)
-        return found
+            neighbour = nearest - 1 if nearest else min(1, len(poses) - 1)
+            restless = _distance(poses[nearest], poses[neighbour], size) > STILL_M
+            boxes[name] = PosedBox(poses[nearest], size, known=False, restless=restless)
+        return boxes
 
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """points_m: float64 [H, W, 3], where A's surfaces are when B is taken, NaN where that is not
-    known. moved: bool [H, W], carried along with a box. unclear_b: bool [H, W] of B, left out.
+    """Positions of A's surfaces when B is taken. points_m: float64 [H, W, 3], world, NaN where not
+    known. moved: bool [H, W], pixels of A that go along with a box. unclear_b: bool [H, W], pixels
+    of B that are left out.
     """
 
     points_m: np.ndarray
@@ -267,26 +286,28 @@ class Carried:
 def carry(
     paths: ActorPaths, a: DepthView, b: DepthView, is_actor: np.ndarray | None = None
 ) -> Carried:
-    """Where A's surfaces are when B is taken. Cameras are in the world of the boxes. is_actor: bool
-    [H, W], pixels of A that are known to show an actor: outside of every box they are left out, as
-    nobody knows where they go (the recording car's own bonnet, say). Raises ValueError: a camera is
-    orthographic.
+    """Return the positions of A's surfaces when B is taken. Cameras are in the world of the boxes.
+    is_actor: bool [H, W], pixels of A that are known to show an actor. Those outside of every box
+    are left out, as their motion is not known (the recording car's own bonnet, for example). Raises
+    ValueError: a camera is orthographic.
     """
     points = world_points(a)
-    at_a, at_b = paths.at(a.camera.timestamp_ns), paths.at(b.camera.timestamp_ns)
+    at_a = paths.at(a.camera.timestamp_ns)
+    at_b = paths.at(b.camera.timestamp_ns)
     moving = [n for n in {**at_a, **at_b} if _moves(at_a.get(n), at_b.get(n))]
     unclear_a, unclear_b = (
         _around([at[n] for n in moving if n in at], view) for at, view in ((at_a, a), (at_b, b))
     )
     claims = np.zeros(a.depth_m.shape, np.int64)
-    there = [n for n in moving if n in at_a]
-    for number, rows, columns in _shown([at_a[n] for n in there], a):
-        one, other = at_a[there[number]], at_b.get(there[number])
-        if other is None or not (one.known and other.known):
+    track_ids = [n for n in moving if n in at_a]
+    for number, rows, columns in _shown([at_a[n] for n in track_ids], a):
+        box_a = at_a[track_ids[number]]
+        box_b = at_b.get(track_ids[number])
+        if box_b is None or not (box_a.known and box_b.known):
             claims[rows, columns] += 2
             continue
         claims[rows, columns] += 1
-        b_from_a = other.world_from_box @ _inverse(one.world_from_box)
+        b_from_a = box_b.world_from_box @ _inverse(box_a.world_from_box)
         points[rows, columns] = points[rows, columns] @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     points[unclear_a | (claims > 1)] = np.nan
     if is_actor is not None:
@@ -295,7 +316,7 @@ def carry(
 
 
 def _moves(a: PosedBox | None, b: PosedBox | None) -> bool:
-    """Whether what a box holds cannot be taken to stand."""
+    """Return True unless the box is known to stand still between the two times."""
     if a is None or b is None:
         return True
     if a.known and b.known:
@@ -304,13 +325,13 @@ def _moves(a: PosedBox | None, b: PosedBox | None) -> bool:
 
 
 def _distance(a: np.ndarray, b: np.ndarray, size_m: np.ndarray) -> float:
-    """How far a corner of a box is at most between two poses, metres."""
+    """Return the largest distance that a corner of a box moves between two poses, metres."""
     ends = [(CORNERS * size_m) @ pose[:3, :3].T + pose[:3, 3] for pose in (a, b)]
     return float(np.linalg.norm(ends[0] - ends[1], axis=1).max())
 
 
 def _around(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
-    """bool [H, W]: what lies within MARGIN_M of a box and is not the box."""
+    """Return the pixels that lie within MARGIN_M of a box and outside of all, bool [H, W]."""
     mask = np.zeros(view.depth_m.shape, bool)
     for _, rows, columns in _shown(boxes, view, MARGIN_M):
         mask[rows, columns] = True
@@ -318,7 +339,7 @@ def _around(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
 
 
 def _inside(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
-    """bool [H, W]: what shows one of the boxes."""
+    """Return the pixels that show one of the boxes, bool [H, W]."""
     mask = np.zeros(view.depth_m.shape, bool)
     for _, rows, columns in _shown(boxes, view):
         mask[rows, columns] = True
@@ -328,11 +349,11 @@ def _inside(boxes: Sequence[PosedBox], view: DepthView) -> np.ndarray:
 def _shown(
     boxes: Sequence[PosedBox], view: DepthView, margin_m: float = 0.0
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """As `shown_pixels`, of boxes with a margin on all sides."""
+    """Yield as `shown_pixels` the pixels of boxes that have a margin on all sides."""
     if not boxes:
         return iter(())
     poses = torch.from_numpy(np.stack([box.world_from_box for box in boxes]))
-    placed = PlacedBoxes.of(
+    placed_boxes = PlacedBoxes.of(
         Boxes(
             ("",) * len(boxes),
             ("",) * len(boxes),
@@ -342,18 +363,21 @@ def _shown(
         ),
         np.zeros(3),
     )
-    low, high = placed.low_m - margin_m, placed.high_m + margin_m
-    grown = dataclasses.replace(placed, low_m=low, high_m=high)
+    low = placed_boxes.low_m - margin_m
+    high = placed_boxes.high_m + margin_m
+    wide_boxes = dataclasses.replace(placed_boxes, low_m=low, high_m=high)
     depth = np.where(np.isfinite(view.depth_m), view.depth_m, 0.0).astype(np.float32)
-    return shown_pixels(grown, view.camera, depth)
+    return shown_pixels(wide_boxes, view.camera, depth)
 
 
 def _finite_boxes(boxes: Boxes) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Track, size [3] and world_from_box [4, 4] of every box whose numbers can be used."""
-    placed = PlacedBoxes.of(boxes, np.zeros(3))
-    poses = rigid(torch.from_numpy(placed.rotations), torch.from_numpy(placed.centres_m)).numpy()
-    for number in np.flatnonzero(placed.is_usable):
-        yield boxes.track_ids[number], placed.sizes_m[number], poses[number]
+    placed_boxes = PlacedBoxes.of(boxes, np.zeros(3))
+    poses = rigid(
+        torch.from_numpy(placed_boxes.rotations), torch.from_numpy(placed_boxes.centres_m)
+    ).numpy()
+    for number in np.flatnonzero(placed_boxes.is_usable):
+        yield boxes.track_ids[number], placed_boxes.sizes_m[number], poses[number]
 
 
 def _inverse(pose: np.ndarray) -> np.ndarray:

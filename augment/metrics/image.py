@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-WINDOW = 11  # SSIM's, pixels
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
-PIXELS_PER_DEGREE = 67.0206  # FLIP's own default: a 0.7 m wide 3840 px screen at 0.7 m
-CLOSE_M = 0.05
+WINDOW = 11  # width of SSIM's window, pixels
+SIGMA = 1.5  # standard deviation of SSIM's window, pixels
+C1 = 0.01**2  # constant of SSIM that keeps the ratio of means finite; colours are in [0, 1]
+C2 = 0.03**2  # constant of SSIM that keeps the ratio of variances finite; colours are in [0, 1]
+PIXELS_PER_DEGREE = 67.0206  # resolution in FLIP's default: a 0.7 m wide 3840 px screen at 0.7 m
+CLOSE_M = 0.05  # largest error of a depth that counts as close, metres
 
 
 def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
@@ -92,12 +93,15 @@ def depth_errors(
     Pixels of weight 0 are left out, whatever they hold. Raises ValueError: shapes differ, or a
     pixel that counts has no finite depth or no true depth > 0.
     """
-    depth, true = np.asarray(depth_m, np.float64), np.asarray(true_m, np.float64)
+    depth = np.asarray(depth_m, np.float64)
+    true = np.asarray(true_m, np.float64)
     if depth.shape != true.shape:
         raise ValueError(f"depths must have one shape; got {depth.shape} and {true.shape}")
     w = np.ones(depth.shape) if weight is None else _checked_weight(weight, depth.shape)
     counts = w > 0
-    depth, true, w = depth[counts], true[counts], w[counts]
+    depth = depth[counts]
+    true = true[counts]
+    w = w[counts]
     if not (np.isfinite(depth).all() and np.isfinite(true).all() and (true > 0).all()):
         raise ValueError(
             "depths must be finite and true depths > 0 (metres) wherever the weight is > 0; "
@@ -118,9 +122,9 @@ def depth_errors(
 
 def _quantile(values: np.ndarray, weight: np.ndarray, part: float) -> float:
     order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order])
+    weight_sums = np.cumsum(weight[order])
     # Sums of weights round: an exact half must count as reached.
-    first = int(np.searchsorted(reached, part * reached[-1] * (1 - 1e-12)))
+    first = int(np.searchsorted(weight_sums, part * weight_sums[-1] * (1 - 1e-12)))
     return float(values[order[min(first, len(order) - 1)]])
 
 
@@ -133,8 +137,10 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     def blurred(image: np.ndarray) -> np.ndarray:
         return cv2.sepFilter2D(image, cv2.CV_64F, window, window, borderType=cv2.BORDER_CONSTANT)
 
-    mean_a, mean_b = blurred(a), blurred(b)
-    var_a, var_b = blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
+    mean_a = blurred(a)
+    mean_b = blurred(b)
+    var_a = blurred(a * a) - mean_a**2
+    var_b = blurred(b * b) - mean_b**2
     covariance = blurred(a * b) - mean_a * mean_b
     similarity = (
         (2 * mean_a * mean_b + C1)
@@ -147,8 +153,11 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _pair(
     picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Both as float64 in [0, 1], the picture made right where nothing counts; and the weight."""
-    a, b = _unit("picture", picture), _unit("reference", reference)
+    """Return picture, reference and weight. Both pictures are float64 in [0, 1]; where the weight
+    is 0, the picture has the reference's colours.
+    """
+    a = _unit("picture", picture)
+    b = _unit("reference", reference)
     if a.shape != b.shape:
         raise ValueError(f"pictures must have one size; got {a.shape} and {b.shape}")
     if weight is None:
@@ -167,7 +176,8 @@ def _unit(name: str, image: np.ndarray) -> np.ndarray:
         return image / 255.0
     if not np.issubdtype(image.dtype, np.floating):
         raise ValueError(f"{name} must be uint8, or floats in [0, 1]; got {image.dtype}")
-    low, high = float(image.min()), float(image.max())
+    low = float(image.min())
+    high = float(image.max())
     if not (low >= 0 and high <= 1):  # `not` also catches NaN
         raise ValueError(f"{name} must lie in [0, 1] (clamp it first); got {low:g} to {high:g}")
     return image.astype(np.float64)

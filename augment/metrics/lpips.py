@@ -23,9 +23,10 @@ from torch import Tensor
 from augment.errors import MetricError
 from augment.files.checkpoints import read_state_dict
 
-# Applied to pictures in [-1, 1]: about ImageNet's means and deviations.
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_MIN_LENGTH = 1e-10  # of a feature vector: one of zeros stays zeros
+# SHIFT and SCALE apply to pictures in [-1, 1]; they are about ImageNet's means and deviations.
+SHIFT = (-0.030, -0.088, -0.188)  # mean of red, green and blue, no unit
+SCALE = (0.458, 0.448, 0.450)  # standard deviation of red, green and blue, no unit
+_MIN_LENGTH = 1e-10  # length added to that of a feature vector, so that a zero vector stays zero
 
 
 @dataclass(frozen=True)
@@ -95,31 +96,31 @@ class Lpips:
         """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones. Raises
         ValueError: shapes differ, or the pictures are too small for the network.
         """
-        least = self.architecture.min_px
-        if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < least:
+        min_px = self.architecture.min_px
+        if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < min_px:
             raise ValueError(
-                f"pictures must be two of [B, 3, H, W] with H, W >= {least} for {self.name}; got "
+                f"pictures must be two of [B, 3, H, W] with H, W >= {min_px} for {self.name}; got "
                 f"{list(a.shape)} and {list(b.shape)}"
             )
         total = torch.zeros(len(a))
         pairs = zip(self._features(a), self._features(b), strict=True)
-        for number, (one, other) in enumerate(pairs):
-            squared = (_normalised(one) - _normalised(other)) ** 2
+        for number, (features_a, features_b) in enumerate(pairs):
+            squared = (_normalised(features_a) - _normalised(features_b)) ** 2
             total += F.conv2d(squared, self._weights[_head(number)]).mean((1, 2, 3))
         return total
 
     def _features(self, pictures: Tensor) -> list[Tensor]:
-        shift, scale = (torch.tensor(each)[:, None, None] for each in (SHIFT, SCALE))
+        shift, scale = (torch.tensor(channels)[:, None, None] for channels in (SHIFT, SCALE))
         x = (2 * pictures.float() - 1 - shift) / scale
-        taken = []
+        features = []
         for number, convs in enumerate(self.architecture.slices):
             if number in self.architecture.pools:
                 x = F.max_pool2d(x, self.architecture.pool_px, 2)
             for conv in convs:
                 weight, bias = (self._weights[name] for name in _names(number, conv))
                 x = F.relu(F.conv2d(x, weight, bias, conv.stride, conv.padding))
-            taken.append(x)
-        return taken
+            features.append(x)
+        return features
 
 
 def picture_lpips(
@@ -132,8 +133,8 @@ def picture_lpips(
     if weight is not None:
         picture = np.where(weight[..., None], picture, reference)
     a, b = (
-        torch.from_numpy(np.ascontiguousarray(each, np.float32)).permute(2, 0, 1)[None]
-        for each in (picture, reference)
+        torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
+        for image in (picture, reference)
     )
     return float(network(a, b))
 
@@ -146,25 +147,30 @@ def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
     (`lin0.model.1.weight`, ...), version 0.1. Raises MetricError: no such file, not one of these
     kinds, or tensors that are missing, of another shape or dtype, or not finite; says which.
     """
-    found = read_state_dict(weights, MetricError)
-    origin = dict.fromkeys(found, weights)
+    tensors = read_state_dict(weights, MetricError)
+    file_of_name = dict.fromkeys(tensors, weights)
     if heads is not None:
-        own = read_state_dict(heads, MetricError)
-        found, origin = found | own, origin | dict.fromkeys(own, heads)
-    architecture = _recognised(found, weights)
-    from_torchvision = "features.0.weight" in found
-    filled = {}
+        head_tensors = read_state_dict(heads, MetricError)
+        tensors = tensors | head_tensors
+        file_of_name = file_of_name | dict.fromkeys(head_tensors, heads)
+    architecture = _recognised(tensors, weights)
+    from_torchvision = "features.0.weight" in tensors
+    metric_tensors = {}
     for name, shape in expected_shapes(architecture).items():
-        theirs = _torchvision_name(name) if from_torchvision else name
-        filled[name] = _checked(found.get(theirs), theirs, shape, origin.get(theirs, weights))
-    for name, ours in (("shift", SHIFT), ("scale", SCALE)):
-        given = found.get(f"scaling_layer.{name}")
-        if given is not None and not torch.allclose(given.flatten().float(), torch.tensor(ours)):
+        stored_name = _torchvision_name(name) if from_torchvision else name
+        metric_tensors[name] = _checked(
+            tensors.get(stored_name), stored_name, shape, file_of_name.get(stored_name, weights)
+        )
+    for name, expected in (("shift", SHIFT), ("scale", SCALE)):
+        tensor = tensors.get(f"scaling_layer.{name}")
+        if tensor is not None and not torch.allclose(
+            tensor.flatten().float(), torch.tensor(expected)
+        ):
             raise MetricError(
-                f"{weights}: scaling_layer.{name} is {given.flatten().tolist()}; LPIPS 0.1 has "
-                f"{list(ours)}"
+                f"{weights}: scaling_layer.{name} is {tensor.flatten().tolist()}; LPIPS 0.1 has "
+                f"{list(expected)}"
             )
-    return Lpips(architecture, filled)
+    return Lpips(architecture, metric_tensors)
 
 
 def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
@@ -198,28 +204,28 @@ def _normalised(features: Tensor) -> Tensor:
     return features / (features.square().sum(1, keepdim=True).sqrt() + _MIN_LENGTH)
 
 
-def _recognised(found: Mapping[str, Tensor], path: Path) -> Architecture:
-    first = found.get("net.slice1.0.weight", found.get("features.0.weight"))
+def _recognised(tensors: Mapping[str, Tensor], path: Path) -> Architecture:
+    first_conv = tensors.get("net.slice1.0.weight", tensors.get("features.0.weight"))
     for architecture in (ALEX, VGG16):
-        wanted = expected_shapes(architecture)["net.slice1.0.weight"]
-        if first is not None and tuple(first.shape) == wanted:
+        expected_shape = expected_shapes(architecture)["net.slice1.0.weight"]
+        if first_conv is not None and tuple(first_conv.shape) == expected_shape:
             return architecture
-    told = f"it is {list(first.shape)}" if first is not None else "there is none"
+    text = f"it is {list(first_conv.shape)}" if first_conv is not None else "there is none"
     raise MetricError(
         f"{path}: expected a first convolution net.slice1.0.weight (LPIPS) or features.0.weight "
-        f"(torchvision) of AlexNet [64, 3, 11, 11] or VGG-16 [64, 3, 3, 3]; {told}. The file holds "
-        f"{', '.join(list(found)[:4]) or 'nothing'}"
+        f"(torchvision) of AlexNet [64, 3, 11, 11] or VGG-16 [64, 3, 3, 3]; {text}. The file holds "
+        f"{', '.join(list(tensors)[:4]) or 'nothing'}"
     )
 
 
-def _checked(given: Tensor | None, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
-    if given is None:
+def _checked(tensor: Tensor | None, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
+    if tensor is None:
         hint = ". The linear heads have a file of their own: name it too" * name.startswith("lin")
         raise MetricError(f"{path} lacks {name}, a tensor {list(shape)}{hint}")
-    if tuple(given.shape) != shape or not given.dtype.is_floating_point:
+    if tuple(tensor.shape) != shape or not tensor.dtype.is_floating_point:
         raise MetricError(
-            f"{path}: {name} must be floats {list(shape)}; got {given.dtype} {list(given.shape)}"
+            f"{path}: {name} must be floats {list(shape)}; got {tensor.dtype} {list(tensor.shape)}"
         )
-    if not bool(torch.isfinite(given).all()):
+    if not bool(torch.isfinite(tensor).all()):
         raise MetricError(f"{path}: {name} holds NaN or infinite values")
-    return given.float()
+    return tensor.float()
