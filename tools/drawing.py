@@ -62,7 +62,7 @@ def write(
     centred: bool = False,
     thickness: int = 1,
 ) -> None:
-    """Text with its baseline at y and its left end, or its centre, at x."""
+    """Write a text with its baseline at y and its left end, or its centre, at x."""
     if centred:
         x -= 0.5 * text_width(text, size, thickness)
     cv2.putText(image, text, (round(x), round(y)), FONT, size, color, thickness, cv2.LINE_AA)
@@ -83,13 +83,13 @@ def strip(panels: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def resized(image: np.ndarray, width: int, how: int) -> np.ndarray:
-    """At another width, by one of OpenCV's interpolations."""
+    """Resize a picture to another width, by one of OpenCV's interpolations."""
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return cv2.resize(image, (width, height), interpolation=how)
 
 
 def text_width(text: str, size: float, thickness: int = 1) -> int:
-    """Pixels."""
+    """Return the width of a text, in pixels."""
     return cv2.getTextSize(text, FONT, size, thickness)[0][0]
 
 
@@ -100,7 +100,7 @@ def color_mapped(values: np.ndarray, color_map: int) -> np.ndarray:
 
 
 def color_bar(width: int, height: int, color_map: int) -> np.ndarray:
-    """uint8 [H, W, 3]: 0 at the left, 1 at the right."""
+    """Return a colour bar, uint8 [H, W, 3]: 0 at the left, 1 at the right."""
     ramp = np.broadcast_to(np.linspace(0, 1, width), (height, width))
     return color_mapped(ramp, color_map)
 
@@ -112,9 +112,9 @@ def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
         return [low]
     unit = 10.0 ** math.floor(math.log10(rough))
     step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= rough * 0.999)
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [i * step for i in range(first, last + 1)]
+    first_index = math.ceil(low / step - 1e-9)
+    last_index = math.floor(high / step + 1e-9)
+    return [i * step for i in range(first_index, last_index + 1)]
 
 
 def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
@@ -131,7 +131,7 @@ def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
 
 
 def short_number(value: float) -> str:
-    """For an axis: 5000 as 5k, 1.5e6 as 1.5M, 0.02 as it is."""
+    """Return a number as text for an axis: 5000 as 5k, 1.5e6 as 1.5M, 0.02 as it is."""
     for limit, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
             return f"{value / limit:g}{suffix}"
@@ -148,12 +148,12 @@ def value_codes(table: pa.Table, *columns: str) -> np.ndarray:
 
 
 def first_of_each(table: pa.Table, *columns: str) -> np.ndarray:
-    """int64: the rows where a combination of the columns' values stands first, in their order."""
+    """Return the rows (int64) where a combination of the columns' values stands first, in order."""
     return np.sort(np.unique(value_codes(table, *columns), return_index=True)[1])
 
 
 def evenly(values: Sequence[Value], most: int) -> list[Value]:
-    """At most `most` of them in their order, from the middles of as many equal parts."""
+    """Choose at most `most` items in their order, from the middles of as many equal parts."""
     number = min(most, len(values))
     return [values[(2 * i + 1) * len(values) // (2 * number)] for i in range(number)]
 
@@ -406,7 +406,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
 
 
 def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
-    """PNG or JPEG by the name's ending.
+    """Write a picture as PNG or JPEG, by the name's ending.
 
     Raises:
         OutputError: the file cannot be written.

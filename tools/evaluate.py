@@ -111,10 +111,10 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
             print_note(f"note: {note}")
     records: list[dict[str, Any]] = []
     for drive, pair in tqdm(drive_pairs, unit="pair", disable=not progress):
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         records.append(_record(views, drive, pair, network))
         if progress and len(records) == _TIMED_PAIR:
-            _say_duration(len(drive_pairs), time.perf_counter() - started)
+            _say_duration(len(drive_pairs), time.perf_counter() - start_s)
     worst = _worst(records)
     if options.pictures is not None:
         for record in worst:
@@ -137,14 +137,14 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
 def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: int) -> list[str]:
     """Explain why tables are empty. kinds: the kinds of the pairs that there are."""
     distances = {SHORT: short, LONG: long}
-    missing = [kind for kind in distances if kind not in kinds]
+    missing_kinds = [kind for kind in distances if kind not in kinds]
     by_camera = [
         sorted(frame for frame, name in drive.rows if name == camera)
         for drive in drives
         for camera in {camera for _, camera in drive.rows}
     ]
     steps = Counter(b - a for frames in by_camera for a, b in itertools.pairwise(frames))
-    if not missing or not steps:
+    if not missing_kinds or not steps:
         return []
     step = steps.most_common(1)[0][0]
     span = max(frames[-1] - frames[0] for frames in by_camera)
@@ -152,11 +152,11 @@ def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: in
     hint = "render more frames"
     if distance > step:
         hint = f"add --short {step} --long {distance}, or render consecutive frames"
-    distance_text = " or ".join(str(distances[kind]) for kind in missing)
+    distance_text = " or ".join(str(distances[kind]) for kind in missing_kinds)
     return [
         f"no two frames of a camera are {distance_text} apart, so the tables of "
-        f"{' and '.join(missing)} range are empty: the numbers of most are {step} apart, of the "
-        f"first and last {span}; "
+        f"{' and '.join(missing_kinds)} range are empty: the numbers of most are {step} apart, of "
+        f"the first and last {span}; "
         f"{hint}"
     ]
 
@@ -229,7 +229,7 @@ class Views:
         self._noise = functools.cache(self._read_noise)
 
     def drives(self) -> list[Drive]:
-        """In the manifest's order."""
+        """Return the drives in the manifest's order."""
         drives: dict[tuple[str, str], Drive] = {}
         masks = masks_of(self.rows)
         names = ("scene", "variant", "recipe", "frame", "camera")
@@ -372,7 +372,7 @@ class Compared(NamedTuple):
 
 
 def compare(views: Views, pair: Pair) -> Compared:
-    """Two views by the protocol.
+    """Compare two views by the protocol.
 
     Raises:
         OutputError: a file is missing or damaged.
@@ -405,7 +405,7 @@ def compare(views: Views, pair: Pair) -> Compared:
 
 
 def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> dict[str, Any]:
-    """The numbers of one pair."""
+    """Compute the numbers of one pair."""
     comparison = compare(views, pair)
     counts = comparison.warp.counts
     cameras = [views.camera(row) for row in (pair.a, pair.b)]
@@ -426,17 +426,15 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
         "rows": pair,
     }
     for name, part in parts.items():
-        consistency = consistency_of(
-            comparison.a.depth_view, comparison.warped, part, comparison.noise
-        )
-        enough = consistency.share >= MIN_SHARE
+        numbers = consistency_of(comparison.a.depth_view, comparison.warped, part, comparison.noise)
+        is_usable = numbers.share >= MIN_SHARE
         record[name] = {
-            "share": consistency.share,
-            "rmse": consistency.rmse if enough else None,
-            "relative": consistency.relative
-            if enough and not math.isnan(consistency.relative)
+            "share": numbers.share,
+            "rmse": numbers.rmse if is_usable else None,
+            "relative": numbers.relative
+            if is_usable and not math.isnan(numbers.relative)
             else None,
-            "noise": consistency.noise if enough and comparison.noise is not None else None,
+            "noise": numbers.noise if is_usable and comparison.noise is not None else None,
         }
     if network is not None and record[ALL]["rmse"] is not None:
         distance = picture_lpips(
@@ -461,23 +459,23 @@ def _summaries(records: Iterable[dict[str, Any]], names: Sequence[str]) -> list[
 
 
 def _of_kind(records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """None where there are no pairs."""
+    """Summarise pairs of one kind; None where there are no pairs."""
     if not records:
         return None
-    used = [r for r in records if r[ALL]["rmse"] is not None]
+    usable_records = [r for r in records if r[ALL]["rmse"] is not None]
     return {
-        "pairs": len(used),
-        "left_out": len(records) - len(used),
+        "pairs": len(usable_records),
+        "left_out": len(records) - len(usable_records),
         **{
-            name: float(np.mean([r[name] for r in used])) if used else None
+            name: float(np.mean([r[name] for r in usable_records])) if usable_records else None
             for name in ("seconds_apart", "meters_apart", "moved_share")
         },
-        **{part: _of_part(used, part) for part in (ALL, DRY, WATER)},
+        **{part: _of_part(usable_records, part) for part in (ALL, DRY, WATER)},
     }
 
 
 def _of_part(records: list[dict[str, Any]], part: str) -> dict[str, Any] | None:
-    """None where no pair has enough such pixels."""
+    """Summarise one part of the pixels; None where no pair has enough such pixels."""
     entries = [r[part] for r in records if part in r and r[part]["rmse"] is not None]
     if not entries:
         return None
@@ -522,10 +520,10 @@ def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
     distance_text = f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart"
     shares = f"what counts: {100 * numbers['share']:.0f} % of the pixels"
     error_map = color_mapped(ERROR_GAIN * error, cv2.COLORMAP_INFERNO)
-    warped = _bytes(np.where(counts[..., None], comparison.warped, 0.0))
+    warped_image = _bytes(np.where(counts[..., None], comparison.warped, 0.0))
     panels = (
         (_bytes(picture), a, f"{record['scene']}, {record['variant']}"),
-        (warped, f"{b}, warped into it", distance_text),
+        (warped_image, f"{b}, warped into it", distance_text),
         (error_map, f"error, x{ERROR_GAIN:g}", f"RMSE {numbers['rmse']:.4f}"),
         (mask, shares, "blue: water; orange: went along with a box"),
     )
@@ -533,8 +531,8 @@ def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
     panel_images = [
         captioned(resized(image, PANEL_PX, interpolation), *texts) for image, *texts in panels
     ]
-    between = np.full((GAP_PX, 2 * panel_images[0].shape[1] + GAP_PX, 3), 255, np.uint8)
-    return np.concatenate([strip(panel_images[:2]), between, strip(panel_images[2:])])
+    gap_image = np.full((GAP_PX, 2 * panel_images[0].shape[1] + GAP_PX, 3), 255, np.uint8)
+    return np.concatenate([strip(panel_images[:2]), gap_image, strip(panel_images[2:])])
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:
@@ -542,7 +540,7 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def evaluation_text(facts: dict[str, Any]) -> str:
-    """All tables."""
+    """Return all tables of an evaluation as text."""
     titles = {k: f"{n} frame{'s' * (n != 1)} apart" for k, n in facts["frames_apart"].items()}
     with_lpips = facts["lpips"] is not None
     lines = [line for note in facts["notes"] for line in (f"Note: {note}", "")]
@@ -561,7 +559,7 @@ def evaluation_text(facts: dict[str, Any]) -> str:
 
 
 def _noises(facts: dict[str, Any]) -> str:
-    """Its root mean square in a pair, by recipe."""
+    """Return the noise's root mean square in a pair, by recipe, as text."""
     texts = []
     for row in facts["recipes"]:
         parts = [row[kind][ALL] for kind in KINDS if row[kind] is not None]

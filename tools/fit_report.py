@@ -157,18 +157,22 @@ def _choose_split(source: ViewSource) -> tuple[str, tuple[ViewKey, ...], str]:
     return "train", keys, note
 
 
-def _spread(keys: Sequence[ViewKey], most: int) -> tuple[ViewKey, ...]:
-    """At most so many of the views, of all cameras alike, evenly spread over each one's."""
-    if len(keys) <= most:
+def _spread(keys: Sequence[ViewKey], max_keys: int) -> tuple[ViewKey, ...]:
+    """Choose at most max_keys views, as many of each camera, evenly spread over its views."""
+    if len(keys) <= max_keys:
         return tuple(keys)
     cameras = {key.camera for key in keys}
-    chosen = set(_of_each_camera(keys, cameras, max(1, most // len(cameras))))
-    return tuple(key for key in keys if key in chosen)
+    chosen_keys = set(_of_each_camera(keys, cameras, max(1, max_keys // len(cameras))))
+    return tuple(key for key in keys if key in chosen_keys)
 
 
-def _of_each_camera(keys: Sequence[ViewKey], cameras: Iterable[str], most: int) -> list[ViewKey]:
+def _of_each_camera(
+    keys: Sequence[ViewKey], cameras: Iterable[str], max_keys: int
+) -> list[ViewKey]:
     return [
-        key for name in cameras for key in evenly([key for key in keys if key.camera == name], most)
+        key
+        for name in cameras
+        for key in evenly([key for key in keys if key.camera == name], max_keys)
     ]
 
 
@@ -198,7 +202,7 @@ def _write_pictures(
 
 
 def _markdown(scene: Scene, report: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
-    """A row per camera and one of the means over all views; columns nothing is known of are out."""
+    """Table of a row per camera and one of the means over all views, without empty columns."""
     unit = " m" if scene.has_metric_scale else ""
     total = {"views": report["scored"]["views"], **report["mean"]}
 
@@ -552,8 +556,8 @@ def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
     """
     truth = open_street(uri)
     keys = source.test or source.train
-    chosen = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
-    cameras = [source.camera(key) for key in chosen]
+    chosen_keys = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
+    cameras = [source.camera(key) for key in chosen_keys]
     return {"street": uri, **true_depth_errors(scene, truth, cameras)}
 
 

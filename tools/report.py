@@ -78,20 +78,29 @@ _CODES = {
     codes.PRECIPITATION: "on a drop or a flake",
 }
 _FACTS = {
-    "size": "Image size", "camera": "Cameras", "trajectory": "Trajectory",
-    "surface": "Surface of labels", "seed": "Seeds", "version": "Version", "backend": "Backend",
-}  # fmt: skip
-# Of a group of images by what is counted. Frames are counted once per scene, whatever their
-# variants and cameras.
+    "size": "Image size",
+    "camera": "Cameras",
+    "trajectory": "Trajectory",
+    "surface": "Surface of labels",
+    "seed": "Seeds",
+    "version": "Version",
+    "backend": "Backend",
+}
+# Columns of a group of images, each with the column it is computed from and Arrow's function.
+# Frames are counted once per scene, whatever their variants and cameras.
 _COUNTS = {
-    "source": ("source", "min"), "finished": ("finished", "sum"), "failed": ("failed", "sum"),
-    "scenes": ("scene", "count_distinct"), "variants": ("draw", "count_distinct"),
-    "frames": ("place", "count_distinct"), "cameras": ("camera", "count_distinct"),
-}  # fmt: skip
+    "source": ("source", "min"),
+    "finished": ("finished", "sum"),
+    "failed": ("failed", "sum"),
+    "scenes": ("scene", "count_distinct"),
+    "variants": ("draw", "count_distinct"),
+    "frames": ("place", "count_distinct"),
+    "cameras": ("camera", "count_distinct"),
+}
 
 
 class Written(NamedTuple):
-    """problems: how many files could not be read."""
+    """A written page. problems: the number of files that could not be read."""
 
     path: Path
     size: int
@@ -132,7 +141,7 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
 
 
 def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
-    """The page's text, and how many files could not be read. html: where it will lie."""
+    """Return the page's text and the number of unreadable files. html: the page's future path."""
     table = read_finished(store, _UNUSED)
     cameras = cameras_on_car(store, table)
     table = add_variant_key(table.drop_columns("calibration_path"))
@@ -205,9 +214,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "number": count, "plural": plural_of, "bytes": byte_size, "percent": percent,
-        "short": short, "with_unit": with_unit,
-    }  # fmt: skip
+        "number": count,
+        "plural": plural_of,
+        "bytes": byte_size,
+        "percent": percent,
+        "short": short,
+        "with_unit": with_unit,
+    }
     environment.globals |= {"depth_gradient": depth_gradient, **LIMITS}
     return environment
 
@@ -217,7 +230,7 @@ def _asset(environment: Environment, name: str) -> Markup:
 
 
 def add_variant_key(table: pa.Table) -> pa.Table:
-    """With a column `draw`: one whole number for each scene and variant, in the table's order."""
+    """Add a column `draw`: one integer for each scene and variant, in the table's order."""
     return table.append_column("draw", pa.array(value_codes(table, "scene", "variant"), pa.int64()))
 
 
@@ -284,24 +297,26 @@ def _kind_of(path: str) -> str:
     return folder if folder in kind_names and len(parts) > 2 else OTHER
 
 
-def _sample_text(files: int, of: int) -> str:
-    """How much of what there is was looked at."""
-    return "" if files >= of else f"; from {files:,} of {count(of, 'file')}, evenly chosen"
+def _sample_text(num_read: int, num_files: int) -> str:
+    """Say how many of the files were read."""
+    if num_read >= num_files:
+        return ""
+    return f"; from {num_read:,} of {count(num_files, 'file')}, evenly chosen"
 
 
 def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
     """Boxes by class, the most frequent first: (class, boxes, tracks). Of every scene's first
     variant that has labels: they are the same in the others.
     """
-    labelled = table.select(["scene", "draw", "labels_path"]).drop_null()
-    first = labelled["draw"].take(first_of_each(labelled, "scene")).combine_chunks()
-    labelled = labelled.filter(pc.is_in(labelled["draw"], value_set=first))
-    rows = first_of_each(labelled, "labels_path").tolist()
+    labelled_rows = table.select(["scene", "draw", "labels_path"]).drop_null()
+    first_draws = labelled_rows["draw"].take(first_of_each(labelled_rows, "scene")).combine_chunks()
+    labelled_rows = labelled_rows.filter(pc.is_in(labelled_rows["draw"], value_set=first_draws))
+    rows = first_of_each(labelled_rows, "labels_path").tolist()
     boxes = Counter[str]()
     tracks = set[tuple[str, str, str]]()
     num_read = 0
     row_numbers = pa.array(evenly(rows, MAX_BOX_FILES), pa.int64())
-    for row in labelled.take(row_numbers).to_pylist():
+    for row in labelled_rows.take(row_numbers).to_pylist():
         columns = files.read_columns(row["labels_path"], ("label", "track_id"))
         if columns is None or columns.num_columns < 2:
             continue
@@ -312,8 +327,8 @@ def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
             tracks.add((label, row["scene"], track))
     tracks_by_label = Counter(label for label, *_ in tracks)
     order = sorted(boxes, key=lambda label: (-boxes[label], label))
-    counted = [(label, boxes[label], tracks_by_label[label]) for label in order]
-    return {"rows": counted, "sample": _sample_text(num_read, len(rows))} if counted else None
+    class_rows = [(label, boxes[label], tracks_by_label[label]) for label in order]
+    return {"rows": class_rows, "sample": _sample_text(num_read, len(rows))} if class_rows else None
 
 
 def read_trainers(files: ReportFiles) -> LabelsRecord | None:
@@ -323,7 +338,7 @@ def read_trainers(files: ReportFiles) -> LabelsRecord | None:
 
 
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
-    """How much the weather leaves of each box that an image shows, in VISIBILITY_STEPS.
+    """Count boxes by the share that the weather leaves visible, in VISIBILITY_STEPS.
 
     The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
     """
@@ -343,7 +358,7 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> di
 
 
 def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
-    """How many points of each recipe's sweeps have which weather code.
+    """Count the points of each recipe's sweeps by their weather code.
 
     None where no sweep has the column `weather_code`.
     """
@@ -369,7 +384,7 @@ def _count_by_recipe(
     table: pa.Table,
     recipes: list[str],
     columns: list[str],
-    most: int,
+    max_sets: int,
     count_values: Callable[[dict[str, str | None]], Counter[int] | None],
 ) -> tuple[list[tuple[str, Counter[int]]], str]:
     """The sum of what is counted in the files of each recipe that has any, of at most `most` of
@@ -383,7 +398,9 @@ def _count_by_recipe(
         sets = recipe_rows.group_by(columns, use_threads=False).aggregate([]).to_pylist()
         sets = [paths for paths in sets if any(paths.values())]
         sets.sort(key=lambda paths: str([*paths.values()]))
-        set_counts = [counts for s in evenly(sets, most) if (counts := count_values(s)) is not None]
+        set_counts = [
+            counts for s in evenly(sets, max_sets) if (counts := count_values(s)) is not None
+        ]
         if total := sum(set_counts, Counter[int]()):
             counts_by_recipe.append((recipe, total))
         num_sets += len(sets) if set_counts else 0
@@ -409,7 +426,7 @@ def _bars(
 
 
 def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray | None:
-    """float64 [boxes that a pixel shows] of the images that a variant's tables hold."""
+    """Return the visible share of every box that a pixel shows, float64 [boxes], of a variant."""
     parts = []
     for column, path in paths.items():
         if path is None:
@@ -422,23 +439,17 @@ def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray 
             **({"pixels": pa.int64()} if has_pixels else {}),
             share_column: pa.float64(),
         }
-        box_table = files.read_columns(path, (*types,))
-        if box_table is None:
+        table = files.read_columns(path, (*types,))
+        if table is None:
             return None
-        if box_table.num_columns < len(types):  # of an output older than `pixels`
+        if table.num_columns < len(types):  # of an output older than `pixels`
             continue
-        if box_table.schema.types != [*types.values()]:
+        if table.schema.types != [*types.values()]:
             return files.note(path, "its columns are not of the types that a job writes")
-        visible_share = (
-            pc.subtract(1.0, box_table[share_column]) if kind.hidden else box_table[share_column]
-        )
-        visible_share = pc.fill_null(
-            pc.if_else(pc.is_finite(visible_share), visible_share, 1.0), 1.0
-        )
-        is_shown = (
-            pc.greater(box_table["pixels"], 0) if has_pixels else pa.repeat(True, len(box_table))
-        )
-        part = box_table.select(list(_BOX)).append_column("left", visible_share)
+        share = pc.subtract(1.0, table[share_column]) if kind.hidden else table[share_column]
+        share = pc.fill_null(pc.if_else(pc.is_finite(share), share, 1.0), 1.0)
+        is_shown = pc.greater(table["pixels"], 0) if has_pixels else pa.repeat(True, len(table))
+        part = table.select(list(_BOX)).append_column("left", share)
         parts.append(part.append_column("shown", pc.fill_null(is_shown, False)))
     if not parts:
         return None

@@ -175,7 +175,7 @@ def _number_columns(table: pa.Table) -> list[str]:
 
 
 def _as_floats(table: pa.Table, column: str) -> np.ndarray:
-    """float64 [rows]; null is NaN."""
+    """Return a column as float64 [rows]; null is NaN."""
     return pc.fill_null(table[column], np.nan).to_numpy().astype(np.float64)
 
 
@@ -234,7 +234,7 @@ def chart(spread: Spread) -> dict[str, Any]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """0.31 m, 4.8 NTU; a number without a unit stands alone."""
+    """Return a number with its unit, such as 0.31 m or 4.8 NTU; without a unit, the number."""
     return f"{short(number)} {unit}".rstrip()
 
 
@@ -252,7 +252,7 @@ def short(number: float) -> str:
 
 
 def count(number: int, noun: str = "") -> str:
-    """12,000 images; 1 image."""
+    """Return a count with its noun, such as 12,000 images or 1 image."""
     return f"{number:,} {plural_of(number, noun)}".rstrip()
 
 
@@ -264,7 +264,7 @@ def plural_of(number: int, noun: str) -> str:
 
 
 def byte_size(number: int) -> str:
-    """3.2 MB, in steps of 1000."""
+    """Return a size as text, such as 3.2 MB, in steps of 1000."""
     size = float(number)
     unit = 0
     while size >= 999.5 and unit < len(_BYTES) - 1:

@@ -107,13 +107,13 @@ class ReportFiles:
             self.unlisted += 1
 
     def read_columns(self, path: str, names: tuple[str, ...]) -> pa.Table | None:
-        """Those of `names` that a Parquet file has."""
+        """Read those columns of `names` that a Parquet file has."""
         return self.read(path, lambda data: read_table(data, path, names))
 
     def read_image(
         self, path: str, decode: Callable[[bytes], np.ndarray], checksum: str = ""
     ) -> np.ndarray | None:
-        """An image of no more than MAX_PIXELS."""
+        """Read an image of no more than MAX_PIXELS."""
 
         def checked(data: bytes) -> np.ndarray:
             header = image_header(data)
@@ -152,9 +152,9 @@ def pick_images(table: pa.Table, among: np.ndarray, number: int, shift: int = 0)
         group = int((i + (0.5 + (i + shift) * _GOLDEN) % 1) * (len(bounds) - 1) / number)
         low = bounds[group]
         size = bounds[group + 1] - bounds[group]
-        inside = int(size * ((0.5 + (i + shift) * _SILVER) % 1))
-        free = (low + (inside + k) % size for k in range(size))
-        rows |= {next((row for row in free if row not in rows), low)}
+        offset = int(size * ((0.5 + (i + shift) * _SILVER) % 1))
+        free_rows = (low + (offset + k) % size for k in range(size))
+        rows |= {next((row for row in free_rows if row not in rows), low)}
     return table.take(among[sorted(rows)]).to_pylist()
 
 
@@ -170,14 +170,14 @@ def pick_places(table: pa.Table, clear: set[int], places: int, variants: int) ->
     for name in evenly(names, 8 * places):  # reading rows of thousands of scenes takes seconds
         candidates.append(_place_of(table, rows_with(table, "scene", name), clear, variants))
     candidates = [rows for rows in candidates if len(rows) >= 2]
-    paired = [rows for rows in candidates if len({row["draw"] in clear for row in rows}) == 2]
-    return evenly(paired or candidates, places)
+    mixed_places = [rows for rows in candidates if len({row["draw"] in clear for row in rows}) == 2]
+    return evenly(mixed_places or candidates, places)
 
 
 def _place_of(table: pa.Table, among: np.ndarray, clear: set[int], variants: int) -> list[Row]:
     rows = table.select(["frame", "camera", "draw"]).take(among)
-    counted = rows.group_by(["frame", "camera"], use_threads=False)
-    view_counts = counted.aggregate([("draw", "count_distinct")]).to_pylist()
+    views = rows.group_by(["frame", "camera"], use_threads=False)
+    view_counts = views.aggregate([("draw", "count_distinct")]).to_pylist()
     max_variants = max(entry["draw_count_distinct"] for entry in view_counts)
     fullest_views = [
         (e["camera"], e["frame"]) for e in view_counts if e["draw_count_distinct"] == max_variants
@@ -235,7 +235,9 @@ class Shares(NamedTuple):
 
     @staticmethod
     def of(images: int) -> Shares:
-        """A third for comparisons, a quarter for depth and classes, the rest for contact sheets."""
+        """Share out a page's images: a third for comparisons, a quarter for depth and classes, the
+        rest for contact sheets.
+        """
         num_compared = images // 3
         samples = images // 4 // _SAMPLE
         # Two stand beside each other, one has the page's width.
@@ -337,7 +339,7 @@ class Gallery:
 
 
 def read_buffers(row: Row, files: ReportFiles, width: int, most: int) -> list[Figure]:
-    """Pictures of what else was written beside an image: depth, classes, masks.
+    """Return pictures of an image's buffers: depth, classes, masks.
 
     width: pixels at most. most: bytes of each.
     """
