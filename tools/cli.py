@@ -220,7 +220,7 @@ class RecordOptions(Command):
     def run(self) -> int:
         from adapters.recording.from_colmap import record_colmap
 
-        made = record_colmap(
+        recording = record_colmap(
             self.model,
             self.images,
             self.out,
@@ -228,21 +228,24 @@ class RecordOptions(Command):
             camera_height_m=self.camera_height,
             positions=self.positions,
         )
-        road = made.road
-        print(f"{made.frames} frames, {made.images} images; {made.left_out} have no pose, left out")
+        road = recording.road
+        print(
+            f"{recording.frames} frames, {recording.images} images; {recording.left_out} have no "
+            f"pose, left out"
+        )
         print(
             f"road: {road.points} points, half of them within {100 * road.residual:.1f} % of the "
             f"cameras' height of one plane, which is taken for level"
         )
-        if made.metres is None:
+        if recording.metres is None:
             print("metres are not known: give --camera-height or --positions")
         else:
             print(
-                f"scale: {made.metres:.4g} m a unit of COLMAP's; the cameras are "
-                f"{made.metres * road.height:.2f} m above the road"
+                f"scale: {recording.metres:.4g} m a unit of COLMAP's; the cameras are "
+                f"{recording.metres * road.height:.2f} m above the road"
             )
-        if made.residual_m is not None:
-            print(f"positions: half of them within {made.residual_m:.2f} m")
+        if recording.residual_m is not None:
+            print(f"positions: half of them within {recording.residual_m:.2f} m")
         print(f"recording: {self.out}")
         return 0
 
@@ -635,7 +638,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not sys.stderr.isatty():  # a log needs a progress line now and then, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     arguments = sys.argv[1:] if arguments is None else arguments
-    table, prog = COMMANDS, "climategs"
+    table = COMMANDS
+    prog = "climategs"
     description = "Weather for driving scenes made of 3D Gaussians."
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[NoteHandler()])
     try:
@@ -643,7 +647,8 @@ def main(arguments: list[str] | None = None) -> int:
         if arguments and arguments[0] in ("bench", *GROUPS):
             group, *arguments = arguments
             table = _bench_commands() if group == "bench" else GROUPS[group]
-            prog, description = f"climategs {group}", COMMANDS[group].__doc__
+            prog = f"climategs {group}"
+            description = COMMANDS[group].__doc__
         result = tyro.extras.subcommand_cli_from_dict(
             table, args=arguments, prog=prog, description=description, sort_subcommands=False
         )

@@ -27,18 +27,21 @@ from recipes.schema import columns_of_effects, parse_frames
 from tools.output import print_note
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-CAPTION_PX, GAP_PX = 42, 8
+CAPTION_PX = 42  # the height of the two lines under a picture, in pixels
+GAP_PX = 8  # the white gap between two pictures, in pixels
 Color = tuple[int, int, int]
 Value = TypeVar("Value")
 VIDEO_WIDTH = 1440
-MAX_SHOWN, MAX_LINES = 12, 48  # scenes and variants in one picture; rows of a contact sheet
+MAX_SHOWN = 12  # the number of scenes and variants in one picture
+MAX_LINES = 48  # the number of rows of a contact sheet
 CELL_WIDTH = 400  # px of one image on a contact sheet
 MARGIN = 6
 CAPTION = 26
 _TITLE_SIZE = 0.6
-# A camera that looks back, or less than 15 degrees past it, is one at the back; axes that differ by
-# less than about 5 degrees are those of a stereo pair.
-BACK_DEG, SAME_AXIS_DEG = 165.0, 5.0
+# The yaw from which cameras are counted, in degrees: a camera that looks back, or less than 15
+# degrees past it, is one at the back.
+BACK_DEG = 165.0
+SAME_AXIS_DEG = 5.0  # the angle below which, roughly, two axes are those of a stereo pair
 # What browsers play, from its start on, in the colours of RGB. One thread and nothing of the moment
 # or the version: the same frames give the same bytes.
 H264 = (
@@ -59,7 +62,7 @@ def write(
     centred: bool = False,
     thickness: int = 1,
 ) -> None:
-    """Text with its baseline at y and its left end, or its centre, at x."""
+    """Write a text with its baseline at y and its left end, or its centre, at x."""
     if centred:
         x -= 0.5 * text_width(text, size, thickness)
     cv2.putText(image, text, (round(x), round(y)), FONT, size, color, thickness, cv2.LINE_AA)
@@ -80,13 +83,13 @@ def strip(panels: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def resized(image: np.ndarray, width: int, how: int) -> np.ndarray:
-    """At another width, by one of OpenCV's interpolations."""
+    """Resize a picture to another width, by one of OpenCV's interpolations."""
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return cv2.resize(image, (width, height), interpolation=how)
 
 
 def text_width(text: str, size: float, thickness: int = 1) -> int:
-    """Pixels."""
+    """Return the width of a text, in pixels."""
     return cv2.getTextSize(text, FONT, size, thickness)[0][0]
 
 
@@ -97,7 +100,7 @@ def color_mapped(values: np.ndarray, color_map: int) -> np.ndarray:
 
 
 def color_bar(width: int, height: int, color_map: int) -> np.ndarray:
-    """uint8 [H, W, 3]: 0 at the left, 1 at the right."""
+    """Return a colour bar, uint8 [H, W, 3]: 0 at the left, 1 at the right."""
     ramp = np.broadcast_to(np.linspace(0, 1, width), (height, width))
     return color_mapped(ramp, color_map)
 
@@ -109,8 +112,9 @@ def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
         return [low]
     unit = 10.0 ** math.floor(math.log10(rough))
     step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= rough * 0.999)
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [i * step for i in range(first, last + 1)]
+    first_index = math.ceil(low / step - 1e-9)
+    last_index = math.floor(high / step + 1e-9)
+    return [i * step for i in range(first_index, last_index + 1)]
 
 
 def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
@@ -127,7 +131,7 @@ def log_ticks(low: float, high: float, most: int = 7) -> list[float]:
 
 
 def short_number(value: float) -> str:
-    """For an axis: 5000 as 5k, 1.5e6 as 1.5M, 0.02 as it is."""
+    """Return a number as text for an axis: 5000 as 5k, 1.5e6 as 1.5M, 0.02 as it is."""
     for limit, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
             return f"{value / limit:g}{suffix}"
@@ -144,28 +148,31 @@ def value_codes(table: pa.Table, *columns: str) -> np.ndarray:
 
 
 def first_of_each(table: pa.Table, *columns: str) -> np.ndarray:
-    """int64: the rows where a combination of the columns' values stands first, in their order."""
+    """Return the rows (int64) where a combination of the columns' values stands first, in order."""
     return np.sort(np.unique(value_codes(table, *columns), return_index=True)[1])
 
 
 def evenly(values: Sequence[Value], most: int) -> list[Value]:
-    """At most `most` of them in their order, from the middles of as many equal parts."""
+    """Choose at most `most` items in their order, from the middles of as many equal parts."""
     number = min(most, len(values))
     return [values[(2 * i + 1) * len(values) // (2 * number)] for i in range(number)]
 
 
 def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
-    """The cameras of a manifest's rows as they stand on the car: from above, left to right with the
-    front in the middle, those at the back last. Behind them, by name, cameras of which no
-    calibration tells.
+    """Return the cameras of a manifest's rows in the order in which they stand on the car.
+
+    Seen from above, they go from left to right with the front in the middle, and those at the back
+    come last. Cameras without a calibration follow, sorted by name.
     """
     places = {name: (math.inf, 0.0, name) for name in pc.unique(table["camera"]).to_pylist()}
-    read = cache(lambda path: {e["frame"]: e for e in json.loads(store.read(path))["frames"]})
-    placed = table.select(["camera", "frame", "calibration_path"]).drop_null()
-    for row in placed.take(first_of_each(placed, "camera")).to_pylist():
+    read_entries = cache(
+        lambda path: {e["frame"]: e for e in json.loads(store.read(path))["frames"]}
+    )
+    calibration_rows = table.select(["camera", "frame", "calibration_path"]).drop_null()
+    for row in calibration_rows.take(first_of_each(calibration_rows, "camera")).to_pylist():
         name = row["camera"]
         with suppress(OutputError), reading_back("calibration", ""):
-            entry = read(row["calibration_path"])[row["frame"]]
+            entry = read_entries(row["calibration_path"])[row["frame"]]
             world_from_camera = np.array(entry["cameras"][name]["world_from_camera"], float)
             ego_from_world = np.linalg.inv(np.array(entry["world_from_ego"], float))
             x, y, left_m = (ego_from_world @ world_from_camera)[(0, 1, 1), (2, 2, 3)].tolist()
@@ -174,7 +181,7 @@ def cameras_on_car(store: Store, table: pa.Table) -> list[str]:
     return sorted(places, key=places.__getitem__)
 
 
-def _finished(out: Path, **chosen: str | list[str] | None) -> pa.Table:
+def _finished(out: Path, **choices: str | list[str] | None) -> pa.Table:
     """The rows of finished images whose columns have one of the given values each: a list of them,
     or an option's text, of frames None for the middle one.
 
@@ -186,17 +193,25 @@ def _finished(out: Path, **chosen: str | list[str] | None) -> pa.Table:
     table = table.filter(pc.equal(table["status"], OK))
     if not table.num_rows:
         raise OutputError(f"{out} holds no finished image; run `climategs render` first")
-    for column, given in chosen.items():
-        there = sorted(pc.unique(table[column]).to_pylist())
-        if given == "all":
+    for column, choice in choices.items():
+        column_values = sorted(pc.unique(table[column]).to_pylist())
+        if choice == "all":
             continue
-        values = given.split(",") if isinstance(given, str) else given or [there[len(there) // 2]]
-        if column == "frame" and isinstance(given, str):
-            values = parse_frames(given).select(there, clip=True) or ()
-        if not values or not set(values) <= set(there):
-            wrong = ", ".join(str(v) for v in values if v not in there) or given
-            known = ", ".join(map(str, there[:100])) + ", ..." * (len(there) > 100)
-            raise OutputError(f"{out} holds no image of {column} {wrong}; it has {known}")
+        values = (
+            choice.split(",")
+            if isinstance(choice, str)
+            else choice or [column_values[len(column_values) // 2]]
+        )
+        if column == "frame" and isinstance(choice, str):
+            values = parse_frames(choice).select(column_values, clip=True) or ()
+        if not values or not set(values) <= set(column_values):
+            wrong_values = ", ".join(str(v) for v in values if v not in column_values) or choice
+            value_list = ", ".join(map(str, column_values[:100]))
+            if len(column_values) > 100:
+                value_list += ", ..."
+            raise OutputError(
+                f"{out} holds no image of {column} {wrong_values}; it has {value_list}"
+            )
         kind = table.schema.field(column).type
         table = table.filter(pc.is_in(table[column], pa.array(values, kind)))
     return table
@@ -212,20 +227,26 @@ def shown_variants(table: pa.Table) -> list[Row]:
 
 
 def _numbers(row: Row) -> list[float]:
-    """What captions tell in numbers; old folders lack some of the columns."""
-    told = (c for c in columns_of_effects().values() if c.caption and c.is_number)
-    absent = {"all": -math.inf, "nonzero": 0.0}
-    numbers = ((row.get(column.name, math.nan), column.shows) for column in told)
-    return [absent[shows or "all"] if math.isnan(n) else n for n, shows in numbers]
+    """Return the numbers that captions tell; old folders lack some of the columns."""
+    number_columns = (c for c in columns_of_effects().values() if c.caption and c.is_number)
+    absence_numbers = {"all": -math.inf, "nonzero": 0.0}
+    numbers = ((row.get(column.name, math.nan), column.shows) for column in number_columns)
+    return [absence_numbers[shows or "all"] if math.isnan(n) else n for n, shows in numbers]
 
 
 def _weather(row: Row) -> str:
     """The variant's name and what its weather means to a person."""
     columns = sorted(columns_of_effects().values(), key=lambda column: column.is_number)
     values = {column.name: row.get(column.name, column.of(None)) for column in columns}
-    there = [c for c in columns if (c.is_present if c.is_number else bool)(values[c.name])]
-    shown = values | {c.name: c.shown(values[c.name]) for c in there if c.is_number}
-    texts = [column.caption.format_map(shown) for column in there if column.caption]
+    present_columns = [
+        c for c in columns if (c.is_present if c.is_number else bool)(values[c.name])
+    ]
+    caption_values = values | {
+        c.name: c.shown(values[c.name]) for c in present_columns if c.is_number
+    }
+    texts = [
+        column.caption.format_map(caption_values) for column in present_columns if column.caption
+    ]
     return f"{row['variant']} ({', '.join(texts) or 'no weather'})"
 
 
@@ -255,7 +276,7 @@ def draw_sheet(
 def sheet_lines(
     out: Path, recipe: str = "all", camera: str = "all", frame: str | None = None
 ) -> list[tuple[str, list[tuple[str, np.ndarray]]]]:
-    """A title for every scene, variant and frame, and its images, each with its camera's name.
+    """Return a title for every scene, variant and frame, and its images by camera.
 
     recipe, camera: names separated by commas, or all. frame: numbers as `parse_frames` has them, by
     default the middle one. At most MAX_SHOWN variants and MAX_LINES lines, evenly spread.
@@ -265,13 +286,15 @@ def sheet_lines(
     """
     table = _finished(out, recipe=recipe, camera=camera, frame=frame)
     cameras = cameras_on_car(open_store(out), table)
-    found: dict[tuple[str, str, int], dict[str, Row]] = {}
+    rows_by_key: dict[tuple[str, str, int], dict[str, Row]] = {}
     for row in table.to_pylist():
-        found.setdefault((row["scene"], row["variant"], row["frame"]), {})[row["camera"]] = row
-    shown = [(row["scene"], row["variant"]) for row in shown_variants(table)]
+        key = (row["scene"], row["variant"], row["frame"])
+        rows_by_key.setdefault(key, {})[row["camera"]] = row
+    variants = [(row["scene"], row["variant"]) for row in shown_variants(table)]
     lines = []
-    for key in evenly([key for each in shown for key in found if key[:2] == each], MAX_LINES):
-        rows = found[key]
+    keys = [key for variant in variants for key in rows_by_key if key[:2] == variant]
+    for key in evenly(keys, MAX_LINES):
+        rows = rows_by_key[key]
         title = f"{key[0]}, frame {key[2]}: {_weather(next(iter(rows.values())))}"
         lines.append((title, [(name, _read(out, rows[name])) for name in cameras if name in rows]))
     return lines
@@ -288,7 +311,9 @@ def draw_video(
     table = _finished(out, recipe=recipe, camera=[camera])
     groups = [(row["scene"], row["variant"]) for row in shown_variants(table)]
     rows = {(row["scene"], row["variant"], row["frame"]): row for row in table.to_pylist()}
-    frames = sorted({frame for *_, frame in rows if all((*each, frame) in rows for each in groups)})
+    frames = sorted(
+        {frame for *_, frame in rows if all((*group, frame) in rows for group in groups)}
+    )
     if not frames:
         raise OutputError(f"{out}: its scenes and variants have no frame of {camera} in common")
     pictures = (
@@ -334,7 +359,8 @@ def side_by_side(images: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
     lines = -(-len(images) // columns)
     canvas = np.zeros((lines * height, columns * width, 3), np.uint8)
     for number, (caption, image) in enumerate(images):
-        top, left = number // columns * height, number % columns * width
+        top = number // columns * height
+        left = number % columns * width
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         canvas[top : top + height, left : left + width] = small
         write(canvas, caption, left + 9, top + 23, size=0.55, color=(0, 0, 0))
@@ -380,7 +406,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
 
 
 def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
-    """PNG or JPEG by the name's ending.
+    """Write a picture as PNG or JPEG, by the name's ending.
 
     Raises:
         OutputError: the file cannot be written.

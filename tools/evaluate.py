@@ -53,7 +53,9 @@ from tools.report_pictures import evenly
 if TYPE_CHECKING:
     from tools.cli import EvaluateOptions
 
-SHORT, LONG, CAMERAS = "short", "long", "cameras"
+SHORT = "short"  # pairs of one camera whose frames are close
+LONG = "long"  # pairs of one camera whose frames are far apart
+CAMERAS = "cameras"  # pairs of neighbouring cameras of one frame
 KINDS = (SHORT, LONG, CAMERAS)
 MAX_ANGLE_DEG = 90.0  # between the optical axes of neighbouring cameras
 # Masks of what passes between camera and scene within one exposure, or sits on the lens: no view of
@@ -62,14 +64,18 @@ PASSING = ("rain", "snowfall", "lens_drops")
 _BUFFERS = ("image", "depth", "water", "instance", *PASSING)
 _KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mostly 6 or 7
 MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
-ALL, DRY, WATER = "all", "dry", "water"
+ALL = "all"  # all pixels that count
+DRY = "dry"  # the pixels that count and show no water
+WATER = "water"  # the pixels that count and show water
 _NUMBERS = ("rmse", "relative", "share", "noise")
 _TIMED_PAIR = 2  # the first pair also loads what all of them need
 _MIN_SAID_S = 20.0  # what takes less is not said
 PANEL_PX = 640  # wide
 ERROR_GAIN = 5.0  # of the error's picture: white is a fifth of the range
-# Of the mask: what counts, went along with a box, shows water; what does not count is black.
-_COUNTS, _MOVED, _WATER = (190, 190, 190), (240, 160, 30), (60, 120, 230)
+# Colours of the mask in RGB, 0 to 255; pixels that do not count are black.
+_COUNTS = (190, 190, 190)  # pixels that count
+_MOVED = (240, 160, 30)  # pixels that went along with a box
+_WATER = (60, 120, 230)  # pixels that show water
 _PARTS = {ALL: "", DRY: "without water", WATER: "water only"}
 
 
@@ -81,17 +87,19 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
             a picture cannot be written.
         MetricError: the weights cannot be used.
     """
-    out, short, long = options.out, options.short, options.long
+    out = options.out
+    short = options.short
+    long = options.long
     network = options.lpips and load_lpips(options.lpips, options.lpips_heads)
     views = Views(open_store(out), names_in(options.scenes), names_in(options.recipes))
     drives = views.drives()
-    found = [
+    drive_pairs = [
         (drive, pair)
         for drive in drives
         for pair in pairs_of(views, drive, short, long, options.pairs)
     ]
-    notes = _notes(drives, {pair.kind for _, pair in found}, short, long)
-    if not found:
+    notes = _notes(drives, {pair.kind for _, pair in drive_pairs}, short, long)
+    if not drive_pairs:
         hint = "".join(f" ({note})" for note in notes)
         raise OutputError(
             f"{out} has no two images to compare: neither frames {short} or {long} apart of one "
@@ -102,11 +110,11 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
         for note in notes:
             print_note(f"note: {note}")
     records: list[dict[str, Any]] = []
-    for drive, pair in tqdm(found, unit="pair", disable=not progress):
-        started = time.perf_counter()
+    for drive, pair in tqdm(drive_pairs, unit="pair", disable=not progress):
+        start_s = time.perf_counter()
         records.append(_record(views, drive, pair, network))
         if progress and len(records) == _TIMED_PAIR:
-            _say_duration(len(found), time.perf_counter() - started)
+            _say_duration(len(drive_pairs), time.perf_counter() - start_s)
     worst = _worst(records)
     if options.pictures is not None:
         for record in worst:
@@ -127,26 +135,28 @@ def evaluate_output(options: EvaluateOptions, *, progress: bool = True) -> dict[
 
 
 def _notes(drives: Sequence[Drive], kinds: Collection[str], short: int, long: int) -> list[str]:
-    """Why tables are empty. kinds: of the pairs that there are."""
-    asked = {SHORT: short, LONG: long}
-    missing = [kind for kind in asked if kind not in kinds]
+    """Explain why tables are empty. kinds: the kinds of the pairs that there are."""
+    distances = {SHORT: short, LONG: long}
+    missing_kinds = [kind for kind in distances if kind not in kinds]
     by_camera = [
-        sorted(frame for frame, own in drive.rows if own == camera)
+        sorted(frame for frame, name in drive.rows if name == camera)
         for drive in drives
         for camera in {camera for _, camera in drive.rows}
     ]
     steps = Counter(b - a for frames in by_camera for a, b in itertools.pairwise(frames))
-    if not missing or not steps:
+    if not missing_kinds or not steps:
         return []
-    step, span = steps.most_common(1)[0][0], max(frames[-1] - frames[0] for frames in by_camera)
-    far = min(math.ceil(long / step), span // step) * step
+    step = steps.most_common(1)[0][0]
+    span = max(frames[-1] - frames[0] for frames in by_camera)
+    distance = min(math.ceil(long / step), span // step) * step
     hint = "render more frames"
-    if far > step:
-        hint = f"add --short {step} --long {far}, or render consecutive frames"
-    apart = " or ".join(str(asked[kind]) for kind in missing)
+    if distance > step:
+        hint = f"add --short {step} --long {distance}, or render consecutive frames"
+    distance_text = " or ".join(str(distances[kind]) for kind in missing_kinds)
     return [
-        f"no two frames of a camera are {apart} apart, so the tables of {' and '.join(missing)} "
-        f"range are empty: the numbers of most are {step} apart, of the first and last {span}; "
+        f"no two frames of a camera are {distance_text} apart, so the tables of "
+        f"{' and '.join(missing_kinds)} range are empty: the numbers of most are {step} apart, of "
+        f"the first and last {span}; "
         f"{hint}"
     ]
 
@@ -205,11 +215,11 @@ class Views:
         for column, names in (("scene", scenes), ("recipe", recipes)):
             if names is None:
                 continue
-            there = set(pc.unique(table[column]).to_pylist())
-            if unknown := sorted(set(names) - there):
+            column_values = set(pc.unique(table[column]).to_pylist())
+            if unknown := sorted(set(names) - column_values):
                 raise OutputError(
                     f"{store.uri} has no {column} {unknown}; finished are: "
-                    f"{', '.join(sorted(there)) or 'none'}"
+                    f"{', '.join(sorted(column_values)) or 'none'}"
                 )
             table = table.filter(pc.is_in(table[column], pa.array(names, pa.string())))
         self.rows = Rows.of(table)
@@ -219,22 +229,22 @@ class Views:
         self._noise = functools.cache(self._read_noise)
 
     def drives(self) -> list[Drive]:
-        """In the manifest's order."""
-        found: dict[tuple[str, str], Drive] = {}
+        """Return the drives in the manifest's order."""
+        drives: dict[tuple[str, str], Drive] = {}
         masks = masks_of(self.rows)
         names = ("scene", "variant", "recipe", "frame", "camera")
         columns = (self.rows[name].to_pylist() for name in names)
         for row, (scene, variant, recipe, *item) in enumerate(zip(*columns, strict=True)):
-            if (scene, variant) not in found:
-                effects = " + ".join(name for name, there in masks.items() if there[row]) or "clean"
-                found[scene, variant] = Drive(scene, variant, recipe, effects, {})
-            found[scene, variant].rows[item[0], item[1]] = row
-        return list(found.values())
+            if (scene, variant) not in drives:
+                effects = " + ".join(name for name, mask in masks.items() if mask[row]) or "clean"
+                drives[scene, variant] = Drive(scene, variant, recipe, effects, {})
+            drives[scene, variant].rows[item[0], item[1]] = row
+        return list(drives.values())
 
     def camera(self, row: int) -> Camera:
         """The row's camera in the dataset's world, which is that of the boxes."""
-        found = self.rows.row(row)
-        record, _ = self._reader.camera(found)
+        manifest_row = self.rows.row(row)
+        record, _ = self._reader.camera(manifest_row)
         try:
             return Camera(
                 record.name,
@@ -249,8 +259,8 @@ class Views:
             )
         except (RuntimeError, TypeError, ValueError) as error:
             raise OutputError(
-                f"{self._store.uri}: {found['calibration_path']} is damaged (frame "
-                f"{found['frame']}, camera {record.name!r}: {error}); delete it and run "
+                f"{self._store.uri}: {manifest_row['calibration_path']} is damaged (frame "
+                f"{manifest_row['frame']}, camera {record.name!r}: {error}); delete it and run "
                 f"the job again, which makes it anew"
             ) from error
 
@@ -258,8 +268,10 @@ class Views:
         """Sigma of the noise that the row's recipe gives its camera; 0 of JPEG, which loses some of
         it, and of a variant without its recipe.
         """
-        found = self.rows.row(row)
-        return self._noise(f"{variant_folder(found['scene'], found['variant'])}/recipe.yaml")
+        manifest_row = self.rows.row(row)
+        return self._noise(
+            f"{variant_folder(manifest_row['scene'], manifest_row['variant'])}/recipe.yaml"
+        )
 
     def _read_noise(self, path: str) -> float:
         if not self._store.exists(path):
@@ -277,25 +289,25 @@ class Views:
         return sensor.noise if output.image == "png" else 0.0
 
     def paths(self, row: int) -> ActorPaths:
-        """Where the boxes of the row's drive are; none where it has no labels."""
+        """Return the paths of the boxes of the row's drive; none where it has no labels."""
         path = self.rows.row(row)["labels_path"]
         if path is None:
             return ActorPaths({})
         return self._reader.parsed("actors", path, lambda file: (ActorPaths(read_boxes(file)),))[0]
 
     def _read(self, row: int) -> View:
-        """What the row's files hold.
+        """Read the view that the row's files hold.
 
         Raises:
             OutputError: the row has no depth, or a file is missing or damaged.
         """
-        found = self.rows.row(row)
-        images = self._reader.images(found, _BUFFERS)
+        manifest_row = self.rows.row(row)
+        images = self._reader.images(manifest_row, _BUFFERS)
         if "depth" not in images:
             raise OutputError(
-                f"{self._store.uri}: variant {found['variant']!r} of scene {found['scene']!r} has "
-                f"no depth images, by which views are compared; render it with output: {{depth: "
-                f"median}}"
+                f"{self._store.uri}: variant {manifest_row['variant']!r} of scene "
+                f"{manifest_row['scene']!r} has no depth images, by which views are compared; "
+                f"render it with output: {{depth: median}}"
             )
         depth_m = depth_in_metres(images["depth"])
         counts = depth_m > 0
@@ -319,19 +331,22 @@ def pairs_of(views: Views, drive: Drive, short: int, long: int, most: int | None
     warped into the earlier), and of neighbouring cameras of one frame (the second by name into the
     first). most: of each kind at most so many, evenly chosen.
     """
-    rows, found = drive.rows, dict[str, list[Pair]]()
+    rows = drive.rows
+    pairs_by_kind = dict[str, list[Pair]]()
     frames = sorted({frame for frame, _ in rows})
     cameras = sorted({camera for _, camera in rows})
-    for kind, apart in ((SHORT, short), (LONG, long)):
-        items = [((n, camera), (n + apart, camera)) for camera in cameras for n in frames]
-        found[kind] = [Pair(kind, rows[a], rows[b]) for a, b in items if a in rows and b in rows]
-    found[CAMERAS] = [
+    for kind, distance in ((SHORT, short), (LONG, long)):
+        items = [((n, camera), (n + distance, camera)) for camera in cameras for n in frames]
+        pairs_by_kind[kind] = [
+            Pair(kind, rows[a], rows[b]) for a, b in items if a in rows and b in rows
+        ]
+    pairs_by_kind[CAMERAS] = [
         Pair(CAMERAS, a, b)
         for frame in frames
         for a, b in _neighbours(views, [rows[frame, c] for c in cameras if (frame, c) in rows])
     ]
     limit = most or len(rows) ** 2
-    return [pair for each in found.values() for pair in evenly(each, limit)]
+    return [pair for pairs in pairs_by_kind.values() for pair in evenly(pairs, limit)]
 
 
 def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
@@ -357,39 +372,46 @@ class Compared(NamedTuple):
 
 
 def compare(views: Views, pair: Pair) -> Compared:
-    """Two views by the protocol.
+    """Compare two views by the protocol.
 
     Raises:
         OutputError: a file is missing or damaged.
     """
-    one, other = views.view(pair.a), views.view(pair.b)
-    a, b = one.depth_view, other.depth_view
-    carried = carry(views.paths(pair.a), a, b, one.shows_actor)
+    view_a = views.view(pair.a)
+    view_b = views.view(pair.b)
+    a = view_a.depth_view
+    b = view_b.depth_view
+    carried = carry(views.paths(pair.a), a, b, view_a.shows_actor)
     alpha = np.where(carried.unclear_b, np.float32(0), b.alpha)
     warp = find_warp(a, dataclasses.replace(b, alpha=alpha), carried.points_m)
     water = None
-    if one.shows_water is not None and other.shows_water is not None:
+    if view_a.shows_water is not None and view_b.shows_water is not None:
         # Bilinear: above 0 where any of the four neighbours is water.
-        in_b = warp.sample(other.shows_water[..., None].astype(np.float64))[..., 0] > 0
-        water = one.shows_water | in_b
-    warped, moved = warp.sample(b.picture), carried.moved & warp.counts
-    noise, sigma = None, views.noise(pair.a)
+        in_b = warp.sample(view_b.shows_water[..., None].astype(np.float64))[..., 0] > 0
+        water = view_a.shows_water | in_b
+    warped_picture = warp.sample(b.picture)
+    moved_mask = carried.moved & warp.counts
+    noise = None
+    sigma = views.noise(pair.a)
     if sigma > 0:
-        noise, whole = np.zeros((*warp.counts.shape, 2)), np.zeros(len(warp.rows))
-        places = warp.rows % 1, warp.columns % 1
-        noise[warp.counts, 0] = noise_variance(a.picture[warp.counts], whole, whole, sigma)
-        noise[warp.counts, 1] = noise_variance(warped[warp.counts], *places, sigma)
-    return Compared(one, warped, warp, moved, water, noise)
+        noise = np.zeros((*warp.counts.shape, 2))
+        zero_offsets = np.zeros(len(warp.rows))
+        offsets = warp.rows % 1, warp.columns % 1
+        noise[warp.counts, 0] = noise_variance(
+            a.picture[warp.counts], zero_offsets, zero_offsets, sigma
+        )
+        noise[warp.counts, 1] = noise_variance(warped_picture[warp.counts], *offsets, sigma)
+    return Compared(view_a, warped_picture, warp, moved_mask, water, noise)
 
 
 def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> dict[str, Any]:
-    """The numbers of one pair."""
-    seen = compare(views, pair)
-    counts = seen.warp.counts
+    """Compute the numbers of one pair."""
+    comparison = compare(views, pair)
+    counts = comparison.warp.counts
     cameras = [views.camera(row) for row in (pair.a, pair.b)]
     parts = {ALL: counts}
-    if seen.water is not None:
-        parts |= {DRY: counts & ~seen.water, WATER: counts & seen.water}
+    if comparison.water is not None:
+        parts |= {DRY: counts & ~comparison.water, WATER: counts & comparison.water}
     record: dict[str, Any] = {
         "scene": drive.scene,
         "variant": drive.variant,
@@ -400,109 +422,117 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
         "cameras": [camera.name for camera in cameras],
         "seconds_apart": abs(cameras[1].timestamp_ns - cameras[0].timestamp_ns) * 1e-9,
         "meters_apart": float((cameras[1].centre - cameras[0].centre).norm()),
-        "moved_share": float(seen.moved.mean()),
+        "moved_share": float(comparison.moved.mean()),
         "rows": pair,
     }
     for name, part in parts.items():
-        each = consistency_of(seen.a.depth_view, seen.warped, part, seen.noise)
-        enough = each.share >= MIN_SHARE
+        numbers = consistency_of(comparison.a.depth_view, comparison.warped, part, comparison.noise)
+        is_usable = numbers.share >= MIN_SHARE
         record[name] = {
-            "share": each.share,
-            "rmse": each.rmse if enough else None,
-            "relative": each.relative if enough and not math.isnan(each.relative) else None,
-            "noise": each.noise if enough and seen.noise is not None else None,
+            "share": numbers.share,
+            "rmse": numbers.rmse if is_usable else None,
+            "relative": numbers.relative
+            if is_usable and not math.isnan(numbers.relative)
+            else None,
+            "noise": numbers.noise if is_usable and comparison.noise is not None else None,
         }
     if network is not None and record[ALL]["rmse"] is not None:
-        distance = picture_lpips(network, seen.warped, seen.a.depth_view.picture, counts)
+        distance = picture_lpips(
+            network, comparison.warped, comparison.a.depth_view.picture, counts
+        )
         record[ALL] |= {"lpips": distance, "lpips_counted": distance / record[ALL]["share"]}
     return record
 
 
 def _summaries(records: Iterable[dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
     """Means over the pairs that have these values in common."""
-    grouped: dict[tuple, list[dict[str, Any]]] = {}
+    groups: dict[tuple, list[dict[str, Any]]] = {}
     for record in records:
-        grouped.setdefault(tuple(record[name] for name in names), []).append(record)
+        groups.setdefault(tuple(record[name] for name in names), []).append(record)
     return [
         {
-            **{name: each[0][name] for name in (*names, "effects")},
-            **{kind: _of_kind([r for r in each if r["kind"] == kind]) for kind in KINDS},
+            **{name: group[0][name] for name in (*names, "effects")},
+            **{kind: _of_kind([r for r in group if r["kind"] == kind]) for kind in KINDS},
         }
-        for each in grouped.values()
+        for group in groups.values()
     ]
 
 
 def _of_kind(records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """None where there are no pairs."""
+    """Summarise pairs of one kind; None where there are no pairs."""
     if not records:
         return None
-    used = [r for r in records if r[ALL]["rmse"] is not None]
+    usable_records = [r for r in records if r[ALL]["rmse"] is not None]
     return {
-        "pairs": len(used),
-        "left_out": len(records) - len(used),
+        "pairs": len(usable_records),
+        "left_out": len(records) - len(usable_records),
         **{
-            name: float(np.mean([r[name] for r in used])) if used else None
+            name: float(np.mean([r[name] for r in usable_records])) if usable_records else None
             for name in ("seconds_apart", "meters_apart", "moved_share")
         },
-        **{part: _of_part(used, part) for part in (ALL, DRY, WATER)},
+        **{part: _of_part(usable_records, part) for part in (ALL, DRY, WATER)},
     }
 
 
 def _of_part(records: list[dict[str, Any]], part: str) -> dict[str, Any] | None:
-    """None where no pair has enough such pixels."""
-    used = [r[part] for r in records if part in r and r[part]["rmse"] is not None]
-    if not used:
+    """Summarise one part of the pixels; None where no pair has enough such pixels."""
+    entries = [r[part] for r in records if part in r and r[part]["rmse"] is not None]
+    if not entries:
         return None
-    found: dict[str, Any] = {"pairs": len(used)}
+    summary: dict[str, Any] = {"pairs": len(entries)}
     for name in (*_NUMBERS, "lpips", "lpips_counted"):
-        values = [each[name] for each in used if each.get(name) is not None]
+        values = [entry[name] for entry in entries if entry.get(name) is not None]
         if values:
-            found[name] = {
+            summary[name] = {
                 "mean": float(np.mean(values)),
                 "std": float(np.std(values)),
                 "p90": float(np.quantile(values, 0.9)),
             }
-    return found
+    return summary
 
 
 def _worst(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each recipe and kind the pair with the largest error."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    """Return the pair with the largest error of each recipe and kind."""
+    worst_records: dict[tuple[str, str], dict[str, Any]] = {}
     for record in records:
         rmse = record[ALL]["rmse"]
         key = record["recipe"], record["kind"]
-        if rmse is not None and (key not in found or rmse > found[key][ALL]["rmse"]):
-            found[key] = record
-    return list(found.values())
+        if rmse is not None and (
+            key not in worst_records or rmse > worst_records[key][ALL]["rmse"]
+        ):
+            worst_records[key] = record
+    return list(worst_records.values())
 
 
 def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
     """uint8 [H', W', 3]: its frame, the other one warped, their error and the mask."""
-    seen = compare(views, record["rows"])
-    own = seen.a.depth_view.picture
-    counts = seen.warp.counts
-    error = np.abs(seen.warped - own).mean(2) * counts
-    mask = np.zeros(own.shape, np.uint8)
+    comparison = compare(views, record["rows"])
+    picture = comparison.a.depth_view.picture
+    counts = comparison.warp.counts
+    error = np.abs(comparison.warped - picture).mean(2) * counts
+    mask = np.zeros(picture.shape, np.uint8)
     mask[counts] = _COUNTS
-    if seen.water is not None:
-        mask[counts & seen.water] = _WATER
-    mask[seen.moved] = _MOVED
+    if comparison.water is not None:
+        mask[counts & comparison.water] = _WATER
+    mask[comparison.moved] = _MOVED
     numbers = record[ALL]
     a, b = (f"{c}, frame {f}" for c, f in zip(record["cameras"], record["frames"], strict=True))
-    apart = f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart"
+    distance_text = f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart"
     shares = f"what counts: {100 * numbers['share']:.0f} % of the pixels"
     error_map = color_mapped(ERROR_GAIN * error, cv2.COLORMAP_INFERNO)
-    warped = _bytes(np.where(counts[..., None], seen.warped, 0.0))
+    warped_image = _bytes(np.where(counts[..., None], comparison.warped, 0.0))
     panels = (
-        (_bytes(own), a, f"{record['scene']}, {record['variant']}"),
-        (warped, f"{b}, warped into it", apart),
+        (_bytes(picture), a, f"{record['scene']}, {record['variant']}"),
+        (warped_image, f"{b}, warped into it", distance_text),
         (error_map, f"error, x{ERROR_GAIN:g}", f"RMSE {numbers['rmse']:.4f}"),
         (mask, shares, "blue: water; orange: went along with a box"),
     )
-    how = cv2.INTER_NEAREST if own.shape[1] < PANEL_PX else cv2.INTER_AREA
-    drawn = [captioned(resized(image, PANEL_PX, how), *texts) for image, *texts in panels]
-    between = np.full((GAP_PX, 2 * drawn[0].shape[1] + GAP_PX, 3), 255, np.uint8)
-    return np.concatenate([strip(drawn[:2]), between, strip(drawn[2:])])
+    interpolation = cv2.INTER_NEAREST if picture.shape[1] < PANEL_PX else cv2.INTER_AREA
+    panel_images = [
+        captioned(resized(image, PANEL_PX, interpolation), *texts) for image, *texts in panels
+    ]
+    gap_image = np.full((GAP_PX, 2 * panel_images[0].shape[1] + GAP_PX, 3), 255, np.uint8)
+    return np.concatenate([strip(panel_images[:2]), gap_image, strip(panel_images[2:])])
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:
@@ -510,11 +540,11 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def evaluation_text(facts: dict[str, Any]) -> str:
-    """All tables."""
-    apart = {k: f"{n} frame{'s' * (n != 1)} apart" for k, n in facts["frames_apart"].items()}
+    """Return all tables of an evaluation as text."""
+    titles = {k: f"{n} frame{'s' * (n != 1)} apart" for k, n in facts["frames_apart"].items()}
     with_lpips = facts["lpips"] is not None
     lines = [line for note in facts["notes"] for line in (f"Note: {note}", "")]
-    for kind, title in (*apart.items(), (CAMERAS, "Neighbouring cameras")):
+    for kind, title in (*titles.items(), (CAMERAS, "Neighbouring cameras")):
         lines += [title, "", *_table(facts, kind, with_lpips), ""]
     noises = _noises(facts)
     if noises:
@@ -529,13 +559,13 @@ def evaluation_text(facts: dict[str, Any]) -> str:
 
 
 def _noises(facts: dict[str, Any]) -> str:
-    """Its root mean square in a pair, by recipe."""
-    found = []
+    """Return the noise's root mean square in a pair, by recipe, as text."""
+    texts = []
     for row in facts["recipes"]:
         parts = [row[kind][ALL] for kind in KINDS if row[kind] is not None]
-        each = [p["noise"]["mean"] for p in parts if p is not None and "noise" in p]
-        found += [f"{row['recipe']} {np.mean(each):.4f}"] if each else []
-    return ", ".join(found)
+        noises = [p["noise"]["mean"] for p in parts if p is not None and "noise" in p]
+        texts += [f"{row['recipe']} {np.mean(noises):.4f}"] if noises else []
+    return ", ".join(texts)
 
 
 def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:
@@ -549,26 +579,29 @@ def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:
 
 def _rows(row: dict[str, Any], kind: str, with_lpips: bool) -> Iterator[list[str]]:
     """The cells of one recipe: all pixels, then those without and with water."""
-    found = row[kind]
+    summary = row[kind]
     names = [row["recipe"], row["effects"]]
-    if found is None or found[ALL] is None:
-        left_out = "0" if found is None else str(found["left_out"])
-        yield [*names, "0", left_out, *["–"] * (5 + 2 * with_lpips)]
+    if summary is None or summary[ALL] is None:
+        left_out_text = "0" if summary is None else str(summary["left_out"])
+        yield [*names, "0", left_out_text, *["–"] * (5 + 2 * with_lpips)]
         return
-    apart = f"{found['meters_apart']:.2f} m, {found['seconds_apart']:.2f} s"
+    distance_text = f"{summary['meters_apart']:.2f} m, {summary['seconds_apart']:.2f} s"
     for part, title in _PARTS.items():
-        each = found[part]
-        if each is None:
+        part_summary = summary[part]
+        if part_summary is None:
             continue
-        share, rmse = each["share"]["mean"], each["rmse"]
-        relative = f"{each['relative']['mean']:.3f}" if "relative" in each else "–"
+        share = part_summary["share"]["mean"]
+        rmse = part_summary["rmse"]
+        relative = f"{part_summary['relative']['mean']:.3f}" if "relative" in part_summary else "–"
         numbers = [f"{100 * share:.0f} %", f"{rmse['mean']:.4f} ± {rmse['std']:.4f}"]
         numbers += [f"{rmse['p90']:.4f}", relative]
         if with_lpips:
             keys = ("lpips", "lpips_counted")
-            numbers += [f"{each[k]['mean']:.4f}" if k in each else "–" for k in keys]
-        pairs = str(each["pairs"])
+            numbers += [
+                f"{part_summary[k]['mean']:.4f}" if k in part_summary else "–" for k in keys
+            ]
+        pairs = str(part_summary["pairs"])
         if part == ALL:
-            yield [*names, pairs, str(found["left_out"]), apart, *numbers]
+            yield [*names, pairs, str(summary["left_out"]), distance_text, *numbers]
         else:
             yield [title, "", pairs, "", "", *numbers]

@@ -108,7 +108,8 @@ def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
     """Frames, cameras, returns, boxes and ground of a drive that no scene can be made of, what it
     lacks, and the problems found.
     """
-    drive, ground = incomplete.drive, incomplete.ground
+    drive = incomplete.drive
+    ground = incomplete.ground
     boxes = {frame.index: drive.labels.boxes(frame.index) for frame in drive.frames}
     sentence = "not known: it is measured as a scene is made, or told by a map"
     if ground is not None:
@@ -128,8 +129,10 @@ def describe_drive(incomplete: IncompleteDrive) -> dict[str, Any]:
         },
         "boxes": {
             "count": sum(map(len, boxes.values())),
-            "frames": sum(len(found) > 0 for found in boxes.values()),
-            "labels": dict(Counter(label for found in boxes.values() for label in found.labels)),
+            "frames": sum(len(frame_boxes) > 0 for frame_boxes in boxes.values()),
+            "labels": dict(
+                Counter(label for frame_boxes in boxes.values() for label in frame_boxes.labels)
+            ),
             "moving": len({box.object_id for box in drive.boxes}),
         },
         "ground": {"sentence": sentence}
@@ -219,8 +222,8 @@ def explain_recipe(
     """
     template = load_recipe(recipe) if isinstance(recipe, str) else recipe
     if variant >= (count := template.variants):
-        there = f"{count} variants, 0 to {count - 1}" if count > 1 else "one variant, 0"
-        raise ClimateGSError(f"--variant {variant}: {template.name} has {there}")
+        variants_text = f"{count} variants, 0 to {count - 1}" if count > 1 else "one variant, 0"
+        raise ClimateGSError(f"--variant {variant}: {template.name} has {variants_text}")
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
     is_open = resolved.quality.is_open
@@ -258,15 +261,15 @@ def _view_facts(plan: Plan, scene: Scene, scale: float, *, all_of_it: bool) -> d
     """In how many of the scene's views actors and what effects have masks of (water, snow) can be
     seen; None of an effect that is absent, or that takes long to prepare, unless all_of_it.
     """
-    slow = [] if all_of_it else [e.name for e in effects.EFFECTS if e.shares_files]
-    asked = plan.without(slow)
+    slow_effects = [] if all_of_it else [e.name for e in effects.EFFECTS if e.shares_files]
+    quick_plan = plan.without(slow_effects)
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    views = [plan_view(asked, scene, camera.scaled(scale)) for camera in cameras]
+    views = [plan_view(quick_plan, scene, camera.scaled(scale)) for camera in cameras]
     return {
         "count": len(views),
         **{
             effect.mask: None
-            if asked.placed[effect.name].data is None
+            if quick_plan.placed[effect.name].data is None
             else sum(effect.name in view.names for view in views)
             for effect in effects.EFFECTS
             if effect.mask is not None
@@ -289,11 +292,12 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
     cameras = sample_views(scene, count)
     once_s = {}
     plan = make_plan(recipe, scene)
-    for own in plan.active(scene):
-        if own.effect.shares_files:
+    for effect_in_scene in plan.active(scene):
+        if effect_in_scene.effect.shares_files:
             start = time.perf_counter()
-            _ = own.prepared
-            once_s[plan.placed[own.effect.name].steps[0].name] = time.perf_counter() - start
+            _ = effect_in_scene.prepared
+            seconds = time.perf_counter() - start
+            once_s[plan.placed[effect_in_scene.effect.name].steps[0].name] = seconds
     # A recipe's runs stand side by side, since a scene keeps the snow of two recipes at most.
     variants = {"": recipe} | without_folded(recipe, scene)
     runs = {name: [_runs(scene, c, variant) for c in cameras] for name, variant in variants.items()}
@@ -314,7 +318,9 @@ def measure_passes(recipe: Recipe, scene: Scene, count: int = VIEWS) -> dict[str
         "threads": thread_count(),
         "frame_ms": 1e3 * total / len(cameras),
         "share": share,
-        "folded": {name: (drawn_s[""] - own) / total for name, own in drawn_s.items() if name},
+        "folded": {
+            name: (drawn_s[""] - seconds) / total for name, seconds in drawn_s.items() if name
+        },
         "noise": sum(max(view) - min(view) for view in drawing) / total,
         "once_s": once_s,
     }
@@ -372,9 +378,9 @@ def explanation_text(facts: dict[str, Any]) -> str:
 def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
     """One line a pass, with its share of the time where that was measured."""
     share = times["share"] if times else {}
-    named = {step["name"] for step in steps if step["runs"]}
-    others = [name for name in share if name not in named]
-    width = max(len(name) for name in (*(step["name"] for step in steps), *others))
+    step_names = {step["name"] for step in steps if step["runs"]}
+    other_names = [name for name in share if name not in step_names]
+    width = max(len(name) for name in (*(step["name"] for step in steps), *other_names))
     shares = {step["name"]: _share(step["name"], times) for step in steps if step["runs"]}
     column = max((len(text) for text in shares.values()), default=0)
     lines = [
@@ -383,7 +389,7 @@ def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> li
         for step in steps
     ]
     return lines + [
-        f"         {name:<{width}}  {_percent(share[name]):>{column}}" for name in others
+        f"         {name:<{width}}  {_percent(share[name]):>{column}}" for name in other_names
     ]
 
 
@@ -395,7 +401,8 @@ def _share(name: str, times: dict[str, Any] | None) -> str:
         return ""
     texts = [_percent(times["share"][name])] if name in times["share"] else []
     if name in times["folded"]:
-        inside, noise = times["folded"][name], times["noise"]
+        inside = times["folded"][name]
+        noise = times["noise"]
         texts.append(f"({100 * inside:+.1f} %)" if abs(inside) > noise else "(within noise)")
     return " ".join(texts)
 

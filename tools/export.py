@@ -120,13 +120,13 @@ def clear_notes(
         of_sweeps: whether there are sweeps to be weathered.
     """
     tree, extent = _dataset(scene)
-    wanted = {
+    cameras_by_frame = {
         frame.index: [name for name in frame.cameras if cameras is None or name in cameras]
         for frame in scene.frames
         if frames is None or frame.index in frames
     }
     images = {
-        tree.relative(path): name in wanted.get(frame.index, ())
+        tree.relative(path): name in cameras_by_frame.get(frame.index, ())
         for frame in scene.frames
         for name, path in frame.image_paths.items()
     }
@@ -138,8 +138,10 @@ def clear_notes(
         return notes
     if not isinstance(scene.labels, StoresLidar):
         return [*notes, "no LiDAR sweep has a file of its own in the dataset: they stay clear"]
-    rendered = {number for number, names in wanted.items() if names}
-    span = frames_of_span(scene.frames, rendered, {n for names in wanted.values() for n in names})
+    rendered_frames = {number for number, names in cameras_by_frame.items() if names}
+    span = frames_of_span(
+        scene.frames, rendered_frames, {n for names in cameras_by_frame.values() for n in names}
+    )
     sweeps = {
         tree.relative(file): frame.index in span
         for frame in scene.frames
@@ -148,20 +150,21 @@ def clear_notes(
     return notes + _clear_note("LiDAR sweeps", extent.sweeps, sweeps, scene.name)
 
 
-def _clear_note(what: str, total: int, places: Mapping[str | None, bool], scene: str) -> list[str]:
+def _clear_note(kind: str, total: int, places: Mapping[str | None, bool], scene: str) -> list[str]:
     """places: files of the scene's, and whether they will be weathered."""
-    left_out, others = list(places.values()).count(False), total - len(places)
-    reasons = [f"{left_out} of frames or cameras that are not rendered"] if left_out else []
-    if others > 0:
+    num_left_out = list(places.values()).count(False)
+    num_others = total - len(places)
+    reasons = [f"{num_left_out} of frames or cameras that are not rendered"] if num_left_out else []
+    if num_others > 0:
         reasons.append(
-            f"{others} that no frame of scene {scene!r} has (taken outside its frames, or of other "
-            f"scenes)"
+            f"{num_others} that no frame of scene {scene!r} has (taken outside its frames, or of "
+            f"other scenes)"
         )
     if not reasons:
         return []
-    clear = left_out + max(others, 0)
+    num_clear = num_left_out + max(num_others, 0)
     return [
-        f"{clear} of {total} {what} will stay clear in the dataset's copy: {', '.join(reasons)}"
+        f"{num_clear} of {total} {kind} will stay clear in the dataset's copy: {', '.join(reasons)}"
     ]
 
 
@@ -188,18 +191,20 @@ def mirror_outputs(
     tree, extent = _dataset(scene)
     lines = []
     with OutputLock(out):
-        found = _rows(scene, out, variants)
-        deleted = [name for name in found if not _recipe_file(scene, out, name).is_file()]
-        if variants is not None or len(deleted) == len(found):
-            _check_there(scene, out, deleted)
-        for name in deleted:
-            found.pop(name)
+        rows_by_variant = _rows(scene, out, variants)
+        deleted_variants = [
+            name for name in rows_by_variant if not _recipe_file(scene, out, name).is_file()
+        ]
+        if variants is not None or len(deleted_variants) == len(rows_by_variant):
+            _check_there(scene, out, deleted_variants)
+        for name in deleted_variants:
+            rows_by_variant.pop(name)
             lines.append(
                 f"{_recipe_file(scene, out, name).parent} was deleted, so its copy of the dataset "
                 f"is not brought up to date; render it again, or delete {mirror_folder(out, name)}"
             )
         try:
-            for name, rows in found.items():
+            for name, rows in rows_by_variant.items():
                 lines += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
@@ -214,22 +219,23 @@ def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "har
     prints. Returns the exit code."""
     columns = ["source", "scene", "frame", "camera", "lidar"]
     rows = read_manifest(out).select(columns).to_pylist()
-    named: dict[str, list[str]] = {}  # a job can give scenes other names
+    names_by_source: dict[str, list[str]] = {}  # a job can give scenes other names
     for source, name in sorted({(row["source"], row["scene"]) for row in rows}):
-        named.setdefault(source, []).append(name)
-    of_scene: dict[str, list[dict[str, Any]]] = {}
+        names_by_source.setdefault(source, []).append(name)
+    rows_by_scene: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        of_scene.setdefault(row["scene"], []).append(row)
-    sources = [scene_uri] if scene_uri else sorted(named)
+        rows_by_scene.setdefault(row["scene"], []).append(row)
+    sources = [scene_uri] if scene_uri else sorted(names_by_source)
     if not sources:
         raise OutputError(f"{out / MANIFEST} lists no images; render some first")
     for source in sources:
         scene = open_scene(source)
-        for name in named.get(scene.source, [scene.name]):
-            named_scene, own = dataclasses.replace(scene, name=name), of_scene.get(name, [])
-            if own:
-                frames, cameras = ({row[key] for row in own} for key in ("frame", "camera"))
-                of_sweeps = any(row["lidar"] == "weather" for row in own)
+        for name in names_by_source.get(scene.source, [scene.name]):
+            named_scene = dataclasses.replace(scene, name=name)
+            scene_rows = rows_by_scene.get(name, [])
+            if scene_rows:
+                frames, cameras = ({row[key] for row in scene_rows} for key in ("frame", "camera"))
+                of_sweeps = any(row["lidar"] == "weather" for row in scene_rows)
                 for note in clear_notes(named_scene, frames, cameras, of_sweeps=of_sweeps):
                     print_note(f"note: {note}")
             for sentence in mirror_outputs(named_scene, out, links=links):
@@ -261,29 +267,31 @@ def _mirror_rows(
     folder = mirror_folder(out, name)
     record = read_record(tree, folder)
     recipe = load_recipe(_recipe_file(scene, out, name)).resolve(0)
-    between = weather_sweeps_between(scene, recipe, rows, out, progress=progress)
+    sweeps_between = weather_sweeps_between(scene, recipe, rows, out, progress=progress)
     images, notes = weathered_images(out, rows, scene.frames, tree)
-    sweeps, unplaced = weathered_sweeps(out, [*rows, *between.rows], scene.labels, tree)
-    if between.faults:
-        first = min(between.faults)
-        unplaced.append(
-            f"{len(between.faults)} LiDAR sweeps without an image stay clear, the first of frame "
-            f"{first}: {between.faults[first]}"
+    sweeps, sweep_notes = weathered_sweeps(out, [*rows, *sweeps_between.rows], scene.labels, tree)
+    if sweeps_between.faults:
+        first_frame = min(sweeps_between.faults)
+        sweep_notes.append(
+            f"{len(sweeps_between.faults)} LiDAR sweeps without an image stay clear, the first of "
+            f"frame {first_frame}: {sweeps_between.faults[first_frame]}"
         )
-    shown = {**record.replaced, **record.replaced_sweeps}
-    of_others = {place: each for place, each in shown.items() if each.scene != scene.name}
-    others = _of_other_scenes(out, name, of_others)
-    if gone := sorted(p for p in of_others.keys() - others.keys() if of_others[p].image):
-        unplaced.append(
-            f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in {out} or its "
-            f"manifest: the source's own stand there again"
+    entries = {**record.replaced, **record.replaced_sweeps}
+    of_others = {place: entry for place, entry in entries.items() if entry.scene != scene.name}
+    other_files = _of_other_scenes(out, name, of_others)
+    if lost_places := sorted(
+        p for p in of_others.keys() - other_files.keys() if of_others[p].image
+    ):
+        sweep_notes.append(
+            f"{len(lost_places)} images of other scenes, such as {lost_places[0]}, are no longer "
+            f"in {out} or its manifest: the source's own stand there again"
         )
-    scenes = {ours.shown.scene for ours in others.values()} & record.scenes.keys()
+    scenes = {file.shown.scene for file in other_files.values()} & record.scenes.keys()
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
     done = mirror_dataset(
         tree,
         folder,
-        {**others, **images, **sweeps},
+        {**other_files, **images, **sweeps},
         {**{key: record.scenes[key] for key in sorted(scenes)}, scene.name: facts},
         extent=extent,
         links=links,
@@ -291,24 +299,24 @@ def _mirror_rows(
     )
     num_sweeps = sum(tree.is_sweep(place) for place in done.record.replaced_sweeps)
     page = fill("mirror.txt", done=done, record=done.record, sweeps=num_sweeps, root=tree.root)
-    return [*page.split("\n"), *(f"  {note}" for note in [*notes, *unplaced])]
+    return [*page.split("\n"), *(f"  {note}" for note in [*notes, *sweep_notes])]
 
 
-def _of_other_scenes(out: Path, variant: str, shown: Mapping[str, Shown]) -> dict[str, Weathered]:
-    """What of other scenes stands in the copy, as far as the manifest still has it."""
-    if not shown:
+def _of_other_scenes(out: Path, variant: str, entries: Mapping[str, Shown]) -> dict[str, Weathered]:
+    """Return the files of other scenes in the copy that the manifest still has, by place."""
+    if not entries:
         return {}
-    table = rows_of(read_manifest(out), {(each.scene, variant) for each in shown.values()})
+    table = rows_of(read_manifest(out), {(entry.scene, variant) for entry in entries.values()})
     rows = [row for row in table if row["status"] == OK]
     by_path = {row["lidar_path"]: Weathered.sweep(out, row) for row in rows if is_weathered(row)}
     by_path |= {row["image_path"]: Weathered.image(out, row) for row in rows}
-    for each in shown.values():
-        path = each.sweep
-        if path and path not in by_path and is_sweep_between(out, variant, each.scene, path):
-            by_path[path] = Weathered.sweep(out, {"scene": each.scene, "lidar_path": path})
-    found = {place: by_path.get(each.image or each.sweep) for place, each in shown.items()}
+    for entry in entries.values():
+        path = entry.sweep
+        if path and path not in by_path and is_sweep_between(out, variant, entry.scene, path):
+            by_path[path] = Weathered.sweep(out, {"scene": entry.scene, "lidar_path": path})
+    files = {place: by_path.get(entry.image or entry.sweep) for place, entry in entries.items()}
     return {
-        place: ours for place, ours in found.items() if ours is not None and ours.path.is_file()
+        place: file for place, file in files.items() if file is not None and file.path.is_file()
     }
 
 
@@ -327,17 +335,17 @@ def _rows(
         )
     if variants is None:
         variants = sorted({variant for name, variant in pairs if name == scene.name})
-    found = {name: rows_of(table, {(scene.name, name)}) for name in variants}
-    absent = sorted(name for name, rows in found.items() if not rows)
-    if absent or not found:
+    rows_by_variant = {name: rows_of(table, {(scene.name, name)}) for name in variants}
+    absent_variants = sorted(name for name, rows in rows_by_variant.items() if not rows)
+    if absent_variants or not rows_by_variant:
         raise OutputError(
             f"{out / MANIFEST} has no images of scene {scene.name!r}"
-            + (f" and {', '.join(absent)}" if absent else "")
+            + (f" and {', '.join(absent_variants)}" if absent_variants else "")
             + "; render them first, or name another scene"
         )
-    for name, rows in found.items():
+    for name, rows in rows_by_variant.items():
         _check_rows(scene, out, name, rows)
-    return found
+    return rows_by_variant
 
 
 def _recipe_file(scene: Scene, out: Path, name: str) -> Path:
@@ -353,22 +361,23 @@ def _check_there(scene: Scene, out: Path, deleted: Sequence[str]) -> None:
 
 
 def _check_rows(scene: Scene, out: Path, name: str, rows: list[dict[str, Any]]) -> None:
-    where, source = out / variant_folder(scene.name, name), rows[0]["source"]
+    variant_dir = out / variant_folder(scene.name, name)
+    source = rows[0]["source"]
     if rows[0]["trajectory"] != RECORDED:
         raise OutputError(
-            f"{where} shows a camera path; a dataset's copy takes images of its own frames"
+            f"{variant_dir} shows a camera path; a dataset's copy takes images of its own frames"
         )
     if source != scene.source and not (
         parse_uri(source)[::2] == parse_uri(scene.source)[::2] and _has_all(scene, rows)
     ):
         raise OutputError(
-            f"{where} was rendered from {source}, not from {scene.source}; name that scene, or the "
-            f"same one where it is now"
+            f"{variant_dir} was rendered from {source}, not from {scene.source}; name that scene, "
+            f"or the same one where it is now"
         )
 
 
 def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
-    """Whether every image of the rows is one of the scene's, by its time."""
+    """True if the scene has an image of the same time for every row."""
     times = {
         (frame.index, name): camera.timestamp_ns
         for frame in scene.frames
@@ -402,25 +411,25 @@ def label_files(
     """
     from augment.dataset.label_files import WHOLE, LabelsAsked, write_labels
 
-    asked = None
+    request = None
     if split or seed or changes:
         shares = _shares(split) if split else WHOLE
-        asked = LabelsAsked(split=shares, seed=seed, changes=tuple(changes))
+        request = LabelsAsked(split=shares, seed=seed, changes=tuple(changes))
     try:
-        done = write_labels(out, asked)
+        done = write_labels(out, request)
     except ValueError as error:
         raise ClimateGSError(f"--split {' '.join(split)}: {error}") from error
     counts = [f"{name} {done.objects[name]} in {done.images[name]} images" for name in done.images]
     parts = ", ".join(f"{name} {count}" for name, count in done.parts.items())
     lines = [f"labels: {done.folder} ({'; '.join(counts)}; parts: {parts})"]
-    if hidden := max(done.hidden.values(), default=0):
-        lines.append(f"  {hidden} objects are hidden by the weather (output.min_visibility)")
+    if num_hidden := max(done.hidden.values(), default=0):
+        lines.append(f"  {num_hidden} objects are hidden by the weather (output.min_visibility)")
     if done.unmapped:
-        listed = ", ".join(
+        categories_text = ", ".join(
             f"{label or 'boxes without a label'} ({count})"
             for label, count in done.unmapped.items()
         )
-        lines.append(f"  of no category, and left out: {listed}")
+        lines.append(f"  of no category, and left out: {categories_text}")
     if done.without_numbers:
         lines.append(
             f"  {done.without_numbers} objects are DontCare in kitti: centre, size or rotation of "
@@ -432,7 +441,7 @@ def label_files(
 
 
 def _shares(split: Sequence[str]) -> dict[str, float]:
-    """`train=0.8` and so on."""
+    """Parse the shares of a split, such as `train=0.8`."""
     shares = {}
     for text in split:
         name, _, share = text.partition("=")
@@ -509,20 +518,20 @@ def _named(out: Path, kind: ExportKind) -> Path:
     suffix = _SUFFIXES.get(kind, "")
     if not out.resolve().name:
         raise OutputError(f"--out {out} is the file system's root: name a file or folder below it")
-    named = out.suffix.lower()
-    if named == suffix:
+    out_suffix = out.suffix.lower()
+    if out_suffix == suffix:
         return out
-    other = next((kind for kind, ending in _SUFFIXES.items() if ending == named), None)
+    other = next((kind for kind, ending in _SUFFIXES.items() if ending == out_suffix), None)
     if other is not None:
         raise ClimateGSError(
             f"--out {out} is named as --kind {other} writes it, and this is --kind {kind}: say "
-            f"--kind {other}, or give a name without {named}"
+            f"--kind {other}, or give a name without {out_suffix}"
         )
     return out.with_name(out.name + suffix) if suffix else out
 
 
 def _check_out(out: Path, kind: ExportKind, overwrite: bool) -> None:
-    """What is at OUT is nothing, or may be replaced; known before anything is opened."""
+    """Refuse an OUT that exists and may not be replaced, before anything is opened."""
     if not out.exists() or (out.is_dir() and kind not in _SUFFIXES and not any(out.iterdir())):
         return
     if out.is_dir() and kind in _SUFFIXES:

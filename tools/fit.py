@@ -55,7 +55,9 @@ _AVERAGED = ("loss", "l1", "ssim", "depth", "sky")
 # Of timing a run's first steps, whose number is chosen by the time that there is.
 NOMINAL_STEPS = 5000  # of the run that the throw-away trainer believes to be the beginning of
 UNTIMED = 3  # steps that compile kernels and touch new memory
-MIN_TIMED, MAX_TIMED, MAX_TIMED_S = 8, 40, 10.0
+MIN_TIMED = 8  # the number of steps that are timed at least
+MAX_TIMED = 40  # the number of steps that are timed at most
+MAX_TIMED_S = 10.0  # the time after which no further step is timed, in seconds
 MIN_PART = 0.2  # of the time, for steps, however long reading takes
 # A step's time over a whole run, as a multiple of its first steps' where splats are added.
 GROWTH = 1.25
@@ -89,7 +91,7 @@ def fit_scene(
 
 
 def state_folder(out: Path) -> Path:
-    """Where the checkpoint and the report of a scene folder lie: beside it."""
+    """Folder of a scene's checkpoint and report, which lies beside the scene's own."""
     return path_beside(out, ".fit")
 
 
@@ -184,20 +186,23 @@ def estimate_steps(
     for _ in range(UNTIMED):
         fitter.run_step()
     loads: list[float] = []
-    others: list[float] = []
-    begun = clock()
-    while len(others) < MIN_TIMED or (len(others) < MAX_TIMED and clock() - begun < MAX_TIMED_S):
-        before = clock()
+    steps_s: list[float] = []
+    start_s = clock()
+    while len(steps_s) < MIN_TIMED or (
+        len(steps_s) < MAX_TIMED and clock() - start_s < MAX_TIMED_S
+    ):
+        step_start_s = clock()
         load_s = fitter.run_step().stage_s.get("load", 0.0)
         loads.append(load_s)
-        others.append(clock() - before - load_s)
-    step_s = max(statistics.median(others), 1e-6)
+        steps_s.append(clock() - step_start_s - load_s)
+    step_s = max(statistics.median(steps_s), 1e-6)
     left_s = max(budget_s * (1 - RESERVE) - views * statistics.median(loads), MIN_PART * budget_s)
     return rounded_steps(int(left_s / (step_s * (GROWTH if grows else 1.0)))), step_s
 
 
 def _run(run: _Run, checkpoint_s: float, progress: bool) -> Outcome:
-    training, source = run.training, run.source
+    training = run.training
+    source = run.source
     keys = {split: sample_keys(getattr(source, split), n) for split, n in EVALUATED.items()}
 
     def score() -> None:
@@ -217,7 +222,7 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> Outcome:
             )
         _add_step(training, record)
 
-    def shown(record: StepRecord) -> dict[str, str]:
+    def postfix(record: StepRecord) -> dict[str, str]:
         loss = _means(training.sums).get("loss", record.loss)
         latest = {row["split"]: row["psnr"] for row in training.rows if "psnr" in row}
         titles = {"test": "held-out PSNR", "train": "PSNR"}  # held-out views where there are any
@@ -229,7 +234,7 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> Outcome:
         "fit",
         add=add,
         score=score,
-        shown=shown,
+        postfix=postfix,
         write=lambda complete: _write(run, complete),
         checkpoint_s=checkpoint_s,
         progress=progress,
@@ -237,7 +242,7 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> Outcome:
 
 
 def _add_step(training: Training, record: StepRecord) -> None:
-    """One more step in the sums; a row of the history where it completes one."""
+    """Add a step to the sums, and a row to the history where the step completes one."""
     values = {name: float(getattr(record, name)) for name in _AVERAGED}
     values |= {f"stage_s.{stage}": float(s) for stage, s in record.stage_s.items()}
     training.add({"count": 1.0, **values})
@@ -261,17 +266,19 @@ def sample_keys(keys: Sequence[ViewKey], count: int) -> tuple[ViewKey, ...]:
     for key in keys:
         by_camera.setdefault(key.camera, []).append(key)
     cameras = list(by_camera.values())
-    chosen: dict[ViewKey, None] = {}
+    sample: dict[ViewKey, None] = {}
     for i in range(min(count, len(keys))):
         views = cameras[i % len(cameras)]
-        chosen[views[int((i + 0.5) / count * len(views))]] = None
-    return tuple(chosen)
+        sample[views[int((i + 0.5) / count * len(views))]] = None
+    return tuple(sample)
 
 
 def _write(run: _Run, complete: bool) -> dict[str, Any]:
-    options, training = run.options, run.training
+    options = run.options
+    training = run.training
     print_note(f"writing {options.out} and evaluating all views")
-    plan, step = training.plan, training.trainer.step
+    plan = training.plan
+    step = training.trainer.step
     made_by = {"command": "fit", "step": step, "steps": plan.steps}
     made_by |= {"settings": plan.settings, "data": plan.data, "fitted": _fitted(run)}
     scene = dataclasses.replace(training.trainer.scene(), made_by=made_by)
@@ -292,7 +299,8 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "checks": run.checks,
         "trust": trust.as_dict(),
     }
-    source, test = run.source, run.source.test
+    source = run.source
+    test = run.source.test
     if not complete and len(test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
         test = sample_keys(test, EVALUATED_WHEN_STOPPED)
         facts["problems"].append(
@@ -309,7 +317,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
 
 
 def _fitted(run: _Run) -> dict[str, Any]:
-    """What is learnt from, as augment.trust.FitRecord."""
+    """Scale and views that a fit learns from, as augment.trust.FitRecord."""
     views: dict[str, list[int]] = {}
     for key in run.source.train:
         views.setdefault(key.camera, []).append(key.frame)
@@ -355,7 +363,8 @@ def open_to_fit(options: FitOptions) -> tuple[Scene, tuple[str, ...]]:
     try:
         scene = open_scene(format_uri(scheme, path, {**query, HELD_OUT_KEY: guess}))
     except AdapterError:  # the guess may have held out all frames; another reason comes again
-        scene, guess = open_scene(format_uri(scheme, path, query)), None
+        scene = open_scene(format_uri(scheme, path, query))
+        guess = None
     _check_recorded(scene)
     numbers = [frame.index for frame in scene.frames]
     better = held_out_range(numbers, step)
@@ -368,7 +377,7 @@ def open_to_fit(options: FitOptions) -> tuple[Scene, tuple[str, ...]]:
 
 
 def _can_hold_out(scheme: str, path: str) -> bool:
-    """Whether such a scene can be built without some of its frames."""
+    """True if such a scene can be built without some of its frames."""
     if scheme == "street_gaussians":
         from adapters.street_gaussians.model import is_dataset
 
@@ -400,12 +409,16 @@ def held_out_range(numbers: Sequence[int], step: int) -> str | None:
     """start::step over frame numbers for the frames at positions step - 1, 2 step - 1, ...; None
     where there are none, or no such range holds just them.
     """
-    held = list(numbers[step - 1 :: step])
-    if not held:
+    test_frames = list(numbers[step - 1 :: step])
+    if not test_frames:
         return None
-    stride = held[1] - held[0] if len(held) > 1 else max(numbers) - held[0] + 1
-    text = f"{held[0]}::{stride}"
-    return text if _held(text, numbers) == held else None
+    stride = (
+        test_frames[1] - test_frames[0]
+        if len(test_frames) > 1
+        else max(numbers) - test_frames[0] + 1
+    )
+    text = f"{test_frames[0]}::{stride}"
+    return text if _held(text, numbers) == test_frames else None
 
 
 def _held(held_out: str, numbers: Sequence[int]) -> list[int]:
@@ -415,7 +428,7 @@ def _held(held_out: str, numbers: Sequence[int]) -> list[int]:
 
 
 def _data_facts(scene: Scene, source: ViewSource) -> dict[str, Any]:
-    """What was found in the data, to notice when it is no longer the same."""
+    """Counts and a digest of the data, by which a change of the data is noticed."""
     digest = hashlib.sha256()
     for key in (*source.train, *source.test):
         camera = source.camera(key)

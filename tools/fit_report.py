@@ -51,16 +51,23 @@ if TYPE_CHECKING:
 MAX_TRAINING_VIEWS = 60  # where nothing is held out
 TRAINING_SAMPLE = 12  # beside the held-out views, to see what was learnt by heart
 MAX_TRUE_VIEWS = 24
-CURVES, PICTURES = "curves.png", "held_out.jpg"
-TRAINING_PICTURES = "training_views.jpg"
+CURVES = "curves.png"  # the file with the curves of the training
+PICTURES = "held_out.jpg"  # the file with pictures of held-out views
+TRAINING_PICTURES = "training_views.jpg"  # the same of training views
 MAX_ROWS = 12  # of the pictures
 MAX_OF_A_CAMERA = 3
 CELL_WIDTH = 480  # px of one image of the pictures
-_GAP, _EDGE = 6, 16
-_HEAD, _TITLE = 70, 34  # px above the first row, and above each row's images
-_BACKGROUND, _INK, _SOFT, _NOTHING = (250, 250, 250), (30, 30, 30), (110, 110, 110), (90, 90, 90)
-_BAR = (200, 10)
-_FLIP_COLORS, _DEPTH_COLORS = cv2.COLORMAP_MAGMA, cv2.COLORMAP_TURBO
+_GAP = 6  # the space between two images of the sheet, in pixels
+_EDGE = 16  # the margin of the sheet, in pixels
+_HEAD = 70  # the space above the first row, in pixels
+_TITLE = 34  # the space above each row's images, in pixels
+_BACKGROUND = (250, 250, 250)  # the colour of the sheet in RGB, 0 to 255
+_INK = (30, 30, 30)  # the colour of text
+_SOFT = (110, 110, 110)  # the colour of tick marks
+_NOTHING = (90, 90, 90)  # the colour of pixels without a value
+_BAR = (200, 10)  # width and height of a colour bar, in pixels
+_FLIP_COLORS = cv2.COLORMAP_MAGMA  # the colour map of FLIP
+_DEPTH_COLORS = cv2.COLORMAP_TURBO  # the colour map of depth
 
 DEFINITIONS = {
     "picture": "rendered without weather, with the camera's recorded exposure, clamped to [0, 1] "
@@ -138,7 +145,7 @@ def write_report(
 
 
 def _choose_split(source: ViewSource) -> tuple[str, tuple[ViewKey, ...], str]:
-    """Which views are scored: test or train, the views, and what a reader must know."""
+    """Choose the views to score: test or train, the views, and a note for the reader."""
     if source.test:
         return "test", source.test, ""
     keys = _spread(source.train, MAX_TRAINING_VIEWS)
@@ -150,18 +157,22 @@ def _choose_split(source: ViewSource) -> tuple[str, tuple[ViewKey, ...], str]:
     return "train", keys, note
 
 
-def _spread(keys: Sequence[ViewKey], most: int) -> tuple[ViewKey, ...]:
-    """At most so many of the views, of all cameras alike, evenly spread over each one's."""
-    if len(keys) <= most:
+def _spread(keys: Sequence[ViewKey], max_keys: int) -> tuple[ViewKey, ...]:
+    """Choose at most max_keys views, as many of each camera, evenly spread over its views."""
+    if len(keys) <= max_keys:
         return tuple(keys)
     cameras = {key.camera for key in keys}
-    chosen = set(_of_each_camera(keys, cameras, max(1, most // len(cameras))))
-    return tuple(key for key in keys if key in chosen)
+    chosen_keys = set(_of_each_camera(keys, cameras, max(1, max_keys // len(cameras))))
+    return tuple(key for key in keys if key in chosen_keys)
 
 
-def _of_each_camera(keys: Sequence[ViewKey], cameras: Iterable[str], most: int) -> list[ViewKey]:
+def _of_each_camera(
+    keys: Sequence[ViewKey], cameras: Iterable[str], max_keys: int
+) -> list[ViewKey]:
     return [
-        key for name in cameras for key in evenly([key for key in keys if key.camera == name], most)
+        key
+        for name in cameras
+        for key in evenly([key for key in keys if key.camera == name], max_keys)
     ]
 
 
@@ -191,7 +202,7 @@ def _write_pictures(
 
 
 def _markdown(scene: Scene, report: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
-    """A row per camera and one of the means over all views; columns nothing is known of are out."""
+    """Table of a row per camera and one of the means over all views, without empty columns."""
     unit = " m" if scene.has_metric_scale else ""
     total = {"views": report["scored"]["views"], **report["mean"]}
 
@@ -224,7 +235,7 @@ def _plain(value: Any) -> Any:
 
 
 class RenderedView(NamedTuple):
-    """What a user gets of a camera without weather. rgb: uint8 [H, W, 3], clamped to [0, 1] and
+    """A camera's view as users get it without weather. rgb: uint8 [H, W, 3], clamped to [0, 1] and
     rounded to 8 bits. alpha, median_depth_m, expected_depth_m: float32 [H, W]. has_surface: bool
     [H, W], where a depth is written to files.
     """
@@ -263,8 +274,8 @@ def evaluate_views(
     Only weights of 0 leave a pixel out: a scene is judged on the whole picture, not where learning
     was easy. with_flip: FLIP takes most of the time, 0.2 s for 480x270 pixels on one core.
     """
-    shown = tqdm(keys, desc="evaluate", unit="view", disable=None if progress else True)
-    return [_score(key, scene, source.load(key), with_flip) for key in shown]
+    bar = tqdm(keys, desc="evaluate", unit="view", disable=None if progress else True)
+    return [_score(key, scene, source.load(key), with_flip) for key in bar]
 
 
 def mean_scores(scores: Iterable[ViewScore]) -> dict[str, float]:
@@ -274,8 +285,8 @@ def mean_scores(scores: Iterable[ViewScore]) -> dict[str, float]:
     rows = [score.numbers for score in scores]
     means: dict[str, float] = {}
     for name in rows[0] if rows else ():
-        known = [row[name] for row in rows if not math.isnan(row[name])]
-        if known and math.isfinite(mean := float(np.mean(known))):
+        values = [row[name] for row in rows if not math.isnan(row[name])]
+        if values and math.isfinite(mean := float(np.mean(values))):
             means[name] = mean
     return means
 
@@ -284,9 +295,9 @@ def means_by_camera(scores: Sequence[ViewScore]) -> dict[str, dict[str, float]]:
     """`mean_scores` of every camera, with the number of its views."""
     cameras = dict.fromkeys(score.key.camera for score in scores)
     return {
-        name: {"views": len(own), **mean_scores(own)}
+        name: {"views": len(camera_scores), **mean_scores(camera_scores)}
         for name in cameras
-        for own in [[score for score in scores if score.key.camera == name]]
+        for camera_scores in [[score for score in scores if score.key.camera == name]]
     }
 
 
@@ -333,10 +344,12 @@ def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> V
     surface = rendered.has_surface.reshape(-1)[at]
 
     def errors(depth_m: np.ndarray) -> DepthErrors:
-        true_m, weight = view.depth_m[surface], view.depth_weight[surface]
+        true_m = view.depth_m[surface]
+        weight = view.depth_weight[surface]
         return depth_errors(depth_m.reshape(-1)[at[surface]], true_m, weight)
 
-    median, expected = errors(rendered.median_depth_m), errors(rendered.expected_depth_m)
+    median = errors(rendered.median_depth_m)
+    expected = errors(rendered.expected_depth_m)
     numbers |= {
         "depth_median_m": median.median_m,
         "depth_p90_m": median.p90_m,
@@ -369,8 +382,8 @@ def choose_views(scores: Sequence[ViewScore]) -> list[ViewScore]:
     """
     by_key = {score.key: score for score in scores}
     cameras = list(dict.fromkeys(key.camera for key in by_key))[:MAX_ROWS]
-    each = max(1, min(MAX_OF_A_CAMERA, MAX_ROWS // max(1, len(cameras))))
-    return [by_key[key] for key in _of_each_camera(list(by_key), cameras, each)]
+    views_per_camera = max(1, min(MAX_OF_A_CAMERA, MAX_ROWS // max(1, len(cameras))))
+    return [by_key[key] for key in _of_each_camera(list(by_key), cameras, views_per_camera)]
 
 
 def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) -> np.ndarray:
@@ -384,19 +397,23 @@ def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) ->
     _draw_head(sheet, nearest, farthest, unit)
     top = _HEAD
     for row, height in zip(rows, heights, strict=True):
-        key, seen = row.score.key, row.depth_m > 0
+        key = row.score.key
+        has_depth = row.depth_m > 0
         write(sheet, f"{key.camera}, frame {key.frame}", _EDGE, top + 24, size=0.6, color=_INK)
         write(sheet, _figures(row.score.numbers, unit), _column(1), top + 24, size=0.5, color=_INK)
         # Near is red, far is blue.
-        part = np.log(np.where(seen, row.depth_m, nearest) / nearest) / np.log(farthest / nearest)
+        part = np.log(np.where(has_depth, row.depth_m, nearest) / nearest) / np.log(
+            farthest / nearest
+        )
         images = (
             row.recorded,
             row.rendered,
             _masked(color_mapped(row.error, _FLIP_COLORS), row.counts),
-            _masked(color_mapped(1 - part, _DEPTH_COLORS), seen),
+            _masked(color_mapped(1 - part, _DEPTH_COLORS), has_depth),
         )
         for i, image in enumerate(images):
-            y, x = top + _TITLE, _column(i)
+            y = top + _TITLE
+            x = _column(i)
             sheet[y : y + image.shape[0], x : x + CELL_WIDTH] = image
         top += height
     return sheet
@@ -429,8 +446,8 @@ def _depth_range(rows: Sequence[_Row]) -> tuple[float, float]:
     return low, max(high, 2 * low)
 
 
-def _masked(image: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    return np.where(shown[..., None], image, np.array(_NOTHING, np.uint8))
+def _masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    return np.where(mask[..., None], image, np.array(_NOTHING, np.uint8))
 
 
 def _draw_head(sheet: np.ndarray, nearest: float, farthest: float, unit: str) -> None:
@@ -451,7 +468,8 @@ def _draw_scale(
 ) -> None:
     """A colour bar at the right end of a column's head, and what grey means to its left."""
     height, width = bar.shape[:2]
-    x, y = _column(column) + CELL_WIDTH - width - 20, 22
+    x = _column(column) + CELL_WIDTH - width - 20
+    y = 22
     sheet[y : y + height, x : x + width] = bar
     for text, part in ticks.items():
         at = x + part * width
@@ -475,8 +493,8 @@ def _figures(numbers: Mapping[str, float], unit: str) -> str:
         "depth_median_m": f"depth error {{:.3f}}{unit} (median)",
         "depth_p90_m": f"{{:.2f}}{unit} (90 %)",
     }
-    known = {name: text for name, text in texts.items() if not math.isnan(numbers[name])}
-    return "     ".join(text.format(numbers[name]) for name, text in known.items())
+    formats = {name: text for name, text in texts.items() if not math.isnan(numbers[name])}
+    return "     ".join(text.format(numbers[name]) for name, text in formats.items())
 
 
 def true_depth_errors(
@@ -496,8 +514,8 @@ def true_depth_errors(
     views = []
     for camera in cameras:
         pose = camera.camera_from_world @ scene_from_dataset
-        true = truth.render(dataclasses.replace(camera, camera_from_world=pose))
-        views.append((render_recorded(scene, camera), true))
+        true_view = truth.render(dataclasses.replace(camera, camera_from_world=pose))
+        views.append((render_recorded(scene, camera), true_view))
 
     def joined(images: Iterable[np.ndarray]) -> np.ndarray:
         return np.concatenate([image.reshape(-1) for image in images] or [np.zeros(0)])
@@ -505,20 +523,20 @@ def true_depth_errors(
     def errors(depth_m: np.ndarray, pixels: np.ndarray) -> dict[str, Any]:
         return dataclasses.asdict(depth_errors(depth_m[pixels], true_m[pixels]))
 
-    surface = joined(seen.has_surface for seen, _ in views).astype(bool)
-    median_m = joined(seen.median_depth_m for seen, _ in views)
-    expected_m = joined(seen.expected_depth_m for seen, _ in views)
-    alpha = joined(seen.alpha for seen, _ in views)
-    true_m = joined(true.depth for _, true in views)
-    semantic = joined(true.semantic for _, true in views)
+    surface = joined(rendered_view.has_surface for rendered_view, _ in views).astype(bool)
+    median_m = joined(rendered_view.median_depth_m for rendered_view, _ in views)
+    expected_m = joined(rendered_view.expected_depth_m for rendered_view, _ in views)
+    alpha = joined(rendered_view.alpha for rendered_view, _ in views)
+    true_m = joined(true_view.depth for _, true_view in views)
+    semantic = joined(true_view.semantic for _, true_view in views)
     is_sky = np.isinf(true_m)
-    used = surface & ~is_sky
+    compared_pixels = surface & ~is_sky
     return {
         "views": len(views),
-        "median": errors(median_m, used),
-        "expected": errors(expected_m, used),
+        "median": errors(median_m, compared_pixels),
+        "expected": errors(expected_m, compared_pixels),
         "by_class": {
-            SemanticClass(int(c)).name.lower(): errors(median_m, used & (semantic == c))
+            SemanticClass(int(c)).name.lower(): errors(median_m, compared_pixels & (semantic == c))
             for c in np.unique(semantic[~is_sky])
         },
         "no_surface": _mean(~surface[~is_sky]),
@@ -538,8 +556,8 @@ def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
     """
     truth = open_street(uri)
     keys = source.test or source.train
-    chosen = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
-    cameras = [source.camera(key) for key in chosen]
+    chosen_keys = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
+    cameras = [source.camera(key) for key in chosen_keys]
     return {"street": uri, **true_depth_errors(scene, truth, cameras)}
 
 

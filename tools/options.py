@@ -26,7 +26,7 @@ Overrides = Annotated[tuple[str, ...], UseAppendAction, arg(name="set", metavar=
 
 
 class Command(BaseModel):
-    """What a command can be asked for: each field is an option, and says which values it takes.
+    """A command and its options: each field is an option, and says which values it takes.
 
     The docstring of each command is its help. `run` does it and returns the exit code.
     """
@@ -48,15 +48,15 @@ class Command(BaseModel):
         if not error["loc"]:  # of several options together
             return text
         name = str(error["loc"][0])
-        known = cls.model_fields.get(name)
-        named = [getattr(each, "name", None) for each in (known.metadata if known else ())]
-        option = next(filter(None, named), name).replace("_", "-")
+        field = cls.model_fields.get(name)
+        metadata_names = [getattr(item, "name", None) for item in (field.metadata if field else ())]
+        option = next(filter(None, metadata_names), name).replace("_", "-")
         if (rule := text.removeprefix("Input should be ")) == text:
             return f"--{option} {text}"
         return f"--{option} must be {rule}; got {error['input']}"
 
     def run(self) -> int:
-        """The command. Returns its exit code."""
+        """Run the command and return its exit code."""
         raise NotImplementedError
 
 
@@ -151,7 +151,7 @@ class FitOptions(FitConfig, SceneCommand):
 
     @property
     def camera_names(self) -> tuple[str, ...] | None:
-        """None for all."""
+        """Names of the cameras; None for all."""
         return names_in(self.cameras)
 
     def settings(self) -> dict[str, Any]:
@@ -171,7 +171,7 @@ FITTED = "fitted"  # cameras that a scene was made from
 
 
 def names_in(text: str) -> tuple[str, ...] | None:
-    """Of names separated by commas; None for all."""
+    """Split names separated by commas; None for all."""
     return None if text == "all" else tuple(text.split(","))
 
 
@@ -194,25 +194,28 @@ def parse_depth(text: str) -> DepthPriors:
 
     if text == "none":
         return DepthPriors(lidar=False)
-    found: dict[str, Path | bool] = {}
+    fields: dict[str, Path | bool] = {}
     for item in text.split(","):
         kind, colon, folder = item.partition(":")
         if item == "lidar":
-            name, value = "lidar", True
+            name = "lidar"
+            value = True
         else:
             if not colon or kind not in DEPTH_KINDS:
-                kind, folder = "metric", item
-            name, value = f"{kind}_dir", Path(folder).absolute()
+                kind = "metric"
+                folder = item
+            name = f"{kind}_dir"
+            value = Path(folder).absolute()
             if not folder or not value.is_dir():
                 raise ClimateGSError(
                     f"--depth is lidar, none, or lidar and folders of depth maps such as "
                     f"lidar,relative:DIR (kinds: {', '.join(DEPTH_KINDS)}); there is no folder "
                     f"{folder!r}"
                 )
-        if name in found:
+        if name in fields:
             raise ClimateGSError(f"--depth {text}: {kind} is given twice")
-        found[name] = value
-    return DepthPriors(**{"lidar": False, **found})
+        fields[name] = value
+    return DepthPriors(**{"lidar": False, **fields})
 
 
 def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
@@ -230,8 +233,8 @@ def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
     place = Path(path)
     if place.exists():
         # Without `..`, but with the last name as given, even of a link: it names the scene.
-        whole = place.name in ("", "..")
-        path = str(place.resolve() if whole else place.parent.resolve() / place.name)
+        has_no_name = place.name in ("", "..")
+        path = str(place.resolve() if has_no_name else place.parent.resolve() / place.name)
     return scheme, path, query
 
 
@@ -241,8 +244,8 @@ def value_or(value: _Value | None, default: _Value) -> _Value:
 
 def _depth_text(priors: DepthPriors) -> str:
     folders = {kind: getattr(priors, f"{kind}_dir") for kind in DEPTH_KINDS}
-    named = [f"{kind}:{folder}" for kind, folder in folders.items() if folder is not None]
-    return ",".join((["lidar"] if priors.lidar else []) + named) or "none"
+    texts = [f"{kind}:{folder}" for kind, folder in folders.items() if folder is not None]
+    return ",".join((["lidar"] if priors.lidar else []) + texts) or "none"
 
 
 # By encoder. The small one looks at 32 px, whatever it is given; the paper's rate is B0's.

@@ -45,7 +45,7 @@ def duration_text(seconds: float) -> str:
 
 
 def print_images(result: Any, took: str) -> None:
-    """What became of a job's images: counts on stdout, the first failures as notes."""
+    """Print what became of a job's images: counts on stdout, the first failures as notes."""
     rate = result.written / result.seconds if result.seconds else 0.0
     print(
         f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
@@ -73,14 +73,15 @@ def compiling_noted(modules: Sequence[str] = (), *, on_gpu: bool = False) -> Ite
 
     from augment.render.compile_ahead import compile_ahead
 
-    beside, started = ExitStack(), time.perf_counter()
+    exit_stack = ExitStack()
+    start_s = time.perf_counter()
 
     @cache
     def say_once() -> float:
         if on_gpu:
             print_note("compiling kernels (once; kept for the next run) ...")
         if modules:
-            beside.enter_context(compile_ahead(modules))
+            exit_stack.enter_context(compile_ahead(modules))
         return time.perf_counter()
 
     class Announcer(TimingListener):
@@ -93,17 +94,17 @@ def compiling_noted(modules: Sequence[str] = (), *, on_gpu: bool = False) -> Ite
     if on_gpu:
         timer.start()
     try:
-        with beside, install_listener("numba:compile", Announcer()):
+        with exit_stack, install_listener("numba:compile", Announcer()):
             yield
     finally:
         timer.cancel()
     if say_once.cache_info().misses:
-        seconds = time.perf_counter() - (started if on_gpu else say_once())
+        seconds = time.perf_counter() - (start_s if on_gpu else say_once())
         print_note(f"kernels compiled after {seconds:.1f} s")
 
 
 def fill(template: str, **facts: Any) -> str:
-    """The text of one of tools/templates."""
+    """Fill one of tools/templates and return the text."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("tools")
@@ -155,7 +156,7 @@ def check_local(out: Path, instead: str) -> Path:
 
 
 def check_scene_out(out: Path, *, may_replace: bool, why: str = "") -> None:
-    """What is at OUT is nothing, or a scene that may be replaced; known before hours are spent.
+    """Refuse an OUT that holds anything but a scene that may be replaced, before hours are spent.
 
     Raises:
         OutputError: it is something else, or a scene that may not; why: for that message.

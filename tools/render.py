@@ -70,7 +70,8 @@ DEMO_CAMERA = "front"  # the one that is shown as a video
 _MAX_LINES = 20  # of scenes and recipes
 # Of the scene that kernels are compiled with.
 SIZE = 32  # pixels a side
-ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
+ACROSS = 10  # the number of the road's splats to each side
+SPACING_M = 0.1  # the distance between two of these splats, in metres
 
 
 def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> None:
@@ -106,37 +107,47 @@ def kernel_modules(
     street = ["adapters.street"] if of_street else []
     if renders_on_gpu(backend):
         return street
-    present = [e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)]
-    folders = (type(effect).__module__.removesuffix(".effect") for effect in present)
+    present_effects = [
+        e for e in effects.EFFECTS if any(e.of(recipe) is not None for recipe in recipes)
+    ]
+    folders = (type(effect).__module__.removesuffix(".effect") for effect in present_effects)
     pictures = (f"augment.render.{name}" for name in ("cpu", "composite_kernels"))
     passes = ["augment.render.picture_kernels"] if any(map(_alters_picture, recipes)) else []
     return [*street, "augment.kernels", *pictures, *passes, *folders]
 
 
 def _alters_picture(recipe: Recipe) -> bool:
-    """Whether airlight by elevation, scatter or a camera's noise pass over its picture."""
+    """True if airlight by elevation, scatter or a camera's noise pass over the recipe's picture."""
     smog = recipe.weather.smog
     of_smog = smog is not None and (smog.scatter > 0 or smog.overcast > 0)
     return recipe.camera.noise > 0 or of_smog
 
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
-    seen = set()
+    kernel_sets = set()
     if any(uses_boxes(recipe) for recipe in recipes):
         nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
         find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
         output = recipe.output
-        present = ((effect, effect.of(recipe)) for effect in effects.EFFECTS)
-        chosen = tuple(
-            e.kernels(section) if section is not None else None for e, section in present
+        sections = ((effect, effect.of(recipe)) for effect in effects.EFFECTS)
+        effect_kernels = tuple(
+            e.kernels(section) if section is not None else None for e, section in sections
         )
         for_boxes = uses_boxes(recipe) and output.depth == "none"
         ids = output.semantic or output.instance
         base = recipe.render.base
-        kernels = (*chosen, base, output.depth, ids, output.surface, for_boxes, recipe.lidar)
-        if kernels not in seen:
-            seen.add(kernels)
+        kernels = (
+            *effect_kernels,
+            base,
+            output.depth,
+            ids,
+            output.surface,
+            for_boxes,
+            recipe.lidar,
+        )
+        if kernels not in kernel_sets:
+            kernel_sets.add(kernels)
             with tempfile.NamedTemporaryFile(suffix=".png") as photo:
                 write_rgb(Path(photo.name), np.zeros((SIZE, SIZE, 3), np.uint8))
                 _warm_recipe(recipe, photo.name, backend)
@@ -144,8 +155,8 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
 
 def _warm_recipe(recipe: Recipe, photo: str, backend: str) -> None:
     scene = _warm_up_scene(0.0, photo, with_labels=False)
-    placed = make_plan(recipe, scene).placed.values()
-    level_z_m = next((p.water_level_z_m for p in placed if p.water_level_z_m), 0.0)
+    effect_plans = make_plan(recipe, scene).placed.values()
+    level_z_m = next((p.water_level_z_m for p in effect_plans if p.water_level_z_m), 0.0)
     scene = _warm_up_scene(level_z_m, photo, with_labels=recipe.output.labels)
     render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
     if recipe.lidar == "weather":
@@ -193,12 +204,12 @@ class _NoLabels:
 
 
 def _one_return(z_m: float) -> LidarSweep:
-    """Of the road, ahead."""
+    """A sweep of one return, from the road ahead."""
     return LidarSweep({"x": np.array([4.0]), "y": np.array([0.0]), "z": np.array([z_m])})
 
 
 def _camera(z_m: float) -> Camera:
-    """Level, ahead along +x."""
+    """A level camera that looks ahead along +x."""
     rotation = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
     centre = torch.tensor([0.0, 0.0, z_m], dtype=torch.float64)
     pose = rigid(rotation, -rotation @ centre)
@@ -207,7 +218,9 @@ def _camera(z_m: float) -> Camera:
 
 def generate_dataset(options: GenerateOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
-    job, out, backend = options.job, options.out, options.backend
+    job = options.job
+    out = options.out
+    backend = options.backend
     assert job is not None
     requested = load_job(job)
     recipes = load_job_recipes(requested, job.parent)
@@ -257,12 +270,12 @@ def show_status(out: str) -> int:
     Raises:
         ClimateGSError: no job was ever started there.
     """
-    found = read_status(open_store(out))
-    if not found:
+    statuses = read_status(open_store(out))
+    if not statuses:
         raise ClimateGSError(f"{out}: no job has been started there (no .climategs/jobs)")
-    for status in found:
+    for status in statuses:
         print(_status_text(status))
-    return 0 if all(_is_done(status) for status in found) else 1
+    return 0 if all(_is_done(status) for status in statuses) else 1
 
 
 def _dry_run(job: GenerateJob) -> int:
@@ -315,11 +328,11 @@ def ended_by_sigterm() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    previous_handler = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
 def _size(count: float) -> str:
@@ -330,18 +343,19 @@ def _size(count: float) -> str:
 
 def render_recipes(options: RenderOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
-    out, backend = options.out, options.backend
+    out = options.out
+    backend = options.backend
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
-    tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
+    trial_recipes = [recipe for resolved in recipes for recipe in recipes_to_try(resolved)]
     on_gpu = renders_on_gpu(backend)
     of_street = options.scene.startswith("procedural:")
-    with compiling_noted(kernel_modules(tried, backend, of_street=of_street)):
+    with compiling_noted(kernel_modules(trial_recipes, backend, of_street=of_street)):
         scene = open_scene(options.scene)
         if not on_gpu:
-            warm_up(tried, backend)
+            warm_up(trial_recipes, backend)
     if on_gpu:
         with compiling_noted(on_gpu=True):
-            warm_up(tried, backend)
+            warm_up(trial_recipes, backend)
     if options.camera_path is None:
         check_frames(scene)
     for problem in scene.problems:
@@ -359,27 +373,29 @@ def render_recipes(options: RenderOptions) -> int:
     recipes = [_with_quality(resolved, scene, options, path) for resolved in recipes]
     for resolved in recipes:
         make_plan(resolved, scene)  # refuse once, not for every image
-    chosen = parse_frames(options.frames).select([frame.index for frame in scene.frames])
+    frame_numbers = parse_frames(options.frames).select([frame.index for frame in scene.frames])
     cameras = _cameras(options, scene, path)
-    frames = [f for f in path or scene.frames if chosen is None or f.index in chosen]
+    frames = [f for f in path or scene.frames if frame_numbers is None or f.index in frame_numbers]
     if options.layout == "source":
         of_sweeps = any(resolved.lidar == "weather" for resolved in recipes)
-        for note in clear_notes(scene, chosen, cameras, of_sweeps=of_sweeps):
+        for note in clear_notes(scene, frame_numbers, cameras, of_sweeps=of_sweeps):
             print_note(f"note: {note}")
     scale = max(resolved.render.scale for resolved in recipes)
     for problem in judge_scene(scene, frames, cameras, scale=scale, count=1).problems:
         print_note(f"note: not fit for weather: {problem}")
     notes = lidar_notes(recipes)
-    labelled = SceneIndex.of(scene, path).labelled
-    asked = labelled if chosen is None else labelled.intersection(chosen)
-    if notes and has_lidar(scene, asked):
+    labelled_frames = SceneIndex.of(scene, path).labelled
+    sweep_frames = (
+        labelled_frames if frame_numbers is None else labelled_frames.intersection(frame_numbers)
+    )
+    if notes and has_lidar(scene, sweep_frames):
         for note in notes:
             print_note(f"note: {note}")
     job = RenderJob(
         scene_uri=options.scene,
         recipes=recipes,
         out_dir=out,
-        frames=chosen,
+        frames=frame_numbers,
         cameras=cameras,
         camera_path=path,
         workers=options.workers,
@@ -391,8 +407,8 @@ def render_recipes(options: RenderOptions) -> int:
     print_images(result, f"{result.seconds:.1f} s")
     if result.written:
         kinds = ("render", "encode", "write")
-        each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
-        print(f"per image: {', '.join(each)} (on threads that overlap)")
+        times = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
+        print(f"per image: {', '.join(times)} (on threads that overlap)")
     if shares := shares_of(result.timings, held_up=options.workers):
         print(shares.sentence)
     print(f"manifest: {result.manifest}")
@@ -407,7 +423,7 @@ def render_recipes(options: RenderOptions) -> int:
 
 
 def _write_labels(out: Path, recipes: Sequence[Recipe], images: int) -> None:
-    """For trainers, where a recipe asks for that."""
+    """Write the labels for trainers, where a recipe asks for them."""
     if not images or not any(recipe.output.label_formats for recipe in recipes):
         return
     try:
@@ -422,11 +438,11 @@ def _cameras(
     """Names, or None for all; a note says which are left out."""
     if options.cameras != FITTED:
         return names_in(options.cameras)
-    left_out = () if path is not None else unfitted_cameras(scene)
-    if not left_out:
+    unfitted_names = () if path is not None else unfitted_cameras(scene)
+    if not unfitted_names:
         return None
-    print_note(f"note: {left_out_sentence(left_out, '--cameras all')}")
-    return [name for name in scene.camera_names if name not in left_out]
+    print_note(f"note: {left_out_sentence(unfitted_names, '--cameras all')}")
+    return [name for name in scene.camera_names if name not in unfitted_names]
 
 
 def resolve_recipes(
@@ -441,19 +457,20 @@ def resolve_recipes(
         RecipeError: a recipe is invalid, or scaled beyond its limits.
         ClimateGSError: two would write to the same folder.
     """
-    resolved, known = [], dict[str, str]()
-    for asked in names:
-        template = load_recipe(asked, read_overrides(overrides))
-        if template.name in known:
+    recipes = []
+    source_by_name = dict[str, str]()
+    for name in names:
+        template = load_recipe(name, read_overrides(overrides))
+        if template.name in source_by_name:
             raise ClimateGSError(
-                f"the recipes {known[template.name]} and {asked} are both called "
+                f"the recipes {source_by_name[template.name]} and {name} are both called "
                 f"{template.name!r} and would write to the same folders: leave one out, or give "
                 f"it another name"
             )
-        known[template.name] = asked
+        source_by_name[template.name] = name
         count = template.variants if variants is None else variants
-        resolved += [scaled_recipe(template.resolve(number), scale) for number in range(count)]
-    return resolved
+        recipes += [scaled_recipe(template.resolve(number), scale) for number in range(count)]
+    return recipes
 
 
 def _with_quality(
@@ -480,23 +497,24 @@ def _with_quality(
 
 def run_demo(out: Path, frames: int) -> int:
     """The embedded street under five recipes, and pictures of it. Returns the exit code."""
-    started = time.perf_counter()
+    start_s = time.perf_counter()
     uri = f"procedural:street?seed=3&frames={frames}"
     print_note(f"building {uri}")
     recipes = [load_recipe(name).resolve(0) for name in DEMO_RECIPES]
     with compiling_noted(kernel_modules(recipes, of_street=True)):
         scene = open_scene(uri)
         warm_up(recipes)
-    ready = time.perf_counter()
+    ready_s = time.perf_counter()
     job = RenderJob(uri, recipes, out, source_digest=scene_digest(uri))
     result = run_job(job, scene_loader=lambda _uri: scene)
     for failure in result.failures:
         print_note(f"failed: {failure}")
     pictures = [draw_sheet(out), draw_video(out, DEMO_CAMERA, frames_per_second=5)]
-    done = time.perf_counter()
+    end_s = time.perf_counter()
     print(
         f"{result.written} images written, {result.skipped} already there, {result.failed} failed: "
-        f"{ready - started:.0f} s to build and compile, {done - ready:.0f} s to render and draw"
+        f"{ready_s - start_s:.0f} s to build and compile, "
+        f"{end_s - ready_s:.0f} s to render and draw"
     )
     print(f"images, depth, labels, LiDAR: {out}")
     print(f"contact sheet:                {pictures[0]}")

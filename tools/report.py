@@ -62,10 +62,11 @@ _DIGITS = re.compile(r"\d+")
 # Of a million rows they take some hundred megabytes, over and over.
 _UNUSED = ["timestamp_ns", "instance_path", "recipe_hash", "style_method"]
 _UNUSED += ["render_scale", "settings"]
-# Of a variant's folder; what else lies there, such as its recipe, is small.
-OTHER, STATE = "other", "state of jobs"
-MAX_BOX_FILES = 40
-MAX_TABLES, MAX_SWEEPS = 6, 3  # of each recipe
+OTHER = "other"  # the kind of a variant's other files, such as its recipe: they are small
+STATE = "state of jobs"  # the kind of the files in the folder of jobs
+MAX_BOX_FILES = 40  # the number of label files in which boxes are counted
+MAX_TABLES = 6  # the number of variants of each recipe whose box tables are read
+MAX_SWEEPS = 3  # the number of sweeps of each recipe that are read
 VISIBILITY_STEPS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95)  # lower bounds of the bins; the last is open
 _BOX = {"frame": pa.int64(), "camera": pa.string(), "box": pa.int64()}
 _CODES = {
@@ -77,20 +78,29 @@ _CODES = {
     codes.PRECIPITATION: "on a drop or a flake",
 }
 _FACTS = {
-    "size": "Image size", "camera": "Cameras", "trajectory": "Trajectory",
-    "surface": "Surface of labels", "seed": "Seeds", "version": "Version", "backend": "Backend",
-}  # fmt: skip
-# Of a group of images by what is counted. Frames are counted once per scene, whatever their
-# variants and cameras.
+    "size": "Image size",
+    "camera": "Cameras",
+    "trajectory": "Trajectory",
+    "surface": "Surface of labels",
+    "seed": "Seeds",
+    "version": "Version",
+    "backend": "Backend",
+}
+# Columns of a group of images, each with the column it is computed from and Arrow's function.
+# Frames are counted once per scene, whatever their variants and cameras.
 _COUNTS = {
-    "source": ("source", "min"), "finished": ("finished", "sum"), "failed": ("failed", "sum"),
-    "scenes": ("scene", "count_distinct"), "variants": ("draw", "count_distinct"),
-    "frames": ("place", "count_distinct"), "cameras": ("camera", "count_distinct"),
-}  # fmt: skip
+    "source": ("source", "min"),
+    "finished": ("finished", "sum"),
+    "failed": ("failed", "sum"),
+    "scenes": ("scene", "count_distinct"),
+    "variants": ("draw", "count_distinct"),
+    "frames": ("place", "count_distinct"),
+    "cameras": ("camera", "count_distinct"),
+}
 
 
 class Written(NamedTuple):
-    """problems: how many files could not be read."""
+    """A written page. problems: the number of files that could not be read."""
 
     path: Path
     size: int
@@ -131,14 +141,15 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
 
 
 def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
-    """The page's text, and how many files could not be read. html: where it will lie."""
+    """Return the page's text and the number of unreadable files. html: the page's future path."""
     table = read_finished(store, _UNUSED)
     cameras = cameras_on_car(store, table)
     table = add_variant_key(table.drop_columns("calibration_path"))
-    beside, own = _beside(store, html)
+    is_beside, page_names = _beside(store, html)
     listing = store.list("")
     files = ReportFiles(store, listing)
-    is_ok, columns = pc.equal(table["status"], OK), {}
+    is_ok = pc.equal(table["status"], OK)
+    columns = {}
     for name in table.column_names:  # a million paths take 50 MB: they are not held twice
         columns[name] = table[name].filter(is_ok)
         if name.endswith("_path") or name == "checksum":
@@ -146,11 +157,11 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     finished = pa.table(columns)
     recipes = group_by(table, "recipe")
     draws = find_draws(finished)
-    clear = set(draws.filter(draws["is_clear"])["draw"].to_pylist())
+    clear_draws = set(draws.filter(draws["is_clear"])["draw"].to_pylist())
     with_images = [group["name"] for group in recipes if group["finished"]]
-    gallery = Gallery(finished, clear, cameras, files, Shares.of(images), beside)
-    some = evenly(with_images, MAX_RECIPES)
-    found = spreads(draws)
+    gallery = Gallery(finished, clear_draws, cameras, files, Shares.of(images), is_beside)
+    sample_recipes = evenly(with_images, MAX_RECIPES)
+    number_spreads = spreads(draws)
     environment = _environment()
     style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
     # Dictionaries keep their order: in this one files are read, and noted where they are damaged.
@@ -159,17 +170,17 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
         "whole": group_by(table)[0],
         "compare": gallery.compare(),
         "sheets": gallery.contact_sheets(with_images),
-        "charts": [chart(spread) for spread in found if not spread.is_constant],
-        "constant": [spread for spread in found if spread.is_constant],
+        "charts": [chart(spread) for spread in number_spreads if not spread.is_constant],
+        "constant": [spread for spread in number_spreads if spread.is_constant],
         "classes": count_classes(finished, files),
         "trainers": read_trainers(files),
-        "visible": share_visible(finished, some, files),
-        "codes": share_codes(finished, some, files),
+        "visible": share_visible(finished, sample_recipes, files),
+        "codes": share_codes(finished, sample_recipes, files),
         "buffers": gallery.buffers(with_images),
         "recipes": recipes,
         "weather": weather_of_recipes(draws),
         "scenes": group_by(table, "scene"),
-        "kinds": files_by_kind(listing, own),
+        "kinds": files_by_kind(listing, page_names),
         "failures": group_failures(table),
         "problems": sorted(files.problems.items()),
         "unlisted": files.unlisted,
@@ -184,7 +195,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
 
 
 def visible_text(value: object) -> object:
-    """What stands in the page for a value: cut to MAX_TEXT, its invisible characters shown."""
+    """Return a value as the page shows it: cut to MAX_TEXT, its invisible characters replaced."""
     if isinstance(value, Markup):
         return value
     text = str(value)
@@ -203,9 +214,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "number": count, "plural": plural_of, "bytes": byte_size, "percent": percent,
-        "short": short, "with_unit": with_unit,
-    }  # fmt: skip
+        "number": count,
+        "plural": plural_of,
+        "bytes": byte_size,
+        "percent": percent,
+        "short": short,
+        "with_unit": with_unit,
+    }
     environment.globals |= {"depth_gradient": depth_gradient, **LIMITS}
     return environment
 
@@ -215,12 +230,12 @@ def _asset(environment: Environment, name: str) -> Markup:
 
 
 def add_variant_key(table: pa.Table) -> pa.Table:
-    """With a column `draw`: one whole number for each scene and variant, in the table's order."""
+    """Add a column `draw`: one integer for each scene and variant, in the table's order."""
     return table.append_column("draw", pa.array(value_codes(table, "scene", "variant"), pa.int64()))
 
 
 def group_by(table: pa.Table, *column: str) -> list[dict[str, Any]]:
-    """What there is of images that share a value of the column, by name; of all without a column.
+    """Count the images that share a value of the column, by that value; without a column, all.
     table: as `add_variant_key` returns it.
     """
     is_ok = pc.equal(table["status"], OK)
@@ -230,9 +245,9 @@ def group_by(table: pa.Table, *column: str) -> list[dict[str, Any]]:
         ("place", pa.array(value_codes(table, "scene", "frame"))),
     ):
         table = table.append_column(name, values)
-    counted = table.group_by([*column]).aggregate([*_COUNTS.values()])
-    named = counted.rename_columns([*("name" for _ in column), *_COUNTS])
-    groups = sorted(named.to_pylist(), key=lambda group: group.get("name"))
+    aggregates = table.group_by([*column]).aggregate([*_COUNTS.values()])
+    named_counts = aggregates.rename_columns([*("name" for _ in column), *_COUNTS])
+    groups = sorted(named_counts.to_pylist(), key=lambda group: group.get("name"))
     return [{k: 0 if value is None else value for k, value in row.items()} for row in groups]
 
 
@@ -240,27 +255,30 @@ def group_failures(table: pa.Table) -> list[dict[str, Any]]:
     """Failed images whose messages differ in numbers alone, which are often frames and paths: the
     first message, how many images, and examples of them. Most frequent first.
     """
-    failed = table.filter(pc.not_equal(table["status"], OK))
+    failed_rows = table.filter(pc.not_equal(table["status"], OK))
     names = ("message", "scene", "variant", "frame", "camera")
-    found: dict[str, dict[str, Any]] = {}
-    for message, *place in zip(*(failed[name].to_pylist() for name in names), strict=True):
-        known = found.setdefault(
+    failures: dict[str, dict[str, Any]] = {}
+    for message, *place in zip(*(failed_rows[name].to_pylist() for name in names), strict=True):
+        failure = failures.setdefault(
             _DIGITS.sub("#", message),
             {"message": message or "no message", "images": 0, "examples": []},
         )
-        known["images"] += 1
-        if known["images"] <= MAX_EXAMPLES:
-            known["examples"].append("{} · {} · frame {} · {}".format(*place))
-    return sorted(found.values(), key=lambda failure: (-failure["images"], failure["message"]))
+        failure["images"] += 1
+        if failure["images"] <= MAX_EXAMPLES:
+            failure["examples"].append("{} · {} · frame {} · {}".format(*place))
+    return sorted(failures.values(), key=lambda failure: (-failure["images"], failure["message"]))
 
 
 def files_by_kind(
-    listing: Mapping[str, StoredFile], own: Sequence[str] = ()
+    listing: Mapping[str, StoredFile], page_names: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
-    """What lies in the output, the largest kind first. own: the page itself, which is left out."""
-    files, size = Counter[str](), Counter[str]()
+    """Count the output's files and bytes by kind, the largest kind first. page_names: paths of the
+    page itself, which is left out.
+    """
+    files = Counter[str]()
+    size = Counter[str]()
     for path, stored in listing.items():
-        if path not in own:
+        if path not in page_names:
             kind = _kind_of(path)
             files[kind] += 1
             size[kind] += stored.size
@@ -275,73 +293,77 @@ def _kind_of(path: str) -> str:
     folder = parts[2] if len(parts) > 3 else parts[-1].partition(".")[0]
     if folder == "manifest":
         return "manifest"
-    known = {"images", *path_kinds()}
-    return folder if folder in known and len(parts) > 2 else OTHER
+    kind_names = {"images", *path_kinds()}
+    return folder if folder in kind_names and len(parts) > 2 else OTHER
 
 
-def _sample_text(files: int, of: int) -> str:
-    """How much of what there is was looked at."""
-    return "" if files >= of else f"; from {files:,} of {count(of, 'file')}, evenly chosen"
+def _sample_text(num_read: int, num_files: int) -> str:
+    """Say how many of the files were read."""
+    if num_read >= num_files:
+        return ""
+    return f"; from {num_read:,} of {count(num_files, 'file')}, evenly chosen"
 
 
 def count_classes(table: pa.Table, files: ReportFiles) -> dict[str, Any] | None:
     """Boxes by class, the most frequent first: (class, boxes, tracks). Of every scene's first
     variant that has labels: they are the same in the others.
     """
-    labelled = table.select(["scene", "draw", "labels_path"]).drop_null()
-    first = labelled["draw"].take(first_of_each(labelled, "scene")).combine_chunks()
-    labelled = labelled.filter(pc.is_in(labelled["draw"], value_set=first))
-    rows = first_of_each(labelled, "labels_path").tolist()
-    boxes, tracks, read = Counter[str](), set[tuple[str, str, str]](), 0
-    chosen = pa.array(evenly(rows, MAX_BOX_FILES), pa.int64())
-    for row in labelled.take(chosen).to_pylist():
-        found = files.read_columns(row["labels_path"], ("label", "track_id"))
-        if found is None or found.num_columns < 2:
+    labelled_rows = table.select(["scene", "draw", "labels_path"]).drop_null()
+    first_draws = labelled_rows["draw"].take(first_of_each(labelled_rows, "scene")).combine_chunks()
+    labelled_rows = labelled_rows.filter(pc.is_in(labelled_rows["draw"], value_set=first_draws))
+    rows = first_of_each(labelled_rows, "labels_path").tolist()
+    boxes = Counter[str]()
+    tracks = set[tuple[str, str, str]]()
+    num_read = 0
+    row_numbers = pa.array(evenly(rows, MAX_BOX_FILES), pa.int64())
+    for row in labelled_rows.take(row_numbers).to_pylist():
+        columns = files.read_columns(row["labels_path"], ("label", "track_id"))
+        if columns is None or columns.num_columns < 2:
             continue
-        read += 1
-        labels, ids = (map(str, found[name].to_pylist()) for name in ("label", "track_id"))
+        num_read += 1
+        labels, ids = (map(str, columns[name].to_pylist()) for name in ("label", "track_id"))
         for label, track in zip(labels, ids, strict=True):
             boxes[label] += 1
             tracks.add((label, row["scene"], track))
-    tracked = Counter(label for label, *_ in tracks)
+    tracks_by_label = Counter(label for label, *_ in tracks)
     order = sorted(boxes, key=lambda label: (-boxes[label], label))
-    counted = [(label, boxes[label], tracked[label]) for label in order]
-    return {"rows": counted, "sample": _sample_text(read, len(rows))} if counted else None
+    class_rows = [(label, boxes[label], tracks_by_label[label]) for label in order]
+    return {"rows": class_rows, "sample": _sample_text(num_read, len(rows))} if class_rows else None
 
 
 def read_trainers(files: ReportFiles) -> LabelsRecord | None:
-    """What the labels in formats for trainers say of themselves; None where there are none."""
+    """Read the record of the labels in formats for trainers; None where there are none."""
     path = f"{LABELS}/{RECORD}"
     return files.read(path, LabelsRecord.model_validate_json) if path in files.listing else None
 
 
 def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
-    """How much the weather leaves of each box that an image shows, in VISIBILITY_STEPS.
+    """Count boxes by the share that the weather leaves visible, in VISIBILITY_STEPS.
 
     The product of what every effect leaves, as `augment.jobs.files.visibility` has it.
     """
-    says = (kind for kind, of_boxes in box_tables().items() if of_boxes.visible or of_boxes.hidden)
-    columns = [f"{kind}_path" for kind in says if f"{kind}_path" in table.column_names]
+    kinds = (kind for kind, of_boxes in box_tables().items() if of_boxes.visible or of_boxes.hidden)
+    columns = [f"{kind}_path" for kind in kinds if f"{kind}_path" in table.column_names]
 
-    def counted(paths: dict[str, str | None]) -> Counter[int] | None:
+    def count_boxes(paths: dict[str, str | None]) -> Counter[int] | None:
         if (visible := _visible(paths, files)) is None:
             return None
         bins = np.digitize(np.clip(visible, 0, 1), VISIBILITY_STEPS) - 1
         return Counter(bins.tolist())
 
-    found, sample = _count_by_recipe(table, recipes, columns, MAX_TABLES, counted)
+    counts_by_recipe, sample = _count_by_recipe(table, recipes, columns, MAX_TABLES, count_boxes)
     bounds = [f"{100 * step:.0f}" for step in VISIBILITY_STEPS] + ["100"]
     keys = {i: (f"{a}–{b} %", f"s{i}") for i, (a, b) in enumerate(itertools.pairwise(bounds))}
-    return _bars(found, sample, "box", keys)
+    return _bars(counts_by_recipe, sample, "box", keys)
 
 
 def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict[str, Any] | None:
-    """How many points of each recipe's sweeps have which weather code.
+    """Count the points of each recipe's sweeps by their weather code.
 
     None where no sweep has the column `weather_code`.
     """
 
-    def counted(paths: dict[str, str | None]) -> Counter[int] | None:
+    def count_points(paths: dict[str, str | None]) -> Counter[int] | None:
         sweep = files.read_columns(str(paths["lidar_path"]), ("weather_code",))
         if sweep is None or not sweep.num_columns:
             return None
@@ -350,89 +372,107 @@ def share_codes(table: pa.Table, recipes: list[str], files: ReportFiles) -> dict
         entries = pc.value_counts(column).to_pylist() if is_whole else ()
         return Counter({entry["values"]: entry["counts"] for entry in entries})
 
-    found, sample = _count_by_recipe(table, recipes, ["lidar_path"], MAX_SWEEPS, counted)
-    known = sorted({code for _, counts in found for code in counts})
-    keys = {code: (_CODES.get(code, f"code {code}"), f"c{i % 8}") for i, code in enumerate(known)}
-    return _bars(found, sample, "point", keys)
+    counts_by_recipe, sample = _count_by_recipe(
+        table, recipes, ["lidar_path"], MAX_SWEEPS, count_points
+    )
+    codes = sorted({code for _, counts in counts_by_recipe for code in counts})
+    keys = {code: (_CODES.get(code, f"code {code}"), f"c{i % 8}") for i, code in enumerate(codes)}
+    return _bars(counts_by_recipe, sample, "point", keys)
 
 
 def _count_by_recipe(
     table: pa.Table,
     recipes: list[str],
     columns: list[str],
-    most: int,
-    counted: Callable[[dict[str, str | None]], Counter[int] | None],
+    max_sets: int,
+    count_values: Callable[[dict[str, str | None]], Counter[int] | None],
 ) -> tuple[list[tuple[str, Counter[int]]], str]:
     """The sum of what is counted in the files of each recipe that has any, of at most `most` of
     those that its rows name together, and how much that is of all.
     """
-    found, read, there = [], 0, 0
+    counts_by_recipe = []
+    num_read = 0
+    num_sets = 0
     for recipe in recipes:
-        own = table.select(["recipe", *columns]).filter(pc.equal(table["recipe"], recipe))
-        sets = own.group_by(columns, use_threads=False).aggregate([]).to_pylist()
+        recipe_rows = table.select(["recipe", *columns]).filter(pc.equal(table["recipe"], recipe))
+        sets = recipe_rows.group_by(columns, use_threads=False).aggregate([]).to_pylist()
         sets = [paths for paths in sets if any(paths.values())]
         sets.sort(key=lambda paths: str([*paths.values()]))
-        each = [counts for s in evenly(sets, most) if (counts := counted(s)) is not None]
-        if total := sum(each, Counter[int]()):
-            found.append((recipe, total))
-        there += len(sets) if each else 0
-        read += len(each)
-    return found, _sample_text(read, there)
+        set_counts = [
+            counts for s in evenly(sets, max_sets) if (counts := count_values(s)) is not None
+        ]
+        if total := sum(set_counts, Counter[int]()):
+            counts_by_recipe.append((recipe, total))
+        num_sets += len(sets) if set_counts else 0
+        num_read += len(set_counts)
+    return counts_by_recipe, _sample_text(num_read, num_sets)
 
 
 def _bars(
-    found: list[tuple[str, Counter[int]]], sample: str, noun: str, keys: Mapping[int, tuple]
+    counts_by_recipe: list[tuple[str, Counter[int]]],
+    sample: str,
+    noun: str,
+    keys: Mapping[int, tuple],
 ) -> dict[str, Any] | None:
     """For every recipe that has any, (CSS class, name, count) of each part of its bar. noun: what
     is counted. keys: (name, CSS class) of each category.
     """
-    rows = [(r, [(*keys[k][::-1], counts[k]) for k in keys if counts[k]]) for r, counts in found]
+    rows = [
+        (r, [(*keys[k][::-1], counts[k]) for k in keys if counts[k]])
+        for r, counts in counts_by_recipe
+    ]
     bars = {"rows": rows, "sample": sample, "noun": noun, "keys": [*keys.values()]}
     return bars if rows else None
 
 
 def _visible(paths: Mapping[str, str | None], files: ReportFiles) -> np.ndarray | None:
-    """float64 [boxes that a pixel shows] of the images that a variant's tables hold."""
+    """Return the visible share of every box that a pixel shows, float64 [boxes], of a variant."""
     parts = []
     for column, path in paths.items():
         if path is None:
             continue
         kind = box_tables()[column.removesuffix("_path")]
-        says, counted = kind.visible or kind.hidden, "pixels" in kind.columns
-        types = {**_BOX, **({"pixels": pa.int64()} if counted else {}), says: pa.float64()}
-        found = files.read_columns(path, (*types,))
-        if found is None:
+        share_column = kind.visible or kind.hidden
+        has_pixels = "pixels" in kind.columns
+        types = {
+            **_BOX,
+            **({"pixels": pa.int64()} if has_pixels else {}),
+            share_column: pa.float64(),
+        }
+        table = files.read_columns(path, (*types,))
+        if table is None:
             return None
-        if found.num_columns < len(types):  # of an output older than `pixels`
+        if table.num_columns < len(types):  # of an output older than `pixels`
             continue
-        if found.schema.types != [*types.values()]:
+        if table.schema.types != [*types.values()]:
             return files.note(path, "its columns are not of the types that a job writes")
-        left = pc.subtract(1.0, found[says]) if kind.hidden else found[says]
-        left = pc.fill_null(pc.if_else(pc.is_finite(left), left, 1.0), 1.0)
-        shown = pc.greater(found["pixels"], 0) if counted else pa.repeat(True, len(found))
-        part = found.select(list(_BOX)).append_column("left", left)
-        parts.append(part.append_column("shown", pc.fill_null(shown, False)))
+        share = pc.subtract(1.0, table[share_column]) if kind.hidden else table[share_column]
+        share = pc.fill_null(pc.if_else(pc.is_finite(share), share, 1.0), 1.0)
+        is_shown = pc.greater(table["pixels"], 0) if has_pixels else pa.repeat(True, len(table))
+        part = table.select(list(_BOX)).append_column("left", share)
+        parts.append(part.append_column("shown", pc.fill_null(is_shown, False)))
     if not parts:
         return None
-    together = pa.concat_tables(parts).group_by(list(_BOX), use_threads=False)
-    boxes = together.aggregate([("left", "product"), ("shown", "any")])
+    groups = pa.concat_tables(parts).group_by(list(_BOX), use_threads=False)
+    boxes = groups.aggregate([("left", "product"), ("shown", "any")])
     return boxes.filter(boxes["shown_any"])["left_product"].to_numpy()
 
 
 def _facts(table: pa.Table, cameras: list[str]) -> list[tuple[str, list[Any]]]:
-    """What all images share, or the few values that they have, the most frequent first; cameras as
-    they stand on the car.
+    """Return the few values that images have in each column of _FACTS, the most frequent first;
+    cameras as they stand on the car.
     """
     sizes = pc.binary_join_element_wise(
         *(table[name].cast(pa.string()) for name in ("width", "height")), "×"
     )
-    table, found = table.append_column("size", sizes), []
+    table = table.append_column("size", sizes)
+    facts = []
     for column, title in _FACTS.items():
-        counted = pc.value_counts(table[column].drop_null()).to_pylist()
-        counted.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
-        values = [entry["values"] for entry in counted[:6]]
-        found.append((title, sorted(values, key=cameras.index) if column == "camera" else values))
-    return [(title, values) for title, values in found if values]
+        entries = pc.value_counts(table[column].drop_null()).to_pylist()
+        entries.sort(key=lambda entry: (-entry["counts"], str(entry["values"])))
+        values = [entry["values"] for entry in entries[:6]]
+        facts.append((title, sorted(values, key=cameras.index) if column == "camera" else values))
+    return [(title, values) for title, values in facts if values]
 
 
 def _name_of(store: Store) -> str:
@@ -443,10 +483,11 @@ def _name_of(store: Store) -> str:
 
 
 def _beside(store: Store, html: Path) -> tuple[bool, list[str]]:
-    """Whether the page lies in the output's folder, and pages that are no part of the output."""
+    """Return True if the page lies in the output's folder, and the pages that are no output."""
     if store.local_dir is None:
         return False, [REPORT]
-    root, target = store.local_dir.resolve(), html.absolute().parent.resolve() / html.name
-    inside = target.is_relative_to(root)
-    own = [REPORT, target.relative_to(root).as_posix()] if inside else [REPORT]
-    return target.parent == root, own
+    root = store.local_dir.resolve()
+    target = html.absolute().parent.resolve() / html.name
+    is_inside = target.is_relative_to(root)
+    page_names = [REPORT, target.relative_to(root).as_posix()] if is_inside else [REPORT]
+    return target.parent == root, page_names

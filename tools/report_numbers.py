@@ -19,7 +19,12 @@ from tools.drawing import linear_ticks, log_ticks
 MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic
 MAX_MARKS = 300
-WIDTH, LEFT, RIGHT, TOP, FLOOR = 340, 6, 6, 14, 104  # of a histogram, in SVG units
+# Sizes of a histogram, in SVG units.
+WIDTH = 340  # the whole picture's width
+LEFT = 6  # the margin on the left
+RIGHT = 6  # the margin on the right
+TOP = 14  # the margin above the bars
+FLOOR = 104  # the height, from the top, at which the bars stand
 _MAX_NUMBER = 1e99  # greater numbers are as little a weather's as infinity is
 _BYTES = ("B", "kB", "MB", "GB", "TB", "PB")
 # By ending of a column's name, the longest first.
@@ -34,9 +39,9 @@ _UNITS = {
 
 
 def quantity_of(column: str) -> Column:
-    """What a number of an effect in the manifest means; one not known by its name's ending."""
-    if column in (known := columns_of_effects()):
-        return known[column]
+    """Return the quantity of a manifest's column; an unknown one is told by its name's ending."""
+    if column in (columns := columns_of_effects()):
+        return columns[column]
     ending = next((e for e in _UNITS if column.endswith(e)), "")
     name = column.removesuffix(ending).replace("_", " ").strip()
     title = name[:1].upper() + name[1:]
@@ -47,12 +52,12 @@ def shown_numbers(quantity: Column, numbers: np.ndarray) -> np.ndarray:
     """float64 [n] in the unit shown; NaN where the manifest's numbers say that there is no effect,
     or are none that an effect has.
     """
-    there = np.abs(numbers) < _MAX_NUMBER  # false for NaN
+    has_effect = np.abs(numbers) < _MAX_NUMBER  # false for NaN
     if quantity.absent == 0:
-        there &= numbers != 0
+        has_effect &= numbers != 0
     if quantity.over is not None:  # a visibility of infinity or below 0 is none
-        there &= numbers > 1 / _MAX_NUMBER
-    return quantity.shown(np.where(there, numbers, np.nan))
+        has_effect &= numbers > 1 / _MAX_NUMBER
+    return quantity.shown(np.where(has_effect, numbers, np.nan))
 
 
 def find_draws(table: pa.Table) -> pa.Table:
@@ -83,7 +88,8 @@ class Spread:
     @property
     def is_constant(self) -> bool:
         """All values are one, but for rounding."""
-        low, high = self.values.min(), self.values.max()
+        low = self.values.min()
+        high = self.values.max()
         return not high - low > 1e-9 * max(abs(low), abs(high))
 
     @property
@@ -99,20 +105,24 @@ class Spread:
 
 
 def spreads(draws: pa.Table) -> list[Spread]:
-    """Of every weather column that some image has a number in; a variant's images all have its."""
-    found, images = [], draws["images"].to_numpy()
+    """Return the spread of every weather column in which some image has a number.
+
+    All images of a variant have the variant's number.
+    """
+    all_spreads = []
+    images = draws["images"].to_numpy()
     for name in _number_columns(draws):
         quantity = quantity_of(name)
         values = shown_numbers(quantity, _as_floats(draws, name))
-        there = ~np.isnan(values)
-        if there.any():
-            absent = int(images[~there].sum())
-            found.append(Spread(quantity, values[there], images[there], absent))
-    return found
+        has_number = ~np.isnan(values)
+        if has_number.any():
+            absent = int(images[~has_number].sum())
+            all_spreads.append(Spread(quantity, values[has_number], images[has_number], absent))
+    return all_spreads
 
 
 def weather_of_recipes(draws: pa.Table) -> dict[str, str]:
-    """What the variants of each recipe drew, in words; "" without weather."""
+    """Describe the weather that each recipe's variants drew, in words; "" without weather."""
     words = [c for c in columns_of_effects().values() if not c.is_number and c.title]
     numbers = [quantity_of(name) for name in _number_columns(draws)]
     ranges = {
@@ -124,17 +134,20 @@ def weather_of_recipes(draws: pa.Table) -> dict[str, str]:
         table = table.append_column(name, values)
     ends = [(q.name, end) for q in numbers for end in ("min", "max")]
     groups = table.group_by("recipe").aggregate([*((c.name, "distinct") for c in words), *ends])
-    found = {}
+    text_by_recipe = {}
     for row in groups.to_pylist():
         names = {c.title: sorted(set(row[f"{c.name}_distinct"]) - {None}) for c in words}
-        texts = [f"{title}: {', '.join(each[:4])}" for title, each in names.items() if each]
-        known = [q for q in numbers if row[f"{q.name}_min"] is not None]
-        for quantity in known[:10]:
-            low, high = row[f"{quantity.name}_min"], row[f"{quantity.name}_max"]
+        texts = [
+            f"{title}: {', '.join(entries[:4])}" for title, entries in names.items() if entries
+        ]
+        quantities = [q for q in numbers if row[f"{q.name}_min"] is not None]
+        for quantity in quantities[:10]:
+            low = row[f"{quantity.name}_min"]
+            high = row[f"{quantity.name}_max"]
             span = short(low) if low == high else f"{short(low)} to {short(high)}"
             texts.append(f"{quantity.title} {span} {quantity.unit}".rstrip())
-        found[row["recipe"]] = "; ".join(texts)
-    return found
+        text_by_recipe[row["recipe"]] = "; ".join(texts)
+    return text_by_recipe
 
 
 def weather_text(row: Mapping[str, Any]) -> str:
@@ -162,7 +175,7 @@ def _number_columns(table: pa.Table) -> list[str]:
 
 
 def _as_floats(table: pa.Table, column: str) -> np.ndarray:
-    """float64 [rows]; null is NaN."""
+    """Return a column as float64 [rows]; null is NaN."""
     return pc.fill_null(table[column], np.nan).to_numpy().astype(np.float64)
 
 
@@ -174,11 +187,13 @@ def histogram(
     values: finite [v], two of them unlike, each counted as often as its whole weight says. linear:
     not logarithmic, however far the values are spread.
     """
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     log = not linear and low > 0 and high / low > LOG_RATIO
     bins = int(min(MAX_BINS, max(6, 2 * math.ceil(math.sqrt(len(values))))))
     edges = np.geomspace(low, high, bins + 1) if log else np.linspace(low, high, bins + 1)
-    edges[0], edges[-1] = min(edges[0], low), max(edges[-1], high)
+    edges[0] = min(edges[0], low)
+    edges[-1] = max(edges[-1], high)
     counts, _ = np.histogram(values, edges, weights=weights)
     return edges, counts, log
 
@@ -219,7 +234,7 @@ def chart(spread: Spread) -> dict[str, Any]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """0.31 m, 4.8 NTU; a number without a unit stands alone."""
+    """Return a number with its unit, such as 0.31 m or 4.8 NTU; without a unit, the number."""
     return f"{short(number)} {unit}".rstrip()
 
 
@@ -237,7 +252,7 @@ def short(number: float) -> str:
 
 
 def count(number: int, noun: str = "") -> str:
-    """12,000 images; 1 image."""
+    """Return a count with its noun, such as 12,000 images or 1 image."""
     return f"{number:,} {plural_of(number, noun)}".rstrip()
 
 
@@ -249,18 +264,20 @@ def plural_of(number: int, noun: str) -> str:
 
 
 def byte_size(number: int) -> str:
-    """3.2 MB, in steps of 1000."""
-    size, unit = float(number), 0
+    """Return a size as text, such as 3.2 MB, in steps of 1000."""
+    size = float(number)
+    unit = 0
     while size >= 999.5 and unit < len(_BYTES) - 1:
-        size, unit = size / 1000, unit + 1
+        size = size / 1000
+        unit = unit + 1
     return f"{number:,} B" if unit == 0 else f"{size:.3g} {_BYTES[unit]}"
 
 
-def percent(part: float, whole: float) -> str:
-    """41 %, < 1 %; an empty whole has no parts."""
-    if not whole:
+def percent(part: float, total: float) -> str:
+    """A share as text, such as 41 % or < 1 %; – where the total is 0."""
+    if not total:
         return "–"
-    share = 100 * part / whole
+    share = 100 * part / total
     if 0 < share < 1:
         return "< 1 %"
     return "> 99 %" if 99 < share < 100 else f"{share:.0f} %"

@@ -39,15 +39,18 @@ BUDGET = 3_100_000  # bytes of all pictures; a third more as text of the page
 MAX_IMAGES = 400  # more of them could not be told apart within the budget
 _MAX_VARIANTS = 6  # of one comparison
 _SAMPLE = 4  # pictures: an image, its depth, its classes, and a mask
-# Pixels across, and bytes at most of one picture.
-_LARGE, _LARGE_BYTES = 1120, 130_000
-_SMALL, _SMALL_BYTES = 400, 40_000
-_BUFFER, _BUFFER_BYTES = 480, 45_000
+_LARGE = 1120  # the width of a picture of a comparison, in pixels
+_LARGE_BYTES = 130_000  # its size at most, in bytes
+_SMALL = 400  # the width of a thumbnail of a contact sheet, in pixels
+_SMALL_BYTES = 40_000  # its size at most, in bytes
+_BUFFER = 480  # the width of a picture of depth, classes or a mask, in pixels
+_BUFFER_BYTES = 45_000  # its size at most, in bytes
 _QUALITIES = (82, 74, 64, 52, 40)
 _NO_DEPTH = (128, 128, 128)
 _NEAREST_M = 0.5
 # Multiples of either, less their whole parts, fill an interval evenly however many there are.
-_GOLDEN, _SILVER = (math.sqrt(5) - 1) / 2, math.sqrt(2) - 1
+_GOLDEN = (math.sqrt(5) - 1) / 2  # the golden ratio, less 1
+_SILVER = math.sqrt(2) - 1  # the silver ratio, less 2
 
 # Told apart by eye, and close to what people know from Cityscapes.
 CLASS_COLORS: dict[SemanticClass, tuple[int, int, int]] = {
@@ -84,7 +87,7 @@ class ReportFiles:
     unlisted: int = 0
 
     def read(self, path: str, parse: Callable[[bytes], Value]) -> Value | None:
-        """What `parse` makes of a file; None, and noted, where it cannot be used."""
+        """Return what `parse` makes of a file; None, and a note, where it cannot be used."""
         stored = self.listing.get(path)
         try:
             if stored is not None and stored.size > MAX_FILE:
@@ -104,13 +107,13 @@ class ReportFiles:
             self.unlisted += 1
 
     def read_columns(self, path: str, names: tuple[str, ...]) -> pa.Table | None:
-        """Those of `names` that a Parquet file has."""
+        """Read those columns of `names` that a Parquet file has."""
         return self.read(path, lambda data: read_table(data, path, names))
 
     def read_image(
         self, path: str, decode: Callable[[bytes], np.ndarray], checksum: str = ""
     ) -> np.ndarray | None:
-        """An image of no more than MAX_PIXELS."""
+        """Read an image of no more than MAX_PIXELS."""
 
         def checked(data: bytes) -> np.ndarray:
             header = image_header(data)
@@ -143,13 +146,15 @@ def pick_images(table: pa.Table, among: np.ndarray, number: int, shift: int = 0)
     """
     draws = table["draw"].to_numpy()[among]
     bounds = [*np.flatnonzero(np.diff(draws, prepend=-1)).tolist(), len(among)]
-    number, rows = min(number, len(among)), set[int]()
+    number = min(number, len(among))
+    rows = set[int]()
     for i in range(number):
         group = int((i + (0.5 + (i + shift) * _GOLDEN) % 1) * (len(bounds) - 1) / number)
-        low, size = bounds[group], bounds[group + 1] - bounds[group]
-        inside = int(size * ((0.5 + (i + shift) * _SILVER) % 1))
-        free = (low + (inside + k) % size for k in range(size))
-        rows |= {next((row for row in free if row not in rows), low)}
+        low = bounds[group]
+        size = bounds[group + 1] - bounds[group]
+        offset = int(size * ((0.5 + (i + shift) * _SILVER) % 1))
+        free_rows = (low + (offset + k) % size for k in range(size))
+        rows |= {next((row for row in free_rows if row not in rows), low)}
     return table.take(among[sorted(rows)]).to_pylist()
 
 
@@ -160,33 +165,38 @@ def pick_places(table: pa.Table, clear: set[int], places: int, variants: int) ->
     Only scenes in which two variants show the same are taken, those with weather and without first.
     clear: the numbers of the variants without weather.
     """
-    names, candidates = sorted(pc.unique(table["scene"]).to_pylist()), []
+    names = sorted(pc.unique(table["scene"]).to_pylist())
+    candidates = []
     for name in evenly(names, 8 * places):  # reading rows of thousands of scenes takes seconds
         candidates.append(_place_of(table, rows_with(table, "scene", name), clear, variants))
     candidates = [rows for rows in candidates if len(rows) >= 2]
-    paired = [rows for rows in candidates if len({row["draw"] in clear for row in rows}) == 2]
-    return evenly(paired or candidates, places)
+    mixed_places = [rows for rows in candidates if len({row["draw"] in clear for row in rows}) == 2]
+    return evenly(mixed_places or candidates, places)
 
 
 def _place_of(table: pa.Table, among: np.ndarray, clear: set[int], variants: int) -> list[Row]:
     rows = table.select(["frame", "camera", "draw"]).take(among)
-    counted = rows.group_by(["frame", "camera"], use_threads=False)
-    seen = counted.aggregate([("draw", "count_distinct")]).to_pylist()
-    most = max(entry["draw_count_distinct"] for entry in seen)
-    full = [(e["camera"], e["frame"]) for e in seen if e["draw_count_distinct"] == most]
+    views = rows.group_by(["frame", "camera"], use_threads=False)
+    view_counts = views.aggregate([("draw", "count_distinct")]).to_pylist()
+    max_variants = max(entry["draw_count_distinct"] for entry in view_counts)
+    fullest_views = [
+        (e["camera"], e["frame"]) for e in view_counts if e["draw_count_distinct"] == max_variants
+    ]
     # The camera that looks ahead first, as far as names tell.
-    camera, _ = min(full, key=lambda key: ("front" not in key[0].lower(), len(key[0]), key[0]))
-    frames = sorted(number for name, number in full if name == camera)
+    camera, _ = min(
+        fullest_views, key=lambda key: ("front" not in key[0].lower(), len(key[0]), key[0])
+    )
+    frames = sorted(number for name, number in fullest_views if name == camera)
     is_frame = pc.equal(rows["frame"], frames[len(frames) // 2])
-    here = pc.and_(is_frame, pc.equal(rows["camera"], camera)).to_numpy()
-    shown = table.take(among[here]).to_pylist()
-    bare = [row for row in shown if row["draw"] in clear]
-    others = [row for row in shown if row["draw"] not in clear] or bare[1:]
+    is_view = pc.and_(is_frame, pc.equal(rows["camera"], camera)).to_numpy()
+    candidates = table.take(among[is_view]).to_pylist()
+    clear_rows = [row for row in candidates if row["draw"] in clear]
+    weathered_rows = [row for row in candidates if row["draw"] not in clear] or clear_rows[1:]
     # Of each recipe its first variant; all of them where there is one recipe only.
-    first = {row["recipe"]: row for row in reversed(others)}
-    if len(first) >= 2:
-        others = [row for row in others if first[row["recipe"]] is row]
-    return bare[:1] + evenly(others, variants - len(bare[:1]))
+    first_rows = {row["recipe"]: row for row in reversed(weathered_rows)}
+    if len(first_rows) >= 2:
+        weathered_rows = [row for row in weathered_rows if first_rows[row["recipe"]] is row]
+    return clear_rows[:1] + evenly(weathered_rows, variants - len(clear_rows[:1]))
 
 
 class Picture(NamedTuple):
@@ -225,15 +235,18 @@ class Shares(NamedTuple):
 
     @staticmethod
     def of(images: int) -> Shares:
-        """A third for comparisons, a quarter for depth and classes, the rest for contact sheets."""
-        compared, samples = images // 3, images // 4 // _SAMPLE
+        """Share out a page's images: a third for comparisons, a quarter for depth and classes, the
+        rest for contact sheets.
+        """
+        num_compared = images // 3
+        samples = images // 4 // _SAMPLE
         # Two stand beside each other, one has the page's width.
-        places = 0 if compared < 2 else 1 if compared < 8 else 2 if compared < 20 else 4
-        variants = min(_MAX_VARIANTS, compared // places) if places else 0
+        places = 0 if num_compared < 2 else 1 if num_compared < 8 else 2 if num_compared < 20 else 4
+        variants = min(_MAX_VARIANTS, num_compared // places) if places else 0
         thumbnails = images - places * variants - _SAMPLE * samples
         unit = BUDGET / max(3 * places * variants + 1.2 * _SAMPLE * samples + thumbnails, 1)
         limits = (_LARGE_BYTES, 3 * unit), (_BUFFER_BYTES, 1.2 * unit), (_SMALL_BYTES, unit)
-        return Shares(places, variants, samples, thumbnails, *(int(min(each)) for each in limits))
+        return Shares(places, variants, samples, thumbnails, *(int(min(limit)) for limit in limits))
 
 
 @dataclass(frozen=True)
@@ -256,7 +269,7 @@ class Gallery:
         places = []
         if self.shares.places:
             places = pick_places(self.table, self.clear, self.shares.places, self.shares.variants)
-        shown = []
+        comparisons = []
         for number, rows in enumerate(places):
             sides = [
                 {
@@ -270,41 +283,47 @@ class Gallery:
             if len(sides) >= 2:
                 right = 1 + number % (len(sides) - 1)  # not the same weather at every place
                 where = "{scene}, frame {frame}, {camera}".format_map(rows[0])
-                shown.append({"number": number, "where": where, "sides": sides, "right": right})
+                comparisons.append(
+                    {"number": number, "where": where, "sides": sides, "right": right}
+                )
         lacks = "clear" if not self.clear else "pairs"
         has_pairs = any(row["draw"] in self.clear for rows in places for row in rows)
-        return {"places": shown, "lacks": None if has_pairs else lacks}
+        return {"places": comparisons, "lacks": None if has_pairs else lacks}
 
     def contact_sheets(self, recipes: Sequence[str]) -> dict[str, Any]:
         """A strip of thumbnails for each recipe, as many recipes as there are pictures for."""
-        chosen = evenly(list(recipes), self.shares.thumbnails)
-        each = max(1, min(8, self.shares.thumbnails // max(len(chosen), 1)))
+        chosen_recipes = evenly(list(recipes), self.shares.thumbnails)
+        num_images = max(1, min(8, self.shares.thumbnails // max(len(chosen_recipes), 1)))
         strips = []
-        for recipe in chosen:
-            own = rows_with(self.table, "recipe", recipe)
-            rows = sorted(pick_images(self.table, own, each), key=self._place_on_car)
-            found = [
+        for recipe in chosen_recipes:
+            row_numbers = rows_with(self.table, "recipe", recipe)
+            rows = sorted(pick_images(self.table, row_numbers, num_images), key=self._place_on_car)
+            candidates = [
                 self._figure(row, _SMALL, self.shares.small_bytes, weather_text(row))
                 for row in rows
             ]
-            figures = [figure for figure in found if figure is not None]
-            strips.append({"recipe": recipe, "images": len(own), "figures": figures})
+            figures = [figure for figure in candidates if figure is not None]
+            strips.append({"recipe": recipe, "images": len(row_numbers), "figures": figures})
         return {"strips": strips, "of": len(recipes)}
 
     def buffers(self, recipes: Sequence[str]) -> list[list[Figure]]:
         """Images of some recipes with their depth, classes and masks."""
-        having = pc.or_(*(pc.is_valid(self.table[f"{k}_path"]) for k in ("depth", "semantic")))
-        table, present = self.table, set(pc.unique(self.table["recipe"].filter(having)).to_pylist())
-        limits, found = (_BUFFER, self.shares.buffer_bytes), []
-        chosen = evenly([r for r in recipes if r in present], self.shares.samples)
-        for i, recipe in enumerate(chosen):
-            own = rows_with(table, "recipe", recipe)
-            own = own[having.to_numpy()[own]]
-            for row in pick_images(table, own, 1, shift=i):
+        has_buffers = pc.or_(*(pc.is_valid(self.table[f"{k}_path"]) for k in ("depth", "semantic")))
+        table = self.table
+        recipes_with_buffers = set(pc.unique(self.table["recipe"].filter(has_buffers)).to_pylist())
+        limits = (_BUFFER, self.shares.buffer_bytes)
+        samples = []
+        chosen_recipes = evenly(
+            [r for r in recipes if r in recipes_with_buffers], self.shares.samples
+        )
+        for i, recipe in enumerate(chosen_recipes):
+            row_numbers = rows_with(table, "recipe", recipe)
+            row_numbers = row_numbers[has_buffers.to_numpy()[row_numbers]]
+            for row in pick_images(table, row_numbers, 1, shift=i):
                 image = self._figure(row, *limits)
-                others = read_buffers(row, self.files, *limits)[: _SAMPLE - 1]
-                found.append(others if image is None else [image, *others])
-        return [figures for figures in found if figures]
+                buffers = read_buffers(row, self.files, *limits)[: _SAMPLE - 1]
+                samples.append(buffers if image is None else [image, *buffers])
+        return [figures for figures in samples if figures]
 
     def _place_on_car(self, row: Row) -> tuple[int, ...]:
         return row["draw"], row["frame"], self.cameras.index(row["camera"])
@@ -320,7 +339,7 @@ class Gallery:
 
 
 def read_buffers(row: Row, files: ReportFiles, width: int, most: int) -> list[Figure]:
-    """Pictures of what else was written beside an image: depth, classes, masks.
+    """Return pictures of an image's buffers: depth, classes, masks.
 
     width: pixels at most. most: bytes of each.
     """
@@ -337,25 +356,26 @@ def read_buffers(row: Row, files: ReportFiles, width: int, most: int) -> list[Fi
     def figure(rgb: np.ndarray, title: str, note: str = "", **more: Any) -> Figure:
         return Figure(embed(rgb, width, most), title, title, note, **more)
 
-    found = []
+    figures = []
     if (depth := read("depth", np.uint16)) is not None:
         rgb, note = color_depth(depth_in_metres(shrunk(depth)))
-        found.append(figure(rgb, "Depth", note, is_depth=True))
+        figures.append(figure(rgb, "Depth", note, is_depth=True))
     if (classes := read("semantic", np.uint8)) is not None:
-        small, palette = shrunk(classes), np.zeros((256, 3), np.uint8)  # what is no class is black
+        small = shrunk(classes)
+        palette = np.zeros((256, 3), np.uint8)  # what is no class is black
         palette[list(CLASS_COLORS)] = list(CLASS_COLORS.values())
         keys = [
             (c.name.lower().replace("_", " "), "rgb({} {} {})".format(*CLASS_COLORS[c]))
             for c in SemanticClass
             if (small == c).mean() > 0.001
         ]
-        found.append(figure(palette[small], "Semantic classes", keys=keys))
+        figures.append(figure(palette[small], "Semantic classes", keys=keys))
     for kind in mask_names():
         if (mask := read(kind, np.uint8)) is not None:
             note = f"{100 * float((mask > 0).mean()):.0f} % of pixels"
             rgb = cv2.cvtColor(shrunk(mask), cv2.COLOR_GRAY2RGB)
-            found.append(figure(rgb, f"{kind.capitalize()} mask", note))
-    return found
+            figures.append(figure(rgb, f"{kind.capitalize()} mask", note))
+    return figures
 
 
 def color_depth(depth_m: np.ndarray) -> tuple[np.ndarray, str]:
@@ -363,15 +383,15 @@ def color_depth(depth_m: np.ndarray) -> tuple[np.ndarray, str]:
 
     depth_m: float32 [H, W], 0 = none, which is grey.
     """
-    there = depth_m > 0
+    has_depth = depth_m > 0
     rgb = np.full((*depth_m.shape, 3), _NO_DEPTH, np.uint8)
-    if not there.any():
+    if not has_depth.any():
         return rgb, "nowhere"
-    near, far = np.percentile(depth_m[there], [1, 99])
+    near, far = np.percentile(depth_m[has_depth], [1, 99])
     near = max(float(near), _NEAREST_M)
     far = max(float(far), 1.01 * near)
     place = np.log(np.maximum(depth_m, _NEAREST_M) / near) / np.log(far / near)
-    rgb[there] = color_mapped(1 - place, cv2.COLORMAP_TURBO)[there]
+    rgb[has_depth] = color_mapped(1 - place, cv2.COLORMAP_TURBO)[has_depth]
     return rgb, f"{near:.1f} m to {far:.0f} m"
 
 
@@ -390,7 +410,9 @@ def embed(rgb: np.ndarray, width: int, most: int) -> Picture:
     for _ in range(8):
         height = round(rgb.shape[0] * width / rgb.shape[1])
         if height > 1.5 * width:
-            height, width = round(1.5 * width), max(1, round(1.5 * width * width / height))
+            max_height = round(1.5 * width)
+            width = max(1, round(1.5 * width * width / height))
+            height = max_height
         small = rgb
         if width < rgb.shape[1]:
             small = cv2.resize(rgb, (width, max(1, height)), interpolation=cv2.INTER_AREA)

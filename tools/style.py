@@ -75,10 +75,13 @@ if TYPE_CHECKING:
 
 # OUT of a training holds the network, the report and its curves; OUT/checkpoint what an unfinished
 # one goes on from.
-NETWORK_FILE, CURVES_FILE = "network.safetensors", "curves.png"
-ROWS, ROW_STEPS = 40, 50  # of the history; steps averaged into one, at most
+NETWORK_FILE = "network.safetensors"
+CURVES_FILE = "curves.png"
+ROWS = 40  # the number of rows of the history, roughly
+ROW_STEPS = 50  # the number of steps that are averaged into one row, at most
 SCORED = 16  # contents with a style each, by which a network is scored
-TIMED, UNTIMED = 8, 2  # steps from which the number of them is estimated
+TIMED = 8  # the number of steps that are timed, to estimate how many fit the time
+UNTIMED = 2  # the number of steps before them that are not timed
 
 
 def train_style(
@@ -89,7 +92,8 @@ def train_style(
     Raises:
         ClimateGSError: options, data or the output folder cannot be used as they are.
     """
-    out, folder = options.out, checkpoint_folder(options.out)
+    out = options.out
+    folder = checkpoint_folder(options.out)
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: choose another --out")
     network = out / NETWORK_FILE
@@ -111,7 +115,7 @@ def train_style(
 
 
 def checkpoint_folder(out: Path) -> Path:
-    """What a training in this folder goes on from."""
+    """Folder of the checkpoint from which a training in `out` goes on."""
     return out / "checkpoint"
 
 
@@ -138,7 +142,8 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     data = _open_data(options)
     for problem in data.problems:
         print_note(f"note: {problem}")
-    views, photos = len(data.pool.views), len(data.pool.photos)
+    views = len(data.pool.views)
+    photos = len(data.pool.photos)
     print_note(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
     features = open_features(options.vgg)
     training = open_training(
@@ -163,7 +168,8 @@ def _check_device(device: str) -> None:
 
 
 def _open_data(options: StyleTrainOptions) -> _Data:
-    size_px, device = options.settings()["size_px"], options.device
+    size_px = options.settings()["size_px"]
+    device = options.device
     views: list[Content] = []
     problems: list[str] = []
     for uri in options.scenes:
@@ -189,10 +195,10 @@ def _open_data(options: StyleTrainOptions) -> _Data:
 
 
 def _digest(pictures: Iterable[torch.Tensor]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for picture in pictures:
-        found.update(picture.cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()
+        digest.update(picture.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _trainer(
@@ -220,14 +226,16 @@ def _trainer(
 def _estimate(
     options: StyleTrainOptions, budget_s: float, pool: TrainingPool, features: FeatureExtractor
 ) -> tuple[int, float]:
-    """Steps that fill the time, and seconds of one with all losses, by a trainer thrown away."""
+    """Estimate the steps that fill the time, and the seconds of one with all losses, by a trainer
+    that is thrown away.
+    """
     trainer = _trainer(options, 1000, pool, features)
     trainer.step = 500  # beyond the warm-up
     seconds: list[float] = []
     for _ in range(UNTIMED + TIMED):
-        begun = time.perf_counter()
+        start_s = time.perf_counter()
         trainer.run_step()
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.perf_counter() - start_s)
     step_s = sorted(seconds[UNTIMED:])[TIMED // 2]
     return rounded_steps(int(budget_s * (1 - RESERVE) / step_s)), step_s
 
@@ -242,12 +250,13 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
         for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
             training.add({f"sum.{name}": value, f"count.{name}": 1})
         if record.step % row_steps == 0 or record.step == steps:
-            sums, training.sums = training.sums, {}
+            sums = training.sums
+            training.sums = {}
             names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
             terms = {name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names}
             training.add_row(loss=sums["loss"] / sums["steps"], **terms)
 
-    def shown(_: StepRecord) -> dict[str, str]:
+    def postfix(_: StepRecord) -> dict[str, str]:
         sums = training.sums
         return {"loss": f"{sums['loss'] / sums['steps']:.4f}"} if sums else {}
 
@@ -256,7 +265,7 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
         "train",
         add=add,
         score=lambda: training.add_row(**_scores(run)),
-        shown=shown,
+        postfix=postfix,
         write=lambda complete: _write(run, complete),
         checkpoint_s=checkpoint_s,
         progress=progress,
@@ -264,13 +273,15 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
 
 
 def _scores(run: _Run) -> dict[str, Any]:
-    """What the network is worth now."""
+    """Scores of the network as it is now."""
     return score_training(run.training.trainer.net, run.data.scored, run.features)
 
 
 def _write(run: _Run, complete: bool) -> dict[str, Any]:
     training = run.training
-    options, plan, net = training.options, training.plan, training.trainer.net
+    options = training.options
+    plan = training.plan
+    net = training.trainer.net
     about = {
         "command": "style train",
         "step": training.trainer.step,
@@ -300,8 +311,8 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
 
 
 def _show_end(out: Path, report: dict[str, Any]) -> None:
-    known = {n: v for n, v in report["scores"].items() if isinstance(v, int | float)}
-    print(", ".join(f"{name} {v:.4g}" for name, v in known.items() if math.isfinite(v)))
+    numbers = {n: v for n, v in report["scores"].items() if isinstance(v, int | float)}
+    print(", ".join(f"{name} {v:.4g}" for name, v in numbers.items() if math.isfinite(v)))
     if (out / CURVES_FILE).is_file():
         print(f"curves: {out / CURVES_FILE}")
     print(f"network: {out / NETWORK_FILE}")
@@ -326,19 +337,19 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
     # Compile the kernel where it is not yet, so that times are of the work.
     eye = torch.eye(3, 4) / 2
     style_gaussians(Gaussians.empty(), StyleMaps(eye[None], eye, eye))
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     scene = open_scene(options.scene)
     for problem in scene.problems:
         print_note(f"note: {problem}")
     scene = storable(scene)
-    opened = time.perf_counter()
+    open_s = time.perf_counter()
     if requested.changes and requested.method == "gscm":
         content_pictures(scene)
     elif requested.changes:
         content_statistics(scene, per_region=requested.per_region)
-    measured = time.perf_counter()
+    measure_s = time.perf_counter()
     maps = style_maps(scene, requested)
-    mapped = time.perf_counter()
+    map_s = time.perf_counter()
 
     styled = styled_scene(scene, maps)
     facts: dict[str, Any] = {
@@ -348,17 +359,17 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
         "maps": _map_facts(maps),
         "clamped": _clamp_facts(scene, styled, maps),
         "seconds": {
-            "open": opened - begun,
-            "content": measured - opened,
-            "image to map": mapped - measured,
+            "open": open_s - start_s,
+            "content": measure_s - open_s,
+            "image to map": map_s - measure_s,
         },
         "apply": _apply_facts(scene, maps),
     }
-    done = {**facts["style"], "scene": scene.source, "maps": facts["maps"]}
-    made_by = {**scene.made_by, "styles": [*scene.made_by.get("styles", ()), done]}
-    begun = time.perf_counter()
+    style_facts = {**facts["style"], "scene": scene.source, "maps": facts["maps"]}
+    made_by = {**scene.made_by, "styles": [*scene.made_by.get("styles", ()), style_facts]}
+    start_s = time.perf_counter()
     save_scene(dataclasses.replace(styled, made_by=made_by), out.absolute())
-    facts["seconds"]["write"] = time.perf_counter() - begun
+    facts["seconds"]["write"] = time.perf_counter() - start_s
     if (picture := _picture(scene, styled)) is not None:
         facts["picture"] = str(picture_file)
         write_rgb(picture_file, picture, jpeg_quality=88)
@@ -367,17 +378,17 @@ def apply_style(options: ApplyOptions) -> dict[str, Any]:
 
 
 def picture_path(out: Path) -> Path:
-    """Where the picture of a styled scene lies: beside its folder."""
+    """Path of a styled scene's picture, beside the scene's folder."""
     return path_beside(out, ".style.jpg")
 
 
 def style_text(facts: Mapping[str, Any]) -> str:
-    """The facts for people."""
+    """Return the facts of a styling as text."""
     return fill("style.txt", **facts)
 
 
 def _style(options: ApplyOptions) -> Style:
-    """Of an image file, or of the preset of that name (a file of the same name is ./NAME)."""
+    """Style of an image file, or of the preset of that name (a file of that name is ./NAME)."""
     source = options.style
     is_preset = source in style_preset_names()
     if not is_preset and not Path(source).exists() and not Path(source).suffix:
@@ -392,7 +403,7 @@ def _style(options: ApplyOptions) -> Style:
 
 
 def _style_facts(style: Style) -> dict[str, Any]:
-    """What is kept with the scene: names and contents of files, not where they lay."""
+    """Facts of a style that are stored with the scene: files by name and digest, not by path."""
     facts = {
         name: value
         for name, value in style.model_dump(exclude={"applied_to", "evaluated", "digest"}).items()
@@ -407,19 +418,22 @@ def _style_facts(style: Style) -> dict[str, Any]:
 
 
 def _map_facts(maps: StyleMaps) -> dict[str, Any]:
-    """Every map that is one of its own, by what it is for."""
-    named = {"splats": maps.splats[0]}
+    """Return the facts of every map that no earlier one equals, by the map's purpose."""
+    map_by_name = {"splats": maps.splats[0]}
     if len(maps.splats) > 1:
-        named = {SemanticClass(n).name.lower(): one for n, one in enumerate(maps.splats)}
-    named["sky"] = maps.sky
-    facts, seen = {}, []
-    for name, one in named.items():
-        if name != "sky" and any(torch.equal(one, other) for other in seen):
+        map_by_name = {
+            SemanticClass(n).name.lower(): style_map for n, style_map in enumerate(maps.splats)
+        }
+    map_by_name["sky"] = maps.sky
+    facts = {}
+    unique_maps = []
+    for name, style_map in map_by_name.items():
+        if name != "sky" and any(torch.equal(style_map, other_map) for other_map in unique_maps):
             continue
-        seen.append(one)
-        gains = torch.linalg.svdvals(one[:, :3].double())
+        unique_maps.append(style_map)
+        gains = torch.linalg.svdvals(style_map[:, :3].double())
         facts[name] = {
-            "map": [[float(value) for value in row] for row in one],
+            "map": [[float(value) for value in row] for row in style_map],
             "gains": [float(gain) for gain in gains],
             "condition": float(gains[0] / gains[-1].clamp_min(1e-12)),
         }
@@ -435,17 +449,17 @@ def _clamp_facts(scene: Scene, styled: Scene, maps: StyleMaps) -> dict[str, Any]
     if not pictures:
         return facts
     half = len(pictures) // 2
-    before, after = pictures[:half], pictures[half:]
-    facts["pixels"] = _outside(
-        [torch.cat([p.reshape(-1, 3) for p in group]) for group in (before, after)]
-    )
+    pictures_before = pictures[:half]
+    pictures_after = pictures[half:]
+    groups = (pictures_before, pictures_after)
+    facts["pixels"] = _outside([torch.cat([p.reshape(-1, 3) for p in group]) for group in groups])
     style_parts = SceneStyle(maps, styled.sky, scene, sky_levels(scene, maps))
     errors = [
-        (_render(scene, camera, style_parts) - new).abs().amax(-1).flatten()
-        for camera, new in zip(_views(scene), after, strict=True)
+        (_render(scene, camera, style_parts) - picture).abs().amax(-1).flatten()
+        for camera, picture in zip(_views(scene), pictures_after, strict=True)
     ]
-    off = torch.cat(errors) > VISIBLE
-    facts["pixels off a render under the style"] = float(off.float().mean())
+    is_visible = torch.cat(errors) > VISIBLE
+    facts["pixels off a render under the style"] = float(is_visible.float().mean())
     return facts
 
 
@@ -468,26 +482,28 @@ def _views(scene: Scene) -> list[Camera]:
 
 def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None) -> torch.Tensor:
     """The picture with its sky, not clamped. style_parts: a style to render it under."""
-    parts, sky = scene.parts_for(camera), scene.sky
+    parts = scene.parts_for(camera)
+    sky = scene.sky
     if style_parts is not None:
-        parts, sky = style_parts.on(parts), style_parts.sky
-    seen = rasterize(parts, camera)
-    assert seen.rgb is not None and seen.alpha is not None
-    return composite_sky(seen.rgb, seen.alpha, camera, sky)
+        parts = style_parts.on(parts)
+        sky = style_parts.sky
+    raster = rasterize(parts, camera)
+    assert raster.rgb is not None and raster.alpha is not None
+    return composite_sky(raster.rgb, raster.alpha, camera, sky)
 
 
 def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
-    """Time of the mapping alone, over all Gaussians, least of three."""
+    """Return the time of the mapping alone, over all Gaussians: the least of three."""
     parts = [dataclasses.replace(part, sh=part.sh.clone()) for part in scene.all_gaussians]
     traffic = 2 * sum(part.sh.numel() * part.sh.element_size() for part in parts)
     seconds = {}
     for is_in_place in (False, True):
         runs = []
         for _ in range(3):
-            begun = time.perf_counter()
+            start_s = time.perf_counter()
             for part in parts:
                 style_gaussians(part, maps, out=part.sh if is_in_place else None)
-            runs.append(time.perf_counter() - begun)
+            runs.append(time.perf_counter() - start_s)
         seconds[is_in_place] = min(runs)
     return {
         "gaussians": sum(map(len, parts)),
@@ -503,8 +519,8 @@ def _picture(scene: Scene, styled: Scene) -> np.ndarray | None:
     rows = []
     for camera in _views(scene):
         panels = [
-            captioned(quantise(_render(shown, camera)), title, camera.name)
-            for shown, title in ((scene, "before"), (styled, "after"))
+            captioned(quantise(_render(panel_scene, camera)), title, camera.name)
+            for panel_scene, title in ((scene, "before"), (styled, "after"))
         ]
         rows.append(strip(panels))
     if not rows:

@@ -48,7 +48,8 @@ EVALUATIONS = 10
 CHECKPOINT_S = 120.0
 RESERVE = 0.05  # of the time, for evaluations and checkpoints
 VERSION = 3
-PLAN_FILE, REPORT_FILE = "fit.json", "report.json"
+PLAN_FILE = "fit.json"  # the checkpoint's settings, history and names of arrays
+REPORT_FILE = "report.json"  # the report of a training, for programs
 _STATES = "state-*.safetensors"
 _STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
 
@@ -116,25 +117,26 @@ class Training:
     begun: float = field(default_factory=time.perf_counter)
 
     def seconds(self) -> float:
-        """Spent so far, in earlier runs too."""
+        """Return the seconds spent so far, in earlier runs too."""
         return self.plan.seconds + time.perf_counter() - self.begun
 
     def add(self, values: Mapping[str, float]) -> None:
-        """To the sums."""
+        """Add numbers to the sums."""
         for name, value in values.items():
             self.sums[name] = self.sums.get(name, 0.0) + value
 
     def add_row(self, **values: Any) -> None:
-        """One more row of the history, at the trainer's step."""
+        """Add a row to the history, at the trainer's step."""
         self.rows.append({"step": int(self.trainer.step), "seconds": self.seconds(), **values})
 
     def save(self) -> Checkpoint:
-        """A checkpoint, which does not change what is learnt. Returned is what its JSON holds."""
+        """Save a checkpoint, which does not change what is learnt. Return what its JSON holds."""
         arrays, facts = self.trainer.state()
-        step, seconds = self.trainer.step, self.seconds()
-        now = {"step": step, "seconds": seconds, "history": self.rows, "sums": self.sums}
-        now |= {"facts": facts, "arrays": arrays}
-        return save_checkpoint(self.folder, self.plan.model_copy(update=now))
+        step = self.trainer.step
+        seconds = self.seconds()
+        state = {"step": step, "seconds": seconds, "history": self.rows, "sums": self.sums}
+        state |= {"facts": facts, "arrays": arrays}
+        return save_checkpoint(self.folder, self.plan.model_copy(update=state))
 
 
 def open_training(
@@ -178,13 +180,14 @@ def open_training(
                 f"{changed}: {'; '.join(differing)}. Begin anew with --overwrite, or choose "
                 f"another --out"
             )
-    made = trainer(plan.steps)
+    new_trainer = trainer(plan.steps)
     if plan.arrays:
-        made.load_state(plan.arrays, plan.facts)
+        new_trainer.load_state(plan.arrays, plan.facts)
         print_note(f"going on after step {plan.step} of {plan.steps}")
-    rows, sums = list(plan.history), dict(plan.sums)
+    rows = list(plan.history)
+    sums = dict(plan.sums)
     plan = plan.model_copy(update={"arrays": {}, "facts": {}})  # the trainer has them
-    return Training(options, folder, made, plan, rows, sums)
+    return Training(options, folder, new_trainer, plan, rows, sums)
 
 
 def run_training(
@@ -193,7 +196,7 @@ def run_training(
     *,
     add: Callable[[Any], None],
     score: Callable[[], None],
-    shown: Callable[[Any], Mapping[str, str]],
+    postfix: Callable[[Any], Mapping[str, str]],
     write: Callable[[bool], dict[str, Any]],
     checkpoint_s: float = CHECKPOINT_S,
     progress: bool = True,
@@ -201,10 +204,12 @@ def run_training(
     """Steps from the trainer's to the plan's last, or until asked to stop.
 
     add(record): of every step. score(): adds rows to the history, about EVALUATIONS times.
-    shown(record): for the progress bar. write(complete): the result; returns the report.
+    postfix(record): for the progress bar. write(complete): the result; returns the report.
     """
-    trainer, steps = training.trainer, training.plan.steps
-    evaluated, saved = evaluation_steps(steps), time.monotonic()
+    trainer = training.trainer
+    steps = training.plan.steps
+    scored_steps = evaluation_steps(steps)
+    save_s = time.monotonic()
     with StopRequest() as stop:
         if trainer.step == 0 and not training.rows:
             score()
@@ -214,22 +219,22 @@ def run_training(
             while trainer.step < steps and not stop.requested:
                 record = trainer.run_step()
                 add(record)
-                if record.step in evaluated:
+                if record.step in scored_steps:
                     score()
-                bar.set_postfix(shown(record), refresh=False)
+                bar.set_postfix(postfix(record), refresh=False)
                 bar.update(record.step - bar.n)
-                if time.monotonic() - saved > checkpoint_s and record.step < steps:
+                if time.monotonic() - save_s > checkpoint_s and record.step < steps:
                     training.save()
-                    saved = time.monotonic()
-        last = training.save()
+                    save_s = time.monotonic()
+        checkpoint = training.save()
         complete = trainer.step >= steps
         report = write(complete)
     if complete:
-        _write_plan(training.folder, last.model_copy(update={"finished": True}))
+        _write_plan(training.folder, checkpoint.model_copy(update={"finished": True}))
         return Outcome(0, report)
     overwrite = training.options.overwrite
-    again = "the same command without --overwrite" if overwrite else "the same command"
-    print_note(f"stopped after step {trainer.step} of {steps}; {again} goes on from there")
+    command_text = "the same command without --overwrite" if overwrite else "the same command"
+    print_note(f"stopped after step {trainer.step} of {steps}; {command_text} goes on from there")
     return Outcome(130, report)
 
 
@@ -239,7 +244,7 @@ def evaluation_steps(steps: int) -> frozenset[int]:
 
 
 def rounded_steps(steps: int) -> int:
-    """At least 1; of hundreds, whole fifties."""
+    """Round a number of steps: at least 1, and a multiple of 50 where it has hundreds."""
     return max(1, steps if steps < 100 else steps // 50 * 50)
 
 
@@ -298,7 +303,7 @@ class Checkpoint(BaseModel):
 
 
 class State(BaseModel):
-    """Of a checkpoint's arrays. file: a name, so that nothing outside of the folder is read."""
+    """A file of a checkpoint's arrays. file: a name, so that nothing outside the folder is read."""
 
     file: str = Field(pattern=r"^[^/\\]+$")
     sha256: str
@@ -327,7 +332,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
 
 def _check_same(options: Any, before: Checkpoint) -> None:
     """Refuse to go on with what was begun with other settings or another length; name them all."""
-    settings, length = options.settings(), length_of(options)
+    settings = options.settings()
+    length = length_of(options)
     changed = _differences(before.settings, settings)
     if length != before.length and length.get("steps") != before.steps:
         was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, length))
@@ -419,7 +425,10 @@ def _damaged(path: Path, what: str) -> OutputError:
     return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
 
 
-_BLUE, _ORANGE, _GREEN = "#0072b2", "#d55e00", "#009e73"
+# Colours of lines in the curves, which colour-blind readers can tell apart.
+_BLUE = "#0072b2"
+_ORANGE = "#d55e00"
+_GREEN = "#009e73"
 Row = Mapping[str, Any]
 
 
@@ -485,10 +494,12 @@ def write_curves(path: Path, history: Sequence[Row], panels: Sequence[Panel]) ->
     Raises:
         OutputError: the file cannot be written.
     """
-    known = [(p, {line: points for line in p.lines if (points := _points(history, line))})
-             for p in panels]  # fmt: skip
-    known = [(panel, lines) for panel, lines in known if lines]
-    if not known:
+    panel_lines = []
+    for panel in panels:
+        lines = {line: points for line in panel.lines if (points := _points(history, line))}
+        if lines:
+            panel_lines.append((panel, lines))
+    if not panel_lines:
         return False
     try:
         from matplotlib.figure import Figure
@@ -498,12 +509,14 @@ def write_curves(path: Path, history: Sequence[Row], panels: Sequence[Panel]) ->
             f"`pip install 'climategs[plots]'`. The report holds the same numbers as `history`"
         )
         return False
-    columns = min(2, len(known))
-    rows = -(-len(known) // columns)
+    columns = min(2, len(panel_lines))
+    rows = -(-len(panel_lines) // columns)
     figure = Figure(figsize=(7.2 * columns, 4.4 * rows), layout="constrained")
     clock = sorted({(float(r["step"]), float(r["seconds"])) for r in history if "seconds" in r})
-    last_step = max(step for _, lines in known for points in lines.values() for step, _ in points)
-    for number, (panel, lines) in enumerate(known, 1):
+    last_step = max(
+        step for _, lines in panel_lines for points in lines.values() for step, _ in points
+    )
+    for number, (panel, lines) in enumerate(panel_lines, 1):
         axes = figure.add_subplot(rows, columns, number)
         _draw_panel(axes, panel, lines, max(last_step, 1.0), clock)
     data = io.BytesIO()
@@ -513,7 +526,7 @@ def write_curves(path: Path, history: Sequence[Row], panels: Sequence[Panel]) ->
 
 
 def _points(history: Sequence[Row], line: Line) -> list[tuple[float, float]]:
-    """(step, value), in order of steps."""
+    """Return the points (step, value) of a line, in order of steps."""
     return [
         (float(row["step"]), float(value))
         for row in history
@@ -540,10 +553,10 @@ def _draw_panel(
         axes.set_yscale("log")
     for line, points in lines.items():
         steps, values = zip(*points, strict=True)
-        drawn = [max(value, lowest) for value in values] if panel.log else values
+        plot_values = [max(value, lowest) for value in values] if panel.log else values
         marker = "o" if line.is_marked or len(points) == 1 else ""
         label = f"{line.label}: {panel.last.format(values[-1])}" if line.label else None
-        axes.plot(steps, drawn, color=line.color, marker=marker, markersize=4, label=label)
+        axes.plot(steps, plot_values, color=line.color, marker=marker, markersize=4, label=label)
     if panel.from_zero:
         axes.set_ylim(bottom=0)
     if any(line.label for line in lines):
@@ -552,16 +565,19 @@ def _draw_panel(
 
 
 def _draw_clock(axes: Any, clock: Sequence[tuple[float, float]]) -> None:
-    """Above the axes, the time at which steps were reached."""
+    """Draw, above the axes, the time at which steps were reached."""
     from matplotlib.ticker import MaxNLocator
 
-    at, seconds = np.array(clock).reshape(-1, 2).T
+    row_steps, seconds = np.array(clock).reshape(-1, 2).T
     if len(clock) < 2 or seconds[-1] <= seconds[0]:
         return
     unit, name = (60.0, "min") if seconds[-1] >= 180 else (1.0, "s")
     # From the first row on: what was spent before it is compiling and opening, not steps.
-    first, last = seconds[0] / unit, seconds[-1] / unit
-    ticks = [t for t in MaxNLocator(6).tick_values(first, last) if first <= t <= last]
+    first_time = seconds[0] / unit
+    last_time = seconds[-1] / unit
+    ticks = [
+        t for t in MaxNLocator(6).tick_values(first_time, last_time) if first_time <= t <= last_time
+    ]
     above = axes.secondary_xaxis("top")
-    steps = np.interp([t * unit for t in ticks], np.maximum.accumulate(seconds), at)
+    steps = np.interp([t * unit for t in ticks], np.maximum.accumulate(seconds), row_steps)
     above.set_xticks(steps, [f"{t:g} {name}" for t in ticks], fontsize="small")
