@@ -61,6 +61,7 @@ from augment.jobs.atomic import (
 )
 from augment.jobs.layout import STATE_FOLDER
 from augment.labels import LabelSource
+from augment.render.cpu.kernel_cache import user_cache_folder
 from augment.scene import Scene, is_drawable
 from recipes.files import open_file
 
@@ -150,12 +151,8 @@ def leave_out_cache() -> None:
 
 def _cache_folder() -> Path | None:
     """Folder of the entries; None where the user has no home."""
-    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        base = cache_home if cache_home.is_absolute() else Path.home() / ".cache"
-    except RuntimeError:
-        return None
-    return base / "climategs" / "scenes"
+    folder = user_cache_folder()
+    return None if folder is None else folder / "scenes"
 
 
 def _limit_bytes() -> float:

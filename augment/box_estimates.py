@@ -79,14 +79,14 @@ class SortedPoints:
 def _are_inside(
     points_m: np.ndarray, placed: PlacedBoxes, number: int, low_m: np.ndarray, high_m: np.ndarray
 ) -> Bool[np.ndarray, " P"]:
-    """Which points [P, 3] lie between two corners of a box, in its own axes from its centre."""
+    """Return for points [P, 3] if they lie between two corners of a box, in the box's axes."""
     along = (points_m.astype(np.float64) - placed.centres_m[number]) @ placed.rotations[number]
     return ((along >= low_m) & (along <= high_m)).all(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a scene knows of a frame's objects besides rendered depth.
+    """Evidence of a frame's objects besides rendered depth.
 
     returns: of the frame's sweep. splats: centres of the background's splats. actors: track_ids of
     the scene's actors.
@@ -97,7 +97,7 @@ class Evidence:
     actors: frozenset[str]
 
     def draws(self, placed: PlacedBoxes, number: int, track_id: str) -> bool:
-        """Whether the scene's splats show the object of a box."""
+        """Return True if the scene's splats show the object of a box."""
         if track_id in self.actors:
             return True
         return len(self.splats.inside(placed, number, placed.low_m[number])) >= MIN_SPLATS

@@ -87,11 +87,7 @@ def parsed_json(text: bytes, where: str, *, max_values: int = MAX_VALUES) -> dic
         SceneError: no JSON, no object, too many values, nested too deeply, a number of thousands
             of digits, or text with half a character (an unpaired surrogate).
     """
-    values = sum(text.count(mark) for mark in (b",", b"[", b"{"))
-    if values > max_values:
-        raise SceneError(
-            f"{where} holds {values} values in its JSON; at most {max_values} are read"
-        )
+    check_values(text, where, max_values=max_values)
     try:
         content = json.loads(text)
         if _SURROGATE.search(text):  # nothing could print or open such text

@@ -22,7 +22,13 @@ from augment.render.compile_ahead import describe_type, find_type, read_signatur
 from augment.render.cpu import jit as cpu_jit
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import KERNELS, kernel, seconds_compiling
-from augment.render.cpu.kernel_cache import KEEP_DAYS, SECONDS_A_DAY, UserCacheLocator, make_folder
+from augment.render.cpu.kernel_cache import (
+    KEEP_DAYS,
+    SECONDS_A_DAY,
+    UserCacheLocator,
+    make_folder,
+    user_cache_folder,
+)
 from augment.render.cpu.simd import exp2, exp2_fine, log2
 from augment.render.threads import kernel_threads
 
@@ -124,10 +130,19 @@ def test_the_folder_of_a_kernel_is_named_by_all_its_sources(tmp_path):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.py"
         path.write_text(text)
         place = type("Place", (UserCacheLocator,), {"digest_of_others": sources_digest})
-        return place(double, str(path)).get_cache_path()
+        return place(double, str(path), tmp_path).get_cache_path()
 
     assert folder("a", "x") == folder("a", "x")
     assert len({folder("a", "x"), folder("b", "x"), folder("a", "y")}) == 3
+
+
+def test_a_relative_cache_folder_does_not_count(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for cache_home in ("", "here"):
+        monkeypatch.setenv("XDG_CACHE_HOME", cache_home)
+        assert user_cache_folder() == tmp_path / ".cache/climategs"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "there"))
+    assert user_cache_folder() == tmp_path / "there/climategs"
 
 
 def test_folders_of_kernels_go_when_unused_for_long(tmp_path):

@@ -145,7 +145,8 @@ class _CompileLog(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         if time.monotonic() - self._end_s >= MIN_PAUSE_S:
-            logger.info(COMPILE_NOTE, os.environ.get("NUMBA_CACHE_DIR") or kernel_cache_folder())
+            folder = os.environ.get("NUMBA_CACHE_DIR") or kernel_cache_folder()
+            logger.info(COMPILE_NOTE, folder or "numba's own place")
         self._end_s = time.monotonic()  # of inner functions' events, which lie within it
 
     def on_end(self, event: event.Event) -> None:
@@ -174,7 +175,7 @@ def compiling(name: str, sig: Any, *, wait: bool = True) -> Iterator[bool]:
         fcntl.lockf(file, way, 1, place)
     except BlockingIOError:
         yield False
-    except (OSError, RuntimeError):  # there is no such folder: processes may do the same work twice
+    except OSError:  # there is no such folder: processes may do the same work twice
         yield True
     else:
         try:
@@ -187,6 +188,8 @@ def compiling(name: str, sig: Any, *, wait: bool = True) -> Iterator[bool]:
 def _lock_file(_process: int) -> int:
     """A file of which each kernel's lock is a byte. It stays open: closing it ends all locks."""
     cache = user_cache_folder()
+    if cache is None:
+        raise FileNotFoundError("this user has no home folder, so no cache folder")
     cache.mkdir(parents=True, exist_ok=True)
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     return os.open(cache / "kernels.lock", flags, 0o600)

@@ -36,15 +36,27 @@ KEEP_DAYS = 60
 SECONDS_A_DAY = 86_400
 
 
-def user_cache_folder() -> Path:
-    """Return the folder of this package in the user's cache folder. It may not exist yet."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "climategs"
+def user_cache_folder() -> Path | None:
+    """Return the folder of this package in the user's cache folder; it may not exist yet. None
+    where the user has no home.
+
+    A relative XDG_CACHE_HOME does not count, as the XDG Base Directory Specification says.
+    """
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        base = cache_home if cache_home.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return base / "climategs"
 
 
 @functools.cache
-def kernel_cache_folder() -> Path:
-    """Return the folder of the compiled kernels: the same one for as long as this process runs."""
-    return user_cache_folder() / "kernels"
+def kernel_cache_folder() -> Path | None:
+    """Return the folder of the compiled kernels: the same one for as long as this process runs.
+    None where the user has no home.
+    """
+    folder = user_cache_folder()
+    return None if folder is None else folder / "kernels"
 
 
 def cache_of_kernel(function: Any, sources_digest: str) -> FunctionCache | None:
@@ -75,14 +87,15 @@ class UserCacheLocator(_CacheLocator):
 
     digest_of_others = ""
 
-    def __init__(self, function: Any, file: str) -> None:
+    def __init__(self, function: Any, file: str, kernels: Path) -> None:
         self._py_file = file  # numba's warnings read it
         self._line = function.__code__.co_firstlineno
         versions = f"{numba.__version__} {self.digest_of_others} {_file_digest(file)}"
         self._digest = hashlib.sha256(versions.encode()).hexdigest()[:24]
+        self._folder = kernels / self._digest
 
     def get_cache_path(self) -> str:
-        return str(kernel_cache_folder() / self._digest)
+        return str(self._folder)
 
     def get_source_stamp(self) -> str:
         return self._digest
@@ -96,10 +109,13 @@ class UserCacheLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> UserCacheLocator | None:
+        kernels = kernel_cache_folder()
+        if kernels is None:
+            return None
         try:
-            locator = cls(function, file)
+            locator = cls(function, file, kernels)
             locator.ensure_cache_path()
-        except (OSError, RuntimeError):  # RuntimeError: this user has no home folder
+        except OSError:
             return None
         return locator
 
