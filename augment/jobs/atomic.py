@@ -88,6 +88,48 @@ def replaced_file(
             flush_folder(path.parent)
 
 
+# The error numbers of a file system that has no hard links.
+_NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Write a file where nothing is, in one step; nothing is replaced, and no link is followed.
+
+    Raises:
+        FileExistsError: there is something at the path, be it a link to nothing.
+        OutputError: the system refuses.
+    """
+    with refusals_of(path):
+        make_folder(path.parent)
+    temporary = temporary_beside(path)
+    try:
+        try:
+            _create_new(temporary, data)
+            os.link(temporary, path, follow_symlinks=False)  # where a rename would replace
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+            _create_new(path, data)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def _create_new(path: Path, data: bytes) -> None:
+    """Write a file that must be new; it goes again where it cannot be written whole."""
+    with path.open("xb") as file:
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+
+
 def read_file(path: Path) -> bytes:
     """Return the bytes of a regular file. Raises OSError: there is none, or it is a folder, a pipe
     (which might be waited for without end) or a device.

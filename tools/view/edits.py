@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import itertools
 import json
 import os
@@ -15,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from augment.errors import OutputError
-from augment.jobs.atomic import make_folder, output_error, refusals_of, temporary_beside
+from augment.jobs.atomic import write_new
 from augment.jobs.render_job import copy_files, portable_recipe
 from recipes.errors import RecipeError, short
 from recipes.fields import found, replaced
@@ -23,9 +22,6 @@ from recipes.job import scaled_recipe
 from recipes.load import dump_recipe, load_recipe, preset_names, read_overrides
 from recipes.schema import Recipe, Sensor
 from tools.view.controls import start_of_model
-
-# The error numbers of a file system that has no hard links.
-_NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 
 
 def as_yaml(value: Any) -> str:
@@ -214,41 +210,3 @@ def create_file(folder: Path, name: str, ending: str, data: bytes) -> Path:
             continue
         return path
     raise AssertionError
-
-
-def write_new(path: Path, data: bytes) -> None:
-    """Write a file where nothing is, in one step; nothing is replaced, and no link is followed.
-
-    Raises:
-        FileExistsError: there is something at the path, be it a link to nothing.
-        OutputError: the system refuses.
-    """
-    with refusals_of(path):
-        make_folder(path.parent)
-    temporary = temporary_beside(path)
-    try:
-        try:
-            _create(temporary, data)
-            os.link(temporary, path, follow_symlinks=False)  # where a rename would replace
-        except OSError as error:
-            if error.errno not in _NO_LINKS:
-                raise
-            _create(path, data)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except FileExistsError:
-        raise
-    except OSError as error:
-        raise output_error(path, error) from error
-
-
-def _create(path: Path, data: bytes) -> None:
-    """Write a file that must be new; it goes again where it cannot be written whole."""
-    with path.open("xb") as file:
-        try:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise

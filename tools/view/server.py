@@ -32,6 +32,7 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import frames_from_path_file
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
+from augment.jobs.atomic import write_new
 from augment.jobs.files import check_frames, encode_image
 from augment.jobs.processes import choose_backend
 from augment.plan import make_plan, plan_view
@@ -44,7 +45,7 @@ from tools.output import compiling_noted, print_note
 from tools.render import kernel_modules
 from tools.view.access import TOKEN_FIELD, Access, is_loopback, start_server
 from tools.view.browser import ARROWS_STAY_WITH_WIDGETS
-from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather, write_new
+from tools.view.edits import Edits, free_path, renamed, save_recipe, without_weather
 from tools.view.outputs import OutputViewer, find_output
 from tools.view.page import FACTORS, FRAME_S, PLAY_S, REST_S, Page, Wish
 from tools.view.pictures import (
