@@ -6,8 +6,7 @@
     depth/<camera>/<frame>.png         where there is no LiDAR: 16 bits, metres x 256, 0 = none
     labels/boxes.parquet               boxes; those that move become actors
 
-Everything is in one world, as calibration.json has it: metres, z up. docs/datasets/recording.md has
-examples.
+Everything is in one world, as calibration.json has it: metres, z up. docs/scenes.md has examples.
 """
 
 from __future__ import annotations
