@@ -214,7 +214,7 @@ def _advice(folder: Path) -> str:
                 f"It is nearly {what}: {', '.join(existing_parts)} {is_are} there, "
                 f"{', '.join(missing)} not"
             )
-    guide = "docs/reconstruction.md, A drive of your own"
+    guide = "docs/datasets/own-drive.md"
     if (model := find_colmap_model(folder)) is not None:
         said.append(
             f"It holds a COLMAP model: `climategs record {model} --images FOLDER --out RECORDING "
@@ -223,7 +223,7 @@ def _advice(folder: Path) -> str:
     elif any(kind in places for kind in _IMAGES):
         said.append(
             f"Its images make a recording with their poses: images/<camera>/000000.jpg and "
-            f"calibration.json (docs/scenes.md); COLMAP finds poses ({guide})"
+            f"calibration.json (docs/datasets/recording.md); COLMAP finds poses ({guide})"
         )
     elif any(kind in places for kind in _VIDEOS):
         said.append(f"Of a video's frames COLMAP and `climategs record` make a recording ({guide})")

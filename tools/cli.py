@@ -196,7 +196,7 @@ class InspectOptions(SceneCommand):
 class RecordOptions(Command):
     """Make a recording of a COLMAP reconstruction, of a phone's video, say.
 
-    docs/reconstruction.md has every command on the way.
+    docs/datasets/own-drive.md has every command on the way.
 
     Args:
         model: The folder of the COLMAP model, or of the project that holds sparse/0.

@@ -46,7 +46,7 @@ from augment.semantics import SemanticClass
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CALIBRATION = "calibration.json"
-_HINT = "docs/scenes.md shows what is in it"
+_HINT = "docs/datasets/recording.md shows what is in it"
 _IF_MISSING = f"a recording needs it, {_HINT}"
 _RIGID = 1e-4  # rotations written with six digits are off by a few millionths
 

@@ -223,13 +223,12 @@ def test_a_box_without_points_is_said(copy):
 
 
 def test_the_example_in_the_docs_is_a_recording(tmp_path, monkeypatch):
-    text = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text()
-    section = text.split("## `recording:PATH`")[1].split("\n## ")[0]
+    text = (Path(__file__).parents[2] / "docs" / "datasets" / "recording.md").read_text()
     calibration, program = (
-        section.split(f"```{kind}\n")[1].split("```")[0] for kind in ("json", "python")
+        text.split(f"```{kind}\n")[1].split("```")[0] for kind in ("json", "python")
     )
     monkeypatch.chdir(tmp_path)
-    exec(compile(program, "docs/scenes.md", "exec"), {})
+    exec(compile(program, "docs/datasets/recording.md", "exec"), {})
     scene = open_scene("my-drive?image_scale=1&sky_size=16&voxel_m=0.2")
     assert scene.problems == () and scene.name == "my-drive" and len(scene.boxes(0)) == 1
     assert len(scene.background) > 1000 and scene.ground_z_m == pytest.approx(0, abs=1e-6)
