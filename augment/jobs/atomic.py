@@ -431,52 +431,56 @@ def replaced_folder(target: Path, own_names: Collection[str]) -> Iterator[Path]:
     target = target.resolve()  # a link to a folder stays a link
     with refusals_of(target):
         make_folder(target.parent)
-        new, descriptor = _locked_folder(target)
+        new_folder, descriptor = _locked_folder(target)
         try:
-            yield new
-            for path in [*new.rglob("*"), new]:
+            yield new_folder
+            for path in [*new_folder.rglob("*"), new_folder]:
                 flush_folder(path)
-            _put_in_place(new, target)
+            _put_in_place(new_folder, target)
             flush_folder(target.parent)
             for name in temporary_names(os.listdir(target.parent), target.name):
-                old = target.with_name(name)
+                old_folder = target.with_name(name)
                 _clear_abandoned(
-                    old, os.O_DIRECTORY, lambda old=old: _clear(old, target, own_names)
+                    old_folder,
+                    os.O_DIRECTORY,
+                    lambda old_folder=old_folder: _clear(old_folder, target, own_names),
                 )
         finally:
-            _clear(new, target, own_names)
+            _clear(new_folder, target, own_names)
             os.close(descriptor)
 
 
 def _locked_folder(target: Path) -> tuple[Path, int]:
     """Make a new folder beside the target; return it and the descriptor that holds its lock."""
     while True:
-        new = temporary_beside(target)
-        new.mkdir()
+        new_folder = temporary_beside(target)
+        new_folder.mkdir()
         with contextlib.suppress(FileNotFoundError):  # another process took it for left behind
-            descriptor = os.open(new, os.O_RDONLY)
-            if _lock_new(new, descriptor):
-                return new, descriptor
+            descriptor = os.open(new_folder, os.O_RDONLY)
+            if _lock_new(new_folder, descriptor):
+                return new_folder, descriptor
             os.close(descriptor)
 
 
-def _put_in_place(new: Path, target: Path) -> None:
+def _put_in_place(new_folder: Path, target: Path) -> None:
     """Give the new folder the target's name, and the old folder the new one's."""
     if not target.exists() or not any(target.iterdir()):
-        os.rename(new, target)  # also over an empty folder
+        os.rename(new_folder, target)  # also over an empty folder
         return
-    if _exchange(new, target):
+    if _exchange(new_folder, target):
         return
     # The file system cannot exchange names: for an instant the old folder has only a temporary
     # name.
-    old = new.with_name(new.name.removesuffix(TEMPORARY_SUFFIX) + ".old" + TEMPORARY_SUFFIX)
-    os.rename(target, old)
+    old_folder = new_folder.with_name(
+        new_folder.name.removesuffix(TEMPORARY_SUFFIX) + ".old" + TEMPORARY_SUFFIX
+    )
+    os.rename(target, old_folder)
     try:
-        os.rename(new, target)
+        os.rename(new_folder, target)
     except BaseException:
-        os.rename(old, target)
+        os.rename(old_folder, target)
         raise
-    os.rename(old, new)
+    os.rename(old_folder, new_folder)
 
 
 def _exchange(path: Path, other_path: Path) -> bool:
@@ -493,7 +497,7 @@ def _exchange(path: Path, other_path: Path) -> bool:
     raise OSError(number, os.strerror(number), str(other_path))
 
 
-def _clear(old: Path, target: Path, own_names: Collection[str]) -> None:
+def _clear(old_folder: Path, target: Path, own_names: Collection[str]) -> None:
     """Delete a temporary folder.
 
     Foreign entries move to `target`. Where they cannot move, they and the folder stay, since this
@@ -502,15 +506,15 @@ def _clear(old: Path, target: Path, own_names: Collection[str]) -> None:
     with contextlib.suppress(
         FileNotFoundError
     ):  # another process that saves there may clear it too
-        for entry in list(old.iterdir()):
+        for entry in list(old_folder.iterdir()):
             if entry.name in own_names and entry.is_dir():
                 shutil.rmtree(entry)
             elif entry.name in own_names:
                 entry.unlink()
             elif target.is_dir() and not (target / entry.name).exists():
                 os.rename(entry, target / entry.name)
-        if not any(old.iterdir()):
-            old.rmdir()
+        if not any(old_folder.iterdir()):
+            old_folder.rmdir()
 
 
 # ---- Links and copies of files -------------------------------------------------------------------

@@ -242,13 +242,13 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
 # reach another machine; if a process there loses a temporary file, its store writes the file again.
 
 
-def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
+def clear_leftovers(store: Store, scratch: Path | None, published_blocks: Iterable[Block]) -> None:
     """Delete what killed processes have left in the output.
 
     Args:
-        published: Blocks that need no further work.
+        published_blocks: Blocks that need no further work.
     """
-    for block in published:
+    for block in published_blocks:
         if staging_folder(store, scratch, block).is_dir():
             claim = try_claim(store, block.claim)
             if claim is not None:
@@ -450,10 +450,10 @@ class BlockWorker:
 
     def _index(self, task: IndexTask) -> SceneRecord:
         """Open a scene and return its record."""
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         scene = self._open_scene(task.uri, task.name)
         digest = self._setup.digest_of(task.uri) if self._setup.digest_of is not None else None
-        return SceneRecord.of(scene, task.uri, time.perf_counter() - started, digest)
+        return SceneRecord.of(scene, task.uri, time.perf_counter() - start_s, digest)
 
     def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
         """Return the recipe with the settings that its quality chooses in the scene."""

@@ -108,13 +108,13 @@ class SceneRecord:
         return _RECORD.dump_json(self)
 
     @staticmethod
-    def from_json(data: bytes, where: str) -> SceneRecord:
+    def from_json(data: bytes, source_name: str) -> SceneRecord:
         """Return the record that `to_json` has written.
 
         Args:
-            where: Name of the file, for errors.
+            source_name: Name of the file, for errors.
         """
-        with reading_back(where, "Delete it; the scene is opened again"):
+        with reading_back(source_name, "Delete it; the scene is opened again"):
             return _RECORD.validate_json(data, strict=True)
 
 
@@ -428,18 +428,18 @@ def stored_plans(store: Store) -> list[StoredPlan]:
 
 def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> None:
     """Raise ClimateGSError where two scenes would share a folder."""
-    for other in records.values():
-        if folder_name(other.name).casefold() == folder_name(record.name).casefold():
+    for other_record in records.values():
+        if folder_name(other_record.name).casefold() == folder_name(record.name).casefold():
             raise ClimateGSError(
-                f"the scenes {other.uri} and {record.uri} are both called {record.name!r}, so they "
-                f"would share a folder; give one of them a name in the job: "
+                f"the scenes {other_record.uri} and {record.uri} are both called {record.name!r}, "
+                f"so they would share a folder; give one of them a name in the job: "
                 f"{{uri: {record.uri!r}, name: ...}}"
             )
 
 
-def _from_json(data: bytes, where: str) -> StoredPlan:
+def _from_json(data: bytes, source_name: str) -> StoredPlan:
     """Return the plan in a file's bytes."""
-    with reading_back(where, "Start the job again, which writes it anew"):
+    with reading_back(source_name, "Start the job again, which writes it anew"):
         return _STORED_PLAN.validate_json(data, strict=True)
 
 
@@ -505,13 +505,13 @@ def read_status(store: Store) -> list[JobStatus]:
     if not plans:
         return []
     parts = list_parts(store)
-    staged = _count_staged_images(store)
-    claims = _claims(store)
-    return [_status(plan, parts, staged, claims) for plan in plans]
+    staged_images = _count_staged_images(store)
+    claim_names = _claims(store)
+    return [_status(plan, parts, staged_images, claim_names) for plan in plans]
 
 
 def _status(
-    plan: StoredPlan, parts: dict[str, Part], staged: dict[str, int], claims: set[str]
+    plan: StoredPlan, parts: dict[str, Part], staged_images: dict[str, int], claim_names: set[str]
 ) -> JobStatus:
     """Return the status of one job."""
     total = Progress()
@@ -528,9 +528,9 @@ def _status(
             if part is not None:
                 group.published += block.images
                 group.in_failed_blocks += block.images if part.has_failures else 0
-        num_claimed += block.claim in claims
+        num_claimed += block.claim in claim_names
         if part is None:
-            num_staged += min(staged.get(block.claim, 0), block.images)
+            num_staged += min(staged_images.get(block.claim, 0), block.images)
         else:
             num_published += 1
             times.append((part.modified_s, block.images))

@@ -116,24 +116,24 @@ class BoxTable:
         that was not measured.
         """
         order = sorted(items)
-        listed = [items[item] for item in order]
-        counts = [len(numbers.track_ids) for numbers in listed]
+        image_numbers = [items[item] for item in order]
+        counts = [len(numbers.track_ids) for numbers in image_numbers]
         cameras = [camera for (_, camera), n in zip(order, counts, strict=True) for _ in range(n)]
         columns: dict[str, Any] = {
             "frame": np.repeat(np.array([frame for frame, _ in order], np.int64), counts),
             "camera": pa.array(cameras, pa.string()),
             "track_id": pa.array(
-                [name for image in listed for name in image.track_ids], pa.string()
+                [name for image in image_numbers for name in image.track_ids], pa.string()
             ),
             "box": _joined([np.arange(n) for n in counts], np.int64),
         }
         for name, kind in self.columns.items():
-            joined = _joined([numbers[name] for numbers in listed], kind)
+            values = _joined([numbers[name] for numbers in image_numbers], kind)
             if kind is object:
-                columns[name] = pa.array(joined, pa.string())
+                columns[name] = pa.array(values, pa.string())
             else:
                 is_count = kind is np.int64
-                columns[name] = pa.array(joined, mask=joined == NOT_COUNTED) if is_count else joined
+                columns[name] = pa.array(values, mask=values == NOT_COUNTED) if is_count else values
         images = [[*item, count] for item, count in zip(order, counts, strict=True)]
         return parquet_bytes(pa.table(columns), {"kind": self.kind, "images": images})
 
@@ -175,15 +175,15 @@ def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate([np.zeros(0, dtype), *arrays])
 
 
-def share_of_pixels(marked: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+def share_of_pixels(column_name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
     """Return a function that divides a column by the box's `pixels`, float64 [B].
 
     The result is 0 where the column was not counted, and NaN for a box without pixels.
 
     Args:
-        marked: Column with a number of pixels.
+        column_name: Column with a number of pixels.
     """
-    return lambda columns: fraction_of(columns[marked], columns["pixels"])
+    return lambda columns: fraction_of(columns[column_name], columns["pixels"])
 
 
 def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -94,7 +94,7 @@ def measure_boxes(
     camera: Camera,
     view: View,
     *,
-    shown: BoxVisibility | None = None,
+    box_visibility: BoxVisibility | None = None,
 ) -> dict[str, BoxNumbers]:
     """Return the measured numbers of a frame's boxes in one of its images, by table.
 
@@ -104,20 +104,20 @@ def measure_boxes(
         world_origin_m: Origin that was subtracted from the dataset's world, metres.
         camera: Camera at the written resolution.
         view: The image, with the data that labels are measured from.
-        shown: Result of `show_boxes` for the image, with masks by depth if it has owners; computed
-            here if None.
+        box_visibility: Result of `show_boxes` for the image, with masks by depth if it has owners;
+            computed here if None.
     """
     world_boxes = PlacedBoxes.of(boxes, world_origin_m)
-    measured: dict[str, BoxNumbers] = {}
+    numbers_of_table: dict[str, BoxNumbers] = {}
     if view.surface is not None:
         numbers = instances.of(boxes.track_ids)
-        shown = shown or show_boxes(boxes, instances, world_boxes, camera, view)
-        columns = {"instance": numbers.astype(np.int64), **shown.columns()}
-        measured[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
-        if shown.occlusion.owners is not None:
+        box_visibility = box_visibility or show_boxes(boxes, instances, world_boxes, camera, view)
+        columns = {"instance": numbers.astype(np.int64), **box_visibility.columns()}
+        numbers_of_table[BOXES_2D.name] = BOXES_2D.numbers(boxes.track_ids, **columns)
+        if box_visibility.occlusion.owners is not None:
             box_numbers = np.arange(1, len(boxes) + 1).astype(np.uint16)
-            owners = shown.paint_estimates(shown.occlusion.owners, box_numbers)
-            measured[MASKS.name] = MASKS.numbers(
+            owners = box_visibility.paint_estimates(box_visibility.occlusion.owners, box_numbers)
+            numbers_of_table[MASKS.name] = MASKS.numbers(
                 boxes.track_ids, **encode_masks(owners, box_numbers)
             )
     for effect in effects.EFFECTS:
@@ -125,8 +125,8 @@ def measure_boxes(
         effect_view = view.effects.get(effect.name)
         if table is not None and effect_view is not None:
             columns = effect.measure(world_boxes, camera, effect_view)
-            measured[table.name] = table.numbers(boxes.track_ids, **columns)
-    return measured
+            numbers_of_table[table.name] = table.numbers(boxes.track_ids, **columns)
+    return numbers_of_table
 
 
 def _grow_boxes(world_boxes: PlacedBoxes, view: View) -> PlacedBoxes:
@@ -186,15 +186,15 @@ class BoxVisibility:
         """
         if not self.estimates:
             return image
-        painted = image.copy()
+        painted_image = image.copy()
         can_show = image == 0
         if classes is not None:
             can_show &= classes != SemanticClass.WATER
         for box, estimate in self.estimates.items():
             is_free = can_show[estimate.rows, estimate.columns]
-            is_free &= painted[estimate.rows, estimate.columns] == 0
-            painted[estimate.rows[is_free], estimate.columns[is_free]] = numbers[box]
-        return painted
+            is_free &= painted_image[estimate.rows, estimate.columns] == 0
+            painted_image[estimate.rows[is_free], estimate.columns[is_free]] = numbers[box]
+        return painted_image
 
 
 def show_boxes(
@@ -362,20 +362,20 @@ def select_frames(
             f"{_join_names(names)}"
         )
     requested_cameras = set(names if cameras is None else cameras)
-    selected = [
+    selection = [
         (
             frame_of_number[number],
             tuple(sorted(requested_cameras & frame_of_number[number].cameras.keys())),
         )
         for number in sorted(frame_of_number if frames is None else set(frames))
     ]
-    selected = [(frame, names) for frame, names in selected if names]
-    if not selected:
+    selection = [(frame, names) for frame, names in selection if names]
+    if not selection:
         raise SceneError(
             f"scene {index.name!r} ({index.source}): the selection holds no image; the scene has "
             f"{len(frame_of_number)} frames and the cameras {_join_names(names) or 'none'}"
         )
-    return selected
+    return selection
 
 
 def has_lidar(scene: Scene, frames: Iterable[int]) -> bool:
@@ -916,7 +916,7 @@ def label_view(
         view: View that `check_view` has passed.
         evidence: Reads further evidence of the frame's objects.
     """
-    measured: dict[str, BoxNumbers] = {}
+    numbers_of_table: dict[str, BoxNumbers] = {}
     wants_masks = bool(recipe.output.label_formats)
     output = recipe.output
     surface = view.surface
@@ -936,16 +936,16 @@ def label_view(
             on_photo=on_photo,
         )
     if output.labels:
-        measured = measure_boxes(
-            boxes, instances, world_origin_m, camera, view, shown=box_visibility
+        numbers_of_table = measure_boxes(
+            boxes, instances, world_origin_m, camera, view, box_visibility=box_visibility
         )
     if view.instance is None or surface is None or box_visibility is None:
-        return view, measured
+        return view, numbers_of_table
     assert surface.shown_depth_m is not None and surface.shown_classes is not None
     box_numbers = instances.of(boxes.track_ids)
     if not surface.is_bare:
         world_boxes = _grow_boxes(world_boxes, view)
-    painted = with_boxes(
+    instance_image = with_boxes(
         view.instance,
         world_boxes,
         box_numbers,
@@ -954,10 +954,14 @@ def label_view(
         surface.shown_classes,
         len(instances.actors),
     )
-    painted = box_visibility.paint_estimates(painted, box_numbers, surface.shown_classes)
+    instance_image = box_visibility.paint_estimates(
+        instance_image, box_numbers, surface.shown_classes
+    )
     if surface.own_car is not None:
-        painted = np.where(surface.own_car, np.uint16(0), painted)
+        instance_image = np.where(surface.own_car, np.uint16(0), instance_image)
     if wants_masks:
-        measured[MASKS.name] = MASKS.numbers(boxes.track_ids, **encode_masks(painted, box_numbers))
+        numbers_of_table[MASKS.name] = MASKS.numbers(
+            boxes.track_ids, **encode_masks(instance_image, box_numbers)
+        )
     untyped_view: Any = view
-    return dataclasses.replace(untyped_view, instance=painted), measured
+    return dataclasses.replace(untyped_view, instance=instance_image), numbers_of_table

@@ -214,8 +214,8 @@ class BlockWork(Work):
         names: Name that the job gives each scene, by scene.
         fail: Records all images of a block as failed.
         on_image: Called with the number of images done and the number of failed ones.
-        damaged: Keys of published blocks that have lost files.
         scene_of_slot: Name of the scene that each slot has open; kept up to date here.
+        damaged_keys: Keys of published blocks that have lost files.
     """
 
     def __init__(
@@ -225,10 +225,10 @@ class BlockWork(Work):
         scene_of_slot: dict[int, str],
         fail: FailBlock,
         on_image: Callable[[int, int], None] = lambda done, failed: None,
-        damaged: Collection[str] = (),
+        damaged_keys: Collection[str] = (),
     ) -> None:
         self.tally = Tally()
-        self._damaged = frozenset(damaged)
+        self._damaged_block_keys = frozenset(damaged_keys)
         self._queue = BlockQueue(blocks)
         self._names = names
         self._fail = fail
@@ -259,14 +259,14 @@ class BlockWork(Work):
             return None
         self._scene_of_slot[slot] = block.scene
         self._busy_slots.add(slot)
-        is_damaged = block.key in self._damaged
+        is_damaged = block.key in self._damaged_block_keys
         return BlockTask(block, self._names.get(block.scene), is_damaged=is_damaged)
 
     def later_s(self) -> float | None:
         return max(0.0, self._postponed[0][0] - time.monotonic()) if self._postponed else None
 
-    def retry(self, slot: int, task: BlockTask, why: str) -> list[BlockTask]:
-        _log.warning("%s is tried once more, alone: %s", task.block.key, why)
+    def retry(self, slot: int, task: BlockTask, reason: str) -> list[BlockTask]:
+        _log.warning("%s is tried once more, alone: %s", task.block.key, reason)
         self._free_slot(slot)
         return [replace(task, is_trial=True)]
 
@@ -481,20 +481,20 @@ def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
     picture_times_s = []
     num_bytes = 0
     with tempfile.TemporaryDirectory(prefix="climategs-estimate-") as folder:
-        for out in (Path(folder) / "0", Path(folder) / "1"):
+        for output_dir in (Path(folder) / "0", Path(folder) / "1"):
             job = RenderJob(
                 block.uri,
                 [block.recipe],
-                out,
+                output_dir,
                 frames=[frame_numbers[len(frame_numbers) // 2]],
                 cameras=[camera],
                 backend=plan.backend,
                 shared_dir=Path(folder) / "beds",
             )
-            started = time.perf_counter()
+            start_s = time.perf_counter()
             run_job(job, scene_loader=loader, progress=False)
-            picture_times_s.append(time.perf_counter() - started)
-            files = [p for p in out.rglob("*") if p.is_file()]
+            picture_times_s.append(time.perf_counter() - start_s)
+            files = [p for p in output_dir.rglob("*") if p.is_file()]
             num_bytes = sum(p.stat().st_size for p in files if STATE_FOLDER not in p.parts)
     return Sample(
         picture_times_s[1] / megapixels,
@@ -742,17 +742,17 @@ class _Generation:
         published_blocks = [block for block in blocks if block.key in parts]
         damaged_blocks = [] if table is None else self._find_damaged_blocks(table, published_blocks)
         self._restore_recipes(published_blocks)
-        pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
-        pending += [block for block in damaged_blocks if not parts[block.key].has_failures]
+        pending_blocks = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        pending_blocks += [block for block in damaged_blocks if not parts[block.key].has_failures]
         self._damaged_keys = {block.key for block in damaged_blocks}
-        new_blocks = [block for block in pending if block.key not in parts]
+        new_blocks = [block for block in pending_blocks if block.key not in parts]
         if new_blocks:
             _check_not_mixed(self._store, self._plan, new_blocks)
         store_plan(self._store, self._plan)
-        pending_keys = {block.key for block in pending}
+        pending_keys = {block.key for block in pending_blocks}
         published_blocks = [block for block in blocks if block.key not in pending_keys]
         clear_leftovers(self._store, self._job.setup.scratch, published_blocks)
-        return pending
+        return pending_blocks
 
     def _accept_changes(self, changes: Iterable[SceneChange]) -> None:
         """Refuse to mix images of changed scenes with their earlier images.
@@ -843,12 +843,12 @@ class _Generation:
                 ) from None
         self._timings[WORKERS] = (time.perf_counter() - start_s) * workers.slots
 
-    def _show_progress(self, done: int, failed: int) -> None:
+    def _show_progress(self, num_done: int, num_failed: int) -> None:
         """Update the progress bar and call `on_image`."""
-        if failed:
-            self._bar.set_postfix(failed=failed, refresh=False)
-        self._bar.update(done - self._bar.n)
-        self._on_image(done, failed)
+        if num_failed:
+            self._bar.set_postfix(failed=num_failed, refresh=False)
+        self._bar.update(num_done - self._bar.n)
+        self._on_image(num_done, num_failed)
 
     def _publish_failure(self, block: Block, message: str) -> None:
         """Publish a block whose images have all failed, unless another process has finished it."""

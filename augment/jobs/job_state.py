@@ -282,8 +282,10 @@ class VariantState:
         """Record the outcome of an image durably; may be called from several threads."""
         row = self._row(outcome, frame)
         tables = box_tables()
-        measured = {k: tables[k].to_json(numbers) for k, numbers in outcome.box_weather.items()}
-        self.progress_log.append({**row, **measured})
+        json_of_table = {
+            k: tables[k].to_json(numbers) for k, numbers in outcome.box_weather.items()
+        }
+        self.progress_log.append({**row, **json_of_table})
         item = frame.index, outcome.camera
         for kind, numbers in outcome.box_weather.items():
             self.box_weather[kind][item] = numbers

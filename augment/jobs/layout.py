@@ -187,11 +187,11 @@ class FileListing:
 
 
 @contextlib.contextmanager
-def reading_back(where: str, advice: str) -> Iterator[None]:
+def reading_back(source_name: str, advice: str) -> Iterator[None]:
     """Context manager that turns errors of reading the output's own JSON into an OutputError.
 
     Args:
-        where: Name of the file.
+        source_name: Name of the file.
         advice: What to do, a sentence without its full stop.
     """
     try:
@@ -208,7 +208,7 @@ def reading_back(where: str, advice: str) -> Iterator[None]:
         if isinstance(e, ValidationError):  # names the first of all differences
             first = e.errors(include_url=False)[0]
             problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise OutputError(f"{where} is damaged: {problem}. {advice}") from e
+        raise OutputError(f"{source_name} is damaged: {problem}. {advice}") from e
 
 
 def relative_parts(path: str) -> tuple[str, ...] | None:

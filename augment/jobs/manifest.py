@@ -178,108 +178,112 @@ def read_manifest(out_dir: Path) -> pa.Table:
     return parse_manifest(data, str(path))
 
 
-def parse_manifest(data: bytes, where: str, without: Collection[str] = ()) -> pa.Table:
+def parse_manifest(data: bytes, source_name: str, without: Collection[str] = ()) -> pa.Table:
     """Return the table in a manifest's bytes, with the columns that an older version lacks.
 
     Args:
         data: Bytes of the Parquet file.
-        where: Name of the file, for errors.
+        source_name: Name of the file, for errors.
         without: Columns to leave out, which saves memory.
     """
-    table = _with_later_columns(read_table(data, where, without=without), without)
-    _check_types(table, where, without)
+    table = _with_later_columns(read_table(data, source_name, without=without), without)
+    _check_types(table, source_name, without)
     for name in weather_columns(table):
         if table[name].null_count:  # some programs write NaN as null
             column = pc.fill_null(table[name], math.nan)
             table = table.set_column(table.column_names.index(name), name, column)
-    _check_values(table, where)
+    _check_values(table, source_name)
     return table
 
 
-def check_rows(rows: Sequence[Row], key: tuple[str, str], where: str) -> None:
+def check_rows(rows: Sequence[Row], key: tuple[str, str], source_name: str) -> None:
     """Raise OutputError, or an error of Python or Arrow, unless a job has written these rows.
 
     Args:
         key: Scene and variant of all rows.
-        where: File that holds the rows, for errors.
+        source_name: File that holds the rows, for errors.
     """
     if wrong_rows := [row for row in rows if (row["scene"], row["variant"]) != key]:
         raise ValueError(f"a line is of {wrong_rows[0]['variant']!r:.80}, not of {key[1]!r}")
-    _check_values(rows_to_table(rows), where)
+    _check_values(rows_to_table(rows), source_name)
 
 
-def _check_types(table: pa.Table, where: str, without: Collection[str]) -> None:
+def _check_types(table: pa.Table, source_name: str, without: Collection[str]) -> None:
     """Raise OutputError where a column is missing or has another type."""
     column_types = {
         n: kind for n, kind in _column_types(weather_columns(table)).items() if n not in without
     }
     advice = "It was written by another program or version: write to another output folder"
-    missing = sorted(column_types.keys() - set(table.column_names))
-    if missing:
-        raise OutputError(f"{where} lacks the columns {missing}. {advice}")
+    missing_columns = sorted(column_types.keys() - set(table.column_names))
+    if missing_columns:
+        raise OutputError(f"{source_name} lacks the columns {missing_columns}. {advice}")
     for field in table.schema:
         if field.type != column_types[field.name]:
             raise OutputError(
-                f"{where}: column {field.name!r} must be of type {column_types[field.name]}; got "
-                f"{field.type}. {advice}"
+                f"{source_name}: column {field.name!r} must be of type "
+                f"{column_types[field.name]}; got {field.type}. {advice}"
             )
 
 
-def _check_values(table: pa.Table, where: str) -> None:
+def _check_values(table: pa.Table, source_name: str) -> None:
     """Raise OutputError at the first value that no job writes."""
     later_defaults = later_columns()
     path_columns = {f"{kind}_path" for kind in path_kinds()}
     for name, column in zip(table.column_names, table.columns, strict=True):
         is_path = name in path_columns
         if column.null_count and not is_path and later_defaults.get(name, "") is not None:
-            _refuse(table, name, pc.is_null(column), "a value", where)
+            _refuse(table, name, pc.is_null(column), "a value", source_name)
         if column.null_count == table.num_rows:
             continue
         if is_path:
             is_unsafe = pc.match_substring_regex(column, _UNSAFE_PATH)
             _refuse(
-                table, name, is_unsafe, "a path inside the output folder, relative to it", where
+                table,
+                name,
+                is_unsafe,
+                "a path inside the output folder, relative to it",
+                source_name,
             )
         elif name in ("width", "height"):
             is_wrong = pc.or_(pc.less(column, 1), pc.greater(column, MAX_SIDE_PX))
-            _refuse(table, name, is_wrong, f"1 to {MAX_SIDE_PX} (pixels)", where)
+            _refuse(table, name, is_wrong, f"1 to {MAX_SIDE_PX} (pixels)", source_name)
         elif name == "render_scale":
             is_scale = pc.and_(pc.greater(column, 0), pc.is_finite(column))
-            _refuse(table, name, pc.invert(is_scale), "a number above 0, or null", where)
+            _refuse(table, name, pc.invert(is_scale), "a number above 0, or null", source_name)
         elif name in share_columns().values():
             is_share = pc.and_(pc.greater_equal(column, 0), pc.less_equal(column, 1))
-            _refuse(table, name, pc.invert(is_share), "0 to 1, or null", where)
+            _refuse(table, name, pc.invert(is_share), "0 to 1, or null", source_name)
         elif pa.types.is_floating(column.type):
-            _refuse(table, name, pc.is_inf(column), "a finite number, or NaN", where)
+            _refuse(table, name, pc.is_inf(column), "a finite number, or NaN", source_name)
         elif name == "status":
             is_status = pc.is_in(column, pa.array([OK, FAILED]))
-            _refuse(table, name, pc.invert(is_status), f"{OK!r} or {FAILED!r}", where)
+            _refuse(table, name, pc.invert(is_status), f"{OK!r} or {FAILED!r}", source_name)
     if table["image_path"].null_count:
         lacks_path = pc.and_(pc.equal(table["status"], OK), pc.is_null(table["image_path"]))
-        _refuse(table, "image_path", lacks_path, f"a path where status is {OK!r}", where)
+        _refuse(table, "image_path", lacks_path, f"a path where status is {OK!r}", source_name)
     if table.num_rows > table.group_by(list(KEY), use_threads=False).aggregate([]).num_rows:
-        raise _repeated_row_error(table, where)
+        raise _repeated_row_error(table, source_name)
 
 
-def _repeated_row_error(table: pa.Table, where: str) -> OutputError:
+def _repeated_row_error(table: pa.Table, source_name: str) -> OutputError:
     """Return the error of an image that has several rows."""
     keys = list(zip(*(table[name].to_pylist() for name in KEY), strict=True))
     key, count = Counter(keys).most_common(1)[0]
     image = ", ".join(f"{name} {part!r:.80}" for name, part in zip(KEY, key, strict=True))
     return OutputError(
-        f"{where}: an image must have one row; {count} are of {image}, the first of them row "
+        f"{source_name}: an image must have one row; {count} are of {image}, the first of them row "
         f"{keys.index(key)} (counted from 0). Leave one of them"
     )
 
 
 def _refuse(
-    table: pa.Table, name: str, is_wrong: pa.ChunkedArray, expected: str, where: str
+    table: pa.Table, name: str, is_wrong: pa.ChunkedArray, expected: str, source_name: str
 ) -> None:
     """Raise OutputError if `is_wrong` is true of a row; names the first such row."""
     row = pc.index(is_wrong, True).as_py()
     if row >= 0:
         raise OutputError(
-            f"{where}: column {name!r}, row {row} (counted from 0) must be {expected}; got "
+            f"{source_name}: column {name!r}, row {row} (counted from 0) must be {expected}; got "
             f"{table[name][row].as_py()!r:.200}. No job writes that: take the file from a copy, or "
             f"write to another output folder"
         )
@@ -302,13 +306,13 @@ def rows_without_files(table: pa.Table, listing: FileListing) -> set[tuple[str, 
 
 
 def merge_rows(
-    old: pa.Table | None, rows: Collection[Row], replaced: set[tuple[str, str]]
+    old_table: pa.Table | None, rows: Collection[Row], replaced_variants: set[tuple[str, str]]
 ) -> pa.Table:
-    """Return `old` with new rows for the (scene, variant) pairs in `replaced`."""
+    """Return `old_table` with new rows for the (scene, variant) pairs in `replaced_variants`."""
     new_rows = rows_to_table(rows)
-    if old is None:
+    if old_table is None:
         return new_rows
-    remaining_rows = old.filter(pa.array(~_in_variants(old, replaced)))
+    remaining_rows = old_table.filter(pa.array(~_in_variants(old_table, replaced_variants)))
     return _sort_rows(concat_rows([remaining_rows, new_rows]))
 
 
@@ -458,8 +462,8 @@ def list_parts(store: Store, scene_folder: str | None = None) -> dict[str, Part]
     """
     parts: dict[str, Part] = {}
     for part in _all_parts(store, scene_folder):
-        other = parts.get(part.key)
-        parts[part.key] = part if other is None else max(other, part, key=_part_rank)
+        other_part = parts.get(part.key)
+        parts[part.key] = part if other_part is None else max(other_part, part, key=_part_rank)
     return parts
 
 
@@ -624,13 +628,13 @@ class Identity:
         """Return the identity that a row of the manifest states."""
         return Identity(**{name: row[name] for name in Identity.__dataclass_fields__})
 
-    def is_of_other_content(self, other: Identity) -> bool:
+    def is_of_other_content(self, other_identity: Identity) -> bool:
         """Return True if the scene's files are known to differ."""
-        return None not in (digests := {self.source_digest, other.source_digest}) and (
+        return None not in (digests := {self.source_digest, other_identity.source_digest}) and (
             len(digests) > 1
         )
 
-    def check(self, stored: Identity, where: str) -> None:
+    def check(self, stored: Identity, source_name: str) -> None:
         """Raise OutputError where images of another identity are in the folder."""
         names = {
             "source": "scene",
@@ -654,9 +658,9 @@ class Identity:
             ]
         if different:
             raise OutputError(
-                f"{where} already holds images of another kind: {'; '.join(different)}. Give the "
-                f"recipe another name, choose another output folder, or ask for the variant to be "
-                f"overwritten (render --overwrite, overwrite=True)"
+                f"{source_name} already holds images of another kind: {'; '.join(different)}. Give "
+                f"the recipe another name, choose another output folder, or ask for the variant to "
+                f"be overwritten (render --overwrite, overwrite=True)"
             )
 
 

@@ -284,10 +284,10 @@ def make_real_folder(folder: str) -> bool:
     return False
 
 
-def find_foreign_names(folder: str, expected: set[str]) -> list[str]:
+def find_foreign_names(folder: str, expected_names: set[str]) -> list[str]:
     """Return foreign names in a folder of the copy; leftovers of a killed run are deleted."""
     with refusals_of(Path(folder)):
-        unexpected_names = set(os.listdir(folder)) - expected
+        unexpected_names = set(os.listdir(folder)) - expected_names
         temporary_leftovers = set(temporary_names(unexpected_names))
         for name in temporary_leftovers:
             os.unlink(os.path.join(folder, name))

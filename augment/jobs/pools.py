@@ -135,7 +135,7 @@ class Work:
         """
         return None
 
-    def retry(self, slot: int, task: Any, why: str) -> Sequence[Any]:
+    def retry(self, slot: int, task: Any, reason: str) -> Sequence[Any]:
         """Return the tasks to try after the task's worker died or memory ran out.
 
         Each runs while no other worker is busy.
@@ -592,12 +592,12 @@ class RayPool:
                 f"version; if memory ran out, use fewer workers"
             ) from error
 
-    def _finish(self, busy: list[_ActorHandle]) -> None:
+    def _finish(self, busy_workers: list[_ActorHandle]) -> None:
         """Let actors finish the images at hand."""
-        for worker in busy:
+        for worker in busy_workers:
             worker.actor.stop.remote()
         deadline = time.monotonic() + STOP_S
-        for worker in busy:
+        for worker in busy_workers:
             with contextlib.suppress(self._ray.exceptions.RayError, StopIteration):
                 while (left_s := deadline - time.monotonic()) > 0:
                     if self._ray.wait([worker.stream], timeout=left_s)[0]:

@@ -436,9 +436,9 @@ def resolve_quality(
             ms = bench.ms(settings)
             reference_ms = bench.ms(reference)
         worst_flip = bench.flip(settings)
-    resolved = resolved_recipe(recipe, settings)
+    chosen_recipe = resolved_recipe(recipe, settings)
     if cameras is None and renderer is None:  # keeps the data that images of these settings share
-        share_effects(Sharing(trial_scene, [resolved], backend=backend))
+        share_effects(Sharing(trial_scene, [chosen_recipe], backend=backend))
         memo_of(scene).update(memo_of(trial_scene).shared())
     is_met = ms is None or ms <= (quality.budget_ms or 0)
     if not is_met:
@@ -452,7 +452,9 @@ def resolve_quality(
         )
     view_names = tuple((v.frame, v.name) for v in views)
     seconds = perf_counter() - start_s
-    return Resolved(resolved, settings, is_met, worst_flip, view_names, ms, reference_ms, seconds)
+    return Resolved(
+        chosen_recipe, settings, is_met, worst_flip, view_names, ms, reference_ms, seconds
+    )
 
 
 def _within_budget(bench: Bench, values_of_knob: Ladders, budget_ms: float) -> Settings:
@@ -616,10 +618,10 @@ def resolve_quality_for(
     with hold(store, claim_name, MAX_CHOOSING_S, activity) as claim:
         if not anew and (stored_recipe := recorded(store, question)):
             return stored_recipe
-        chosen = choose()
+        result = choose()
         claim.check()
-        store.write(question.path, _to_json(question, chosen))
-        return chosen.recipe
+        store.write(question.path, _to_json(question, result))
+        return result.recipe
 
 
 def recorded(store: Store, question: Question) -> Recipe | None:
@@ -646,9 +648,9 @@ def recorded(store: Store, question: Question) -> Recipe | None:
         return resolved_recipe(question.recipe, settings)
 
 
-def _to_json(question: Question, chosen: Resolved) -> bytes:
+def _to_json(question: Question, result: Resolved) -> bytes:
     """Return the file of a choice."""
-    values = vars(chosen)
+    values = vars(result)
     document = {
         "format": _FORMAT,
         "asked": question.facts(),

@@ -327,9 +327,9 @@ class _ImageWork(Work):
     def take(self, slot: int) -> tuple[Chunk, ...] | None:
         return self._tasks.popleft() if self._tasks else None
 
-    def retry(self, slot: int, task: tuple[Chunk, ...], why: str) -> list[tuple[Chunk, ...]]:
+    def retry(self, slot: int, task: tuple[Chunk, ...], reason: str) -> list[tuple[Chunk, ...]]:
         chunks = self._undelivered(task)
-        _log.warning("%d images are tried once more, alone: %s", len(chunks), why)
+        _log.warning("%d images are tried once more, alone: %s", len(chunks), reason)
         return [(image,) for image in chunks]
 
     def done(self, slot: int, task: tuple[Chunk, ...], result: Any) -> None:
@@ -412,8 +412,8 @@ class _Run:
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
                 if not self.job.overwrite:
-                    pending = sorted({chunk.variant for chunk in chunks})
-                    self._prepare([self.recipes[number] for number in pending])
+                    pending_variants = sorted({chunk.variant for chunk in chunks})
+                    self._prepare([self.recipes[number] for number in pending_variants])
                 self.bar = ProgressBar(
                     total=self.total, initial=self.skipped, unit="image", disable=not self.progress
                 )
@@ -453,28 +453,30 @@ class _Run:
         )
         if not chunks:
             return
-        shared = None
+        shared_scene = None
         if self.job.workers > 1:
             check_sendable(self.renderer)
             with self.times.spent("share"):
-                shared = share_scene(self.scene, self.index.frames, self.out_dir / STATE_FOLDER)
+                shared_scene = share_scene(
+                    self.scene, self.index.frames, self.out_dir / STATE_FOLDER
+                )
             self.scene = None  # this process needs only the index from now on
         work = _ImageWork(chunks, self.job.workers, self._deliver, self.times)
         try:
-            with contextlib.closing(self._pool(setup, shared, lock)) as pool:
+            with contextlib.closing(self._pool(setup, shared_scene, lock)) as pool:
                 run_tasks(pool, work)
         finally:
-            if shared is not None:
-                shared.remove()
+            if shared_scene is not None:
+                shared_scene.remove()
 
-    def _pool(self, setup: Setup, shared: SharedScene | None, lock: OutputLock) -> WorkerPool:
+    def _pool(self, setup: Setup, shared_scene: SharedScene | None, lock: OutputLock) -> WorkerPool:
         """Return a pool of this process, or of several processes that open the shared scene."""
         workers = self.job.workers
-        if shared is None:
+        if shared_scene is None:
             assert self.scene is not None
-            opened = (self.scene, self.index.frames)
-            return SerialPool(SceneSetup(setup, lambda: opened, self.renderer))
-        scene_setup = SceneSetup(setup, shared.open, self.renderer, lock.inherited(), workers)
+            opened_scene = (self.scene, self.index.frames)
+            return SerialPool(SceneSetup(setup, lambda: opened_scene, self.renderer))
+        scene_setup = SceneSetup(setup, shared_scene.open, self.renderer, lock.inherited(), workers)
         return ProcessPool(scene_setup, workers)
 
     def _resolve_quality(self, recipe: Recipe) -> Recipe:

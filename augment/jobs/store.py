@@ -415,11 +415,17 @@ class RemoteStore:
 
     def read(self, path: str) -> bytes:
         path = stored_path(path, self.uri)
-        return self._call("read", path, lambda obs, at: bytes(obs.get(at, path).bytes()))
+        return self._call(
+            "read", path, lambda obs, connection: bytes(obs.get(connection, path).bytes())
+        )
 
     def write(self, path: str, data: bytes) -> None:
         path = stored_path(path, self.uri)
-        self._call("write", path, lambda obs, at: obs.put(at, path, data, max_concurrency=4))
+        self._call(
+            "write",
+            path,
+            lambda obs, connection: obs.put(connection, path, data, max_concurrency=4),
+        )
 
     def put_file(self, path: str, source: Path) -> None:
         """Write the bytes of a local file.
@@ -433,7 +439,9 @@ class RemoteStore:
 
     def list(self, folder: str) -> dict[str, StoredFile]:
         path = "" if folder == "" else stored_path(folder, self.uri)
-        objects = self._call("list", path, lambda obs, at: obs.list(at, path or None).collect())
+        objects = self._call(
+            "list", path, lambda obs, connection: obs.list(connection, path or None).collect()
+        )
         files = {}
         for facts in objects:
             name = facts["path"]
@@ -448,7 +456,7 @@ class RemoteStore:
     def exists(self, path: str) -> bool:
         path = stored_path(path, self.uri)
         try:
-            self._call("look up", path, lambda obs, at: obs.head(at, path))
+            self._call("look up", path, lambda obs, connection: obs.head(connection, path))
         except StoredFileMissing:
             return False
         return True
@@ -457,7 +465,9 @@ class RemoteStore:
         names = [stored_path(path, self.uri) for path in paths]
         try:
             if names:
-                self._call("delete", names[0], lambda obs, at: obs.delete(at, names))
+                self._call(
+                    "delete", names[0], lambda obs, connection: obs.delete(connection, names)
+                )
         except StoredFileMissing:  # stores other than S3: a missing object hides the others
             for name in names:
                 self.delete_once(name)
@@ -466,13 +476,13 @@ class RemoteStore:
         """Delete an object without retries: a second request might hit a later object."""
         with contextlib.suppress(StoredFileMissing):
             once = replace(self.patience, retries=0)
-            self._call("delete", path, lambda obs, at: obs.delete(at, path), once)
+            self._call("delete", path, lambda obs, connection: obs.delete(connection, path), once)
 
     def read_version(self, path: str) -> StoredVersion | None:
         """Return the object's current version; None where there is no object."""
 
-        def read(obs: Any, at: Any) -> StoredVersion:
-            result = obs.get(at, path)
+        def read(obs: Any, connection: Any) -> StoredVersion:
+            result = obs.get(connection, path)
             modified_s = result.meta["last_modified"].timestamp()
             return StoredVersion(bytes(result.bytes()), _mark(result.meta), modified_s)
 
@@ -499,7 +509,7 @@ class RemoteStore:
         for attempts_left in (2, 1, 0):
             is_refused = False
             try:
-                put = lambda obs, at: obs.put(at, path, data, mode=mode)  # noqa: E731
+                put = lambda obs, connection: obs.put(connection, path, data, mode=mode)  # noqa: E731
                 return StoredVersion(data, _mark(self._call("write", path, put)))
             except (_OtherVersionError, StoredFileMissing):
                 is_refused = True

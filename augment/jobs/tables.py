@@ -57,7 +57,7 @@ def column_type(column: np.ndarray) -> str:
     return "".join(f"({k},)" for k in column.shape[1:]) + column.dtype.str
 
 
-def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
+def pack_column(pieces: Sequence[np.ndarray], *, source_name: str) -> PackedColumn:
     """Join columns of one meaning, such as one per frame, into one Arrow column.
 
     Each piece becomes a chunk. Pieces of different Arrow types are all stored as JSON, one text for
@@ -65,7 +65,7 @@ def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
 
     Args:
         pieces: Columns, each [n] or [n, k].
-        where: Name of the column, for errors.
+        source_name: Name of the column, for errors.
 
     Raises:
         ValueError: A value cannot be stored such that reading returns it exactly.
@@ -78,7 +78,7 @@ def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
         kind = next(iter(types), pa.null())
         chunks = [a if a is not None and len(a) else pa.array([], kind) for a in arrays]
         return PackedColumn(pa.chunked_array(chunks, type=kind), "plain")
-    texts = [pa.array(_to_json(piece, where), pa.string()) for piece in pieces]
+    texts = [pa.array(_to_json(piece, source_name), pa.string()) for piece in pieces]
     return PackedColumn(pa.chunked_array(texts, type=pa.string()), "json")
 
 
@@ -157,21 +157,21 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
 
 def read_table(
     source: Path | bytes,
-    where: str,
+    source_name: str,
     columns: Sequence[str] | None = None,
     without: Collection[str] = (),
 ) -> pa.Table:
     """Return the table in a Parquet file of any origin, with valid columns of Arrow's own types.
 
     Args:
-        where: Name of the file, for errors.
+        source_name: Name of the file, for errors.
         columns: If given, only those of these columns that the file has.
         without: Columns to leave out.
     """
-    with opened_parquet(source, where) as (content, file):
+    with opened_parquet(source, source_name) as (content, file):
         name_counts = Counter(file.schema_arrow.names)
         if repeated_names := [name for name, count in name_counts.items() if count > 1]:
-            raise OutputError(f"{where} has several columns {repeated_names[0]!r}; leave one")
+            raise OutputError(f"{source_name} has several columns {repeated_names[0]!r}; leave one")
         column_names = [n for n in columns or name_counts if n in name_counts and n not in without]
         long_texts = check_table(content, file, column_names)
         if long_texts:
@@ -240,7 +240,7 @@ def as_described(path: Path) -> Iterator[None]:
 
 @contextmanager
 def opened_parquet(
-    source: Path | bytes, where: str
+    source: Path | bytes, source_name: str
 ) -> Iterator[tuple[pa.NativeFile, pq.ParquetFile]]:
     """Context manager of a file's content and its reader; errors of Arrow become an OutputError.
 
@@ -257,12 +257,14 @@ def opened_parquet(
         ):
             if _has_extension_types(content):
                 raise OutputError(
-                    f"{where} has a column of an Arrow extension type, which is not read, for it "
-                    f"could run code; write plain numbers and texts instead"
+                    f"{source_name} has a column of an Arrow extension type, which is not read, for "
+                    f"it could run code; write plain numbers and texts instead"
                 )
             yield content, pq.ParquetFile(content)
     except (OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError) as error:
-        raise OutputError(f"{where} is missing or not a readable Parquet file: {error}") from error
+        raise OutputError(
+            f"{source_name} is missing or not a readable Parquet file: {error}"
+        ) from error
 
 
 def _has_extension_types(file: pa.NativeFile) -> bool:
@@ -302,10 +304,10 @@ def _to_arrow(piece: np.ndarray) -> pa.Array | None:
     return array if piece.ndim == 1 else pa.FixedSizeListArray.from_arrays(array, piece.shape[1])
 
 
-def _to_json(piece: np.ndarray, where: str) -> list[str]:
+def _to_json(piece: np.ndarray, source_name: str) -> list[str]:
     """Return a text of JSON for each value of the column."""
     if piece.ndim > (1 if piece.dtype.kind == "O" else 2):
-        raise ValueError(f"{where} has shape {list(piece.shape)}; columns are [n] or [n, k]")
+        raise ValueError(f"{source_name} has shape {list(piece.shape)}; columns are [n] or [n, k]")
     # NumPy scalars inside an object column come back as the Python value they stand for.
     values = [v.item() if isinstance(v, np.generic) else v for v in piece.tolist()]
     texts = []
@@ -318,7 +320,7 @@ def _to_json(piece: np.ndarray, where: str) -> list[str]:
             is_exact = False
         if not is_exact:
             raise ValueError(
-                f"{where} holds {value!r} ({type(value).__name__}) in a column of dtype "
+                f"{source_name} holds {value!r} ({type(value).__name__}) in a column of dtype "
                 f"{piece.dtype}, which cannot be stored exactly; use numbers, strings, None, or "
                 f"lists of them"
             )
@@ -379,7 +381,7 @@ def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
     columns = {}
     kinds = {}
     for name, column in sweep.columns.items():
-        packed_column = pack_column([column], where=f"LiDAR column {name!r}")
+        packed_column = pack_column([column], source_name=f"LiDAR column {name!r}")
         columns[name] = packed_column.data
         kinds[name] = [column_type(column), packed_column.encoding]
     note_entries = {} if note is None else {"note": note}
@@ -497,7 +499,7 @@ def _attribute(name: str, boxes_of_frames: list[Boxes]) -> tuple[pa.ChunkedArray
     It has gaps in frames that lack it.
     """
     columns = [boxes.attributes[name] for boxes in boxes_of_frames if name in boxes.attributes]
-    packed_column = pack_column(columns, where=f"box attribute {name!r}")
+    packed_column = pack_column(columns, source_name=f"box attribute {name!r}")
     chunks = iter(packed_column.data.chunks)
     filled_chunks = [
         next(chunks) if name in boxes.attributes else pa.nulls(len(boxes), packed_column.data.type)

@@ -303,13 +303,13 @@ class PassedLidar(NamedTuple):
     """As of Recipe.lidar_note."""
 
 
-def describe(error: BaseException, doing: str) -> str:
+def describe(error: BaseException, activity: str) -> str:
     """Return one line for the manifest: the activity, the error's type and its text.
 
     Args:
-        doing: Activity that failed.
+        activity: Activity that failed.
     """
-    text = " ".join(f"{doing}: {type(error).__name__}: {error}".split())
+    text = " ".join(f"{activity}: {type(error).__name__}: {error}".split())
     return text if len(text) <= MESSAGE_LENGTH else text[: MESSAGE_LENGTH - 3] + "..."
 
 
@@ -384,7 +384,7 @@ class FrameRunner:
         self._warned: set[str] = set()  # variants with a sweep that stayed clear
         self._in_flight: deque[tuple[_RenderedView, Pending]] = deque()
         self._times = WorkTimes()
-        self._started = time.perf_counter()
+        self._start_s = time.perf_counter()
 
     def run(self, chunk: Chunk) -> None:
         """Render the chunk's images. The last may stay in flight until `close` or later ones."""
@@ -395,10 +395,10 @@ class FrameRunner:
 
     def _finish_oldest_view(self) -> None:
         """Wait for the oldest view in flight and queue the writing of its files."""
-        rendered, pending = self._in_flight[0]
+        rendered, pending_view = self._in_flight[0]
         try:
             with self._times.spent(RENDER, AWAIT):
-                view = pending.result()
+                view = pending_view.result()
         except Exception as error:
             self._in_flight.popleft()
             self._fail(rendered.chunk, rendered.camera.name, error)
@@ -421,7 +421,7 @@ class FrameRunner:
                 self._views.close()
             with self._times.spent(HELD):
                 self._pump.close()
-        seconds = time.perf_counter() - self._started
+        seconds = time.perf_counter() - self._start_s
         self._times.add(RENDERERS, seconds)
         self._times.add(WRITERS, seconds * self._pump.threads)
         return self._times.so_far()
@@ -476,30 +476,30 @@ class FrameRunner:
         recipe = rendered.recipe
         name = rendered.camera.name
         paths = item_paths(self._scene.name, recipe, name, chunk.frame)
-        failed = Outcome(chunk.variant, chunk.frame, name, FAILED)
+        failed_outcome = Outcome(chunk.variant, chunk.frame, name, FAILED)
         activity = "measuring the boxes"
         try:
             with self._times.spent(MEASURE):
                 view, box_weather = self._label(chunk.frame, recipe, rendered.camera, view)
             activity = "encoding"
-            written = write_view(Path(self._setup.out_dir), paths, view, recipe)
+            written_files = write_view(Path(self._setup.out_dir), paths, view, recipe)
         except OutputError:
             raise
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
-            self._deliver(replace(failed, message=describe(error, activity)))
+            self._deliver(replace(failed_outcome, message=describe(error, activity)))
             return
-        self._times.add(ENCODE, written.encode_s)
-        self._times.add(WRITE, written.write_s)
+        self._times.add(ENCODE, written_files.encode_s)
+        self._times.add(WRITE, written_files.write_s)
         outcome = replace(
-            failed,
+            failed_outcome,
             status=OK,
-            checksum=written.checksum,
+            checksum=written_files.checksum,
             box_weather=box_weather,
-            shares=written.shares,
+            shares=written_files.shares,
         )
         self._pump.after(
-            rendered.lidar, lambda: self._complete(outcome, rendered.lidar, written.files)
+            rendered.lidar, lambda: self._complete(outcome, rendered.lidar, written_files.files)
         )
 
     def _complete(self, outcome: Outcome, lidar: Future, files: tuple[str, ...]) -> None:
