@@ -503,9 +503,8 @@ def _clear(old_folder: Path, target: Path, own_names: Collection[str]) -> None:
     Foreign entries move to `target`. Where they cannot move, they and the folder stay, since this
     code must not decide to delete them.
     """
-    with contextlib.suppress(
-        FileNotFoundError
-    ):  # another process that saves there may clear it too
+    # Another process that saves there may clear the folder too.
+    with contextlib.suppress(FileNotFoundError):
         for entry in list(old_folder.iterdir()):
             if entry.name in own_names and entry.is_dir():
                 shutil.rmtree(entry)

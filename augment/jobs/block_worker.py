@@ -503,9 +503,8 @@ class BlockWorker:
         with claim:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
             if part is not None and not part.has_failures and not task.is_damaged:
-                clear_block(
-                    self._store, self._setup.scratch, block
-                )  # a killed process may have left it
+                # A killed process may have left the folder.
+                clear_block(self._store, self._setup.scratch, block)
                 return BlockDone(skipped=block.images)
             return self._render_claimed(task, part if task.is_damaged else None)
 

@@ -27,7 +27,8 @@ from augment.jobs.tables import (
     texts_of,
 )
 
-Item = tuple[int, str]  # frame number and camera name
+# Frame number and camera name of an image.
+Item = tuple[int, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ class BoxTable:
         """Return the numbers that `to_json` made lists of."""
         track_ids, *arrays = columns
         names = self.stored
-        if len(arrays) == len(names) - len(self.later):  # of an older version's log
+        if len(arrays) == len(names) - len(self.later):  # log of an older version
             arrays += [[value] * len(track_ids) for value in self.later.values()]
         pairs = zip(names, arrays, strict=True)
         return self.numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})

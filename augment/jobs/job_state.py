@@ -227,9 +227,8 @@ class VariantState:
             if any(row.get(f"{kind}_path") for row in rows):
                 self.box_weather[kind] = _read_table(kind, self.place / file)
         with self.progress_log.reading():
-            for row in (
-                logged_rows
-            ):  # they also hold the boxes' numbers, which are no columns of the manifest
+            # Logged rows also hold the boxes' numbers, which are no columns of the manifest.
+            for row in logged_rows:
                 for kind, box_table in box_tables().items():
                     if (numbers := row.pop(kind, None)) is not None:
                         self.box_weather[kind][row["frame"], row["camera"]] = box_table.from_json(
@@ -365,9 +364,8 @@ class VariantState:
             n: frame_entry(scene_frames[n], camera_names[n], scale, index.world_origin_m)
             for n in frame_numbers
         }
-        if (
-            lost_frames := camera_names.keys() - scene_frames.keys()
-        ):  # frames that the scene has lost since
+        # The scene has lost frames since.
+        if lost_frames := camera_names.keys() - scene_frames.keys():
             entries |= {n: e for n, e in read_entries(path).items() if n in lost_frames}
         return calibration_bytes(index, self.name, trajectory, entries)
 
@@ -417,9 +415,8 @@ class BoxCache:
             try:
                 time_ns = self._index.frames_by_number[number].timestamp_ns
                 boxes = FrameBoxes(time_ns, labels.boxes(number))
-                boxes_bytes(
-                    {number: boxes}
-                )  # boxes that cannot be stored exactly fail here, frame by frame
+                # Boxes that cannot be stored exactly fail here, frame by frame.
+                boxes_bytes({number: boxes})
             except Exception as error:
                 self.errors[number] = describe(error, f"reading the boxes of frame {number}")
             else:
@@ -510,8 +507,8 @@ class JobState:
 
         Does nothing while other jobs run, because the manifest lacks their images.
         """
-        own_folders = {variant.folder for variant in self.variants}
-        if (self.out_dir / PARTS).is_dir() or not own_folders.issuperset(
+        job_folders = {variant.folder for variant in self.variants}
+        if (self.out_dir / PARTS).is_dir() or not job_folders.issuperset(
             logged_variants(self.out_dir)
         ):
             return
@@ -539,14 +536,13 @@ class JobState:
         """Delete temporary files of killed runs."""
         state_dir = self.out_dir / STATE_FOLDER
         remove_temporaries(self.out_dir, recursive=False)
-        remove_temporaries(
-            state_dir, recursive=False
-        )  # blocks of other jobs may be at work below it
+        # Blocks of other jobs may be at work below it.
+        remove_temporaries(state_dir, recursive=False)
         remove_temporaries(state_dir / PROGRESS_LOGS)
         _remove_tree(state_dir / "trash")
-        own_folders = {variant.folder for variant in self.variants}
+        job_folders = {variant.folder for variant in self.variants}
         sweeps = f"{folder_name(self.index.name)}/{SWEEPS}"
-        for folder in sorted({sweeps, *own_folders, *logged_variants(self.out_dir)}):
+        for folder in sorted({sweeps, *job_folders, *logged_variants(self.out_dir)}):
             remove_temporaries(self.out_dir / folder)
 
 

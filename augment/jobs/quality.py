@@ -437,7 +437,7 @@ def resolve_quality(
             reference_ms = bench.ms(reference)
         worst_flip = bench.flip(settings)
     chosen_recipe = resolved_recipe(recipe, settings)
-    if cameras is None and renderer is None:  # keeps the data that images of these settings share
+    if cameras is None and renderer is None:  # keep the images' shared data
         share_effects(Sharing(trial_scene, [chosen_recipe], backend=backend))
         memo_of(scene).update(memo_of(trial_scene).shared())
     is_met = ms is None or ms <= (quality.budget_ms or 0)

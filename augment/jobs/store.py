@@ -323,7 +323,7 @@ def _parse(uri: str) -> _Place:
     scheme = parsed.scheme
     (user, _, host) = parsed.netloc.rpartition("@")
     user, colon, password = map(urllib.parse.unquote, user.partition(":"))
-    if scheme in _AZURE_SCHEMES and not colon:  # a container of an account
+    if scheme in _AZURE_SCHEMES and not colon:  # the URI names a container of an account
         user = ""
         host = parsed.netloc
     user_prefix = f"{_ANONYMOUS}@" if user == _ANONYMOUS else ""

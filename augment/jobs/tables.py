@@ -257,8 +257,8 @@ def opened_parquet(
         ):
             if _has_extension_types(content):
                 raise OutputError(
-                    f"{source_name} has a column of an Arrow extension type, which is not read, for "
-                    f"it could run code; write plain numbers and texts instead"
+                    f"{source_name} has a column of an Arrow extension type, which is not read, "
+                    f"for it could run code; write plain numbers and texts instead"
                 )
             yield content, pq.ParquetFile(content)
     except (OSError, pa.ArrowException, UnicodeDecodeError, StatedSizeError) as error:

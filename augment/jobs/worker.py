@@ -371,7 +371,7 @@ class FrameRunner:
         self._setup = setup
         self._views = None
         if renderer is None:
-            from augment.views import ViewPool  # which brings the rasteriser
+            from augment.views import ViewPool  # imports the rasteriser
 
             self._views = ViewPool(scene, setup.backend)
             renderer = self._views.begin
@@ -548,7 +548,7 @@ class FrameRunner:
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         target = Path(self._setup.out_dir) / (paths["lidar"] or "")
         if target.exists() and not self._setup.overwrite:
-            with contextlib.suppress(OutputError):  # a damaged one is written anew
+            with contextlib.suppress(OutputError):  # a damaged file is written again
                 return _lidar_entries(recipe, read_lidar_note(target))
         with self._times.spent(LIDAR):
             try:
