@@ -399,9 +399,10 @@ class BlockDone:
 
 @dataclass(frozen=True)
 class ResolvedRecipes:
-    """Recipes of a ResolveTask, in its order."""
+    """Result of a ResolveTask: its recipes, resolved, in its order."""
 
     recipes: tuple[Recipe, ...]
+    """Resolved recipes."""
 
 
 Result = SceneRecord | ResolvedRecipes | BlockDone | TaskFailed

@@ -377,7 +377,7 @@ def shard_of(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
 
 @dataclass(frozen=True)
 class PlannedBlock:
-    """A block in the plan's file."""
+    """Block in the plan's file."""
 
     key: str
     """Key of the block."""
@@ -398,13 +398,18 @@ class PlannedBlock:
 
 @dataclass(frozen=True)
 class StoredPlan:
-    """The plan's file."""
+    """File of a job's plan."""
 
     job: str
+    """Name of the job."""
     version: str
+    """Version of this package that planned the job."""
     blocks: tuple[PlannedBlock, ...]
+    """Blocks in order."""
     unusable: dict[str, str]
+    """Reasons why scenes cannot be used, by URI."""
     format: Literal[2] = 2
+    """Version of the file's format."""
 
 
 _STORED_PLAN = TypeAdapter(StoredPlan)

@@ -665,11 +665,17 @@ class _Mirroring:
     """State of one call of mirror_dataset."""
 
     tree: SourceTree
+    """The dataset."""
     folder: Path
+    """Folder of the copies."""
     weathered: Mapping[str, Weathered]
+    """Files that shall stand in the copy, by place in the dataset."""
     result: Mirrored
+    """Result so far."""
     changed_folders: set[str] = field(default_factory=set)
-    encoded: list[str] = field(default_factory=list)  # paths of images that are encoded again
+    """Folders with new names, to be made durable."""
+    encoded: list[str] = field(default_factory=list)
+    """Paths of images that are encoded again."""
 
     def __post_init__(self) -> None:
         self.files = self.result.record.files

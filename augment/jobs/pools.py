@@ -75,7 +75,9 @@ class Finished:
     """Event: a worker has done its task."""
 
     slot: int
+    """Slot of the worker."""
     result: Any
+    """Result of its task."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,9 @@ class Lost:
     """Event: a worker died at its task, and another one takes its place."""
 
     slot: int
+    """Slot of the worker."""
     how: str
-    """How it ended: "was killed by SIGKILL", say."""
+    """Ending of the worker: "was killed by SIGKILL", say."""
 
 
 Event = Finished | Lost
@@ -99,7 +102,9 @@ class WorkerPool(Protocol):
     """
 
     slots: int
+    """Number of workers."""
     tick: Tick
+    """Called with a slot and the outcome of each finished image."""
 
     def give(self, slot: int, task: Any) -> None:
         """Start a task in a worker that has none."""

@@ -190,7 +190,7 @@ class Ended:
     """Stands in place of a child's message: the child has ended."""
 
     how: str
-    """How it ended, after "the worker ..."."""
+    """Ending of the child, after "the worker ..."."""
 
 
 _Child = TypeVar("_Child", bound=ChildProcess)

@@ -190,7 +190,8 @@ def leftovers(out: Path) -> list[str]:
 def check_reader(out: Path, reference_digests: dict[str, str], *, may_fail: bool = False) -> int:
     """What a reader sees is finished and valid, at any time; returns how many images that is.
 
-    reference_digests: digests of the uninterrupted job's files. may_fail: rows of failures are no surprise.
+    reference_digests: digests of the uninterrupted job's files. may_fail: rows of failures are
+    expected.
     """
     try:
         table = read_finished(open_store(out))
