@@ -143,6 +143,7 @@ MAX_LOST = 3
 ELSEWHERE_S = 2.0
 _log = logging.getLogger(__name__)
 
+# Records all images of a block as failed, with a message.
 FailBlock = Callable[[Block, str], None]
 
 
@@ -236,7 +237,7 @@ class BlockWork(Work):
         self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
         self._scene_of_slot = scene_of_slot
         self._busy_slots: set[int] = set()
-        self._lost_alone: Counter[str] = Counter()  # blocks by scene that killed a lone worker
+        self._lone_losses: Counter[str] = Counter()  # blocks by scene that killed a lone worker
         # Times (monotonic) and blocks to try again: another process has claimed them.
         self._postponed: list[tuple[float, Block]] = []
 
@@ -285,8 +286,8 @@ class BlockWork(Work):
         self._free_slot(slot)
         scene = task.block.scene
         self._scene_of_slot.pop(slot, None)
-        self._lost_alone[scene] += 1
-        other_blocks = self._queue.take_all(scene) if self._lost_alone[scene] == MAX_LOST else []
+        self._lone_losses[scene] += 1
+        other_blocks = self._queue.take_all(scene) if self._lone_losses[scene] == MAX_LOST else []
         self._give_up(
             [task.block, *other_blocks],
             f"the worker {how} while at this block of images, and again when it was tried alone; "
@@ -319,7 +320,9 @@ class BlockWork(Work):
 # Reads from the store at a time: a read spends most of its time waiting.
 _NUM_READS = 16
 
+# Record of a scene, or why it cannot be opened, by URI and name.
 SceneRecords = Mapping[tuple[str, str | None], SceneRecord | str]
+# Resolved recipe, or why it could not choose its settings, by scene and variant.
 Choices = dict[tuple[str, str], Recipe | str]
 
 

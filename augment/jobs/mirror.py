@@ -648,16 +648,20 @@ def mirror_dataset(
             before; no file is left half-written.
     """
     check_disjoint(tree, folder)
-    num_files = dict.fromkeys(_FILE_KINDS, 0)
-    num_bytes = dict.fromkeys(_BYTE_KINDS, 0)
+    files_by_kind = dict.fromkeys(_FILE_KINDS, 0)
+    bytes_by_kind = dict.fromkeys(_BYTE_KINDS, 0)
     record = MirrorRecord(
-        folder=str(tree.root), links=links, scenes=dict(scenes), files=num_files, bytes=num_bytes
+        folder=str(tree.root),
+        links=links,
+        scenes=dict(scenes),
+        files=files_by_kind,
+        bytes=bytes_by_kind,
     )
-    run = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
+    mirroring = _Mirroring(tree, folder, weathered, Mirrored(folder / tree.root.name, record))
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
-        run.fill_copy(bar)
-    run.finish()
-    return run.result
+        mirroring.fill_copy(bar)
+    mirroring.finish()
+    return mirroring.result
 
 
 @dataclass(eq=False)

@@ -586,11 +586,11 @@ class RayPool:
     def _failed_start(self, error: Exception) -> None:
         """Raise ClimateGSError, unless perhaps only a machine was lost."""
         self._lost_starts += 1
-        is_own_failure = getattr(error, "actor_init_failed", False)
-        is_own_failure = is_own_failure or isinstance(
+        is_setup_failure = getattr(error, "actor_init_failed", False)
+        is_setup_failure = is_setup_failure or isinstance(
             error, self._ray.exceptions.RuntimeEnvSetupError
         )
-        if is_own_failure or self._lost_starts >= _MAX_LOST_STARTS:
+        if is_setup_failure or self._lost_starts >= _MAX_LOST_STARTS:
             raise ClimateGSError(
                 f"a Ray actor failed while starting: {last_line(error)}. Every machine of the "
                 f"cluster needs climategs, and whatever opens the scenes, installed in the same "

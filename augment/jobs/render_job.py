@@ -278,20 +278,20 @@ def run_job(
         OutputError: The folder cannot be written, is in use, or holds something else.
     """
     start_s = time.perf_counter()
-    run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
+    job_run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
     opening_s = time.perf_counter() - start_s
-    run.times.add("open", opening_s - run.times.so_far().get("settle", 0.0))
-    run.execute()
+    job_run.times.add("open", opening_s - job_run.times.so_far().get("settle", 0.0))
+    job_run.execute()
     seconds = time.perf_counter() - start_s
-    run.times.add(WORKERS, job.workers * seconds)
+    job_run.times.add(WORKERS, job.workers * seconds)
     return JobResult(
-        written=run.counts[OK],
-        skipped=run.skipped,
-        failed=run.counts[FAILED],
-        manifest=run.out_dir / MANIFEST,
+        written=job_run.counts[OK],
+        skipped=job_run.skipped,
+        failed=job_run.counts[FAILED],
+        manifest=job_run.out_dir / MANIFEST,
         seconds=seconds,
-        failures=tuple(sorted(run.failures)),
-        timings=run.times.so_far(),
+        failures=tuple(sorted(job_run.failures)),
+        timings=job_run.times.so_far(),
     )
 
 
