@@ -21,12 +21,18 @@ from augment.effects.flood.flood import FloodMedium
 from augment.effects.flood.lidar import ABSORPTION_905_PER_M, meet_water
 from augment.effects.flood.waves import make_waves
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
-from augment.effects.lidar.beam import LidarModel, origins_of
+from augment.effects.lidar.beam import LidarModel, find_beam_origins
 from augment.effects.lidar.sweep import weathered_sweep
 from augment.effects.smog import soft_echo, soft_response, wavelength_factor
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.effect import snow_layers_of
-from augment.effects.snow.lidar import GROUND_SLACK_M, LidarSnow, layer_of, meet_layers, snow_in
+from augment.effects.snow.lidar import (
+    GROUND_SLACK_M,
+    LidarSnow,
+    find_lidar_snow,
+    intersect_layers,
+    make_snow_grid,
+)
 from augment.effects.snow.snow import PlacedSnow, placement_settings
 from augment.errors import OutputError
 from augment.jobs.manifest import read_manifest
@@ -141,14 +147,14 @@ def test_origins_by_default_and_wrong_ones() -> None:
     sweep = sweep_of(some_points(4))
     unknown = street(labels=SensorLabels(None))
     expected = WORLD_ORIGIN_M + np.array([0.0, 0.0, 1.8])
-    np.testing.assert_allclose(origins_of(unknown, 0, sweep), np.tile(expected, (4, 1)))
+    np.testing.assert_allclose(find_beam_origins(unknown, 0, sweep), np.tile(expected, (4, 1)))
 
     class Wrong(SensorLabels):
         def lidar_origins(self, frame_index, sweep):
             return np.zeros((1, 3))
 
     with pytest.raises(ValueError, match=r"must be \[4, 3\].*got \[1, 3\]"):
-        origins_of(street(labels=Wrong(None)), 0, sweep)
+        find_beam_origins(street(labels=Wrong(None)), 0, sweep)
 
 
 def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarSweep) -> np.ndarray:
@@ -316,10 +322,10 @@ def scene():
 
 def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> np.ndarray:
     """Where beams to points end on a layer of snow, [N, 3]."""
-    layer = layer_of(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
+    layer = make_snow_grid(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
     snow = LidarSnow(layer, {}, 0.8)
     origins, directions, ends = beams(points)
-    hits = meet_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
+    hits = intersect_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
     assert (hits <= ends).all()
     return origins + hits[:, None] * directions
 
@@ -344,11 +350,11 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     points = np.column_stack(
         [rng.uniform(1, 16, 12), rng.uniform(-5, 5, 12), rng.uniform(0, 3, 12)]
     )
-    layer = layer_of(cells, depths, grid_m=0.5)
+    layer = make_snow_grid(cells, depths, grid_m=0.5)
     if layer is None:
         return
     origins, directions, ends = beams(points)
-    shallow = meet_layers(
+    shallow = intersect_layers(
         LidarSnow(layer, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     steps = np.arange(0.3, 20, 5e-3)
@@ -364,8 +370,8 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     # A beam may clip a corner by less than a step, which the search does not see.
     assert (shallow[entered] <= first[entered] + 1e-6).all()
     assert (np.abs(shallow - first)[entered] < 1e-2).mean() > 0.8
-    deep = layer_of(cells, deeper * depths, grid_m=0.5)
-    hits = meet_layers(
+    deep = make_snow_grid(cells, deeper * depths, grid_m=0.5)
+    hits = intersect_layers(
         LidarSnow(deep, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     assert (hits <= shallow + 1e-6).all()
@@ -373,12 +379,12 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
 
 def test_the_layer_is_that_of_the_images(scene) -> None:
     placed = PlacedSnow(SNOW, seed=0)
-    top = snow_in(scene, placed).ground.top
+    top = find_lidar_snow(scene, placed).ground.top
     means = snow_layers_of(scene, placed).ground.gaussians.means.numpy()
     covered = np.isfinite(top)
     # A splat's middle lies a centimetre inside the layer whose surface it shows.
     assert np.median(top[covered]) == pytest.approx(np.median(means[:, 2]), abs=0.02)
-    layer = snow_in(scene, placed).ground
+    layer = find_lidar_snow(scene, placed).ground
     index = np.floor((means[:, :2] - layer.corner) / layer.cell_m).astype(int)
     near = top[np.clip(index[:, 1], 0, top.shape[0] - 1), np.clip(index[:, 0], 0, top.shape[1] - 1)]
     # Drifts are centimetres high and metres long: with another seed they would not agree.

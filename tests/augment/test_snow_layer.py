@@ -14,16 +14,16 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.cast_shadows import linear_from_display
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.kernels import BARE_M, FARTHEST_M, FOLIAGE_MOST_M
+from augment.effects.snow.kernels import MAX_FOLIAGE_DEPTH_M, MAX_GRAIN_DISTANCE_M, MIN_DEPTH_M
 from augment.effects.snow.layer import (
-    PRESSED,
+    PRESSED_SHARE,
     build_snow_layer,
+    covered_share,
+    define_depths,
     find_depths,
     gradient_noise,
-    heights_of,
-    mottle_of,
+    mottle_noise,
     profile_of,
-    share_covered,
 )
 from augment.effects.snow.light import Illumination, display_from_linear, illumination_of, light_of
 from augment.effects.snow.near_camera import Crystals, Layer, SnowLayers
@@ -100,10 +100,10 @@ def test_layer_is_rounded_at_open_edges_and_nowhere_else():
 def test_share_of_level_ground_that_carries_snow(depth_m, coverage):
     snow = Snow(depth_m=depth_m, coverage=coverage)
     expected = coverage * (1 - math.exp(-depth_m / 0.004))
-    assert math.isclose(share_covered(snow), expected, rel_tol=1e-9)
+    assert math.isclose(covered_share(snow), expected, rel_tol=1e-9)
     heights = _depths(level_bed(100.0, 0.2).ground, depth_m=depth_m, coverage=coverage)
     assert abs((heights > 0).mean() - expected) < 0.02
-    assert (heights[heights > 0] >= BARE_M).all()
+    assert (heights[heights > 0] >= MIN_DEPTH_M).all()
 
 
 def test_snow_through_foliage_is_thin_and_in_flecks():
@@ -114,7 +114,7 @@ def test_snow_through_foliage_is_thin_and_in_flecks():
     for depth_m in (0.01, 0.1, 0.5):
         open_m, left_m = (_depths(c, depth_m=depth_m, tracks="never") for c in (cells, green))
         assert 0.25 < (left_m > 0).mean() / (open_m > 0).mean() < 0.42
-        assert left_m.max() <= FOLIAGE_MOST_M + 1e-6 and (left_m <= open_m).all()
+        assert left_m.max() <= MAX_FOLIAGE_DEPTH_M + 1e-6 and (left_m <= open_m).all()
 
 
 # --- tracks and water -----------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def test_tracks_are_pressed_where_the_recipe_says():
     ):
         heights = _depths(cells, depth_m=depth_m, tracks=tracks)
         ratio = np.median(heights[rut]) / np.median(heights[~rut])
-        assert abs(ratio - (1 - PRESSED if shown else 1)) < 0.1
+        assert abs(ratio - (1 - PRESSED_SHARE if shown else 1)) < 0.1
 
 
 def test_no_snow_below_the_waters_edge():
@@ -336,13 +336,13 @@ def test_kernel_computes_what_the_definition_says(options, corner_m, water):
     rng = np.random.default_rng(9)
     profile = profile_of(Snow(**options), rng, on_ground=True, water_level_z_m=water)
     depths = find_depths(cells, profile, SEED)
-    expected = heights_of(cells, profile)
+    expected = define_depths(cells, profile)
     open_m = expected[cells.semantic.numpy() != SemanticClass.VEGETATION]
     assert (open_m == 0).any() == (water is not None or options["depth_m"] < 0.2)
     np.testing.assert_allclose(depths.heights, expected, rtol=2e-6, atol=1e-12)
     covered = expected > 0
     np.testing.assert_allclose(
-        depths.mottle[covered], mottle_of(cells, profile)[covered], rtol=1e-6, atol=1e-6
+        depths.mottle[covered], mottle_noise(cells, profile)[covered], rtol=1e-6, atol=1e-6
     )
 
 
@@ -566,7 +566,7 @@ def test_no_grain_where_nothing_shows_it():
         {"snow": torch.zeros(size)},
         {"hidden": torch.ones(size, dtype=torch.bool)},
         {"height_m": 0.0},
-        {"height_m": FARTHEST_M + 0.1},
+        {"height_m": MAX_GRAIN_DISTANCE_M + 0.1},
         {"height_m": math.nan},
         {"grain": Grain(0.0, 0.4, 5)},
         {"extinction_per_m": 1e6},
