@@ -48,7 +48,7 @@ def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowSupport:
 
 
 def check_cells(cells: SnowCells, gaussians: int) -> None:
-    """What holds for the cells of any scene."""
+    """Check the rules that the cells of every scene keep."""
     count = len(cells)
     for field in dataclasses.fields(SnowCells):
         values = getattr(cells, field.name)

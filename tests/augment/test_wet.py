@@ -91,23 +91,23 @@ def test_wet_over_dry_albedo_is_angstroms(dry, wet):
 
 def test_a_splat_loses_the_light_that_its_albedo_says():
     white, dry = 0.8, torch.tensor([0.06, 0.2, 0.5])
-    own = one_gaussian(rgb=to_display(dry * white).numpy())
-    wet = darken_gaussians(own, torch.ones(1), white)
-    ratio = to_linear(0.5 + SH_C0 * wet.sh[0, 0]) / to_linear(0.5 + SH_C0 * own.sh[0, 0])
+    gaussians = one_gaussian(rgb=to_display(dry * white).numpy())
+    wet = darken_gaussians(gaussians, torch.ones(1), white)
+    ratio = to_linear(0.5 + SH_C0 * wet.sh[0, 0]) / to_linear(0.5 + SH_C0 * gaussians.sh[0, 0])
     assert torch.allclose(ratio, wet_albedo(dry) / dry, rtol=0.005)
     half = wet_ratio(to_display(dry * white)[None], white, 0.5)[0]
     assert bool(((half < 1) & (half > ratio.sqrt().sqrt() * 0.5)).all())
 
 
 def test_dry_splats_keep_their_bits_and_black_ones_stay_finite():
-    own = random_gaussians(50, seed=1)
-    assert darken_gaussians(own, torch.zeros(50), 0.5) is own
+    gaussians = random_gaussians(50, seed=1)
+    assert darken_gaussians(gaussians, torch.zeros(50), 0.5) is gaussians
     wet = torch.zeros(50)
     wet[7] = 1.0
-    found = darken_gaussians(own, wet, 1e-4)
-    others = torch.arange(50) != 7
-    assert torch.equal(found.sh[others], own.sh[others])
-    black = dataclasses.replace(own, sh=own.sh - 9.0)
+    darkened = darken_gaussians(gaussians, wet, 1e-4)
+    is_dry = torch.arange(50) != 7
+    assert torch.equal(darkened.sh[is_dry], gaussians.sh[is_dry])
+    black = dataclasses.replace(gaussians, sh=gaussians.sh - 9.0)
     assert bool(torch.isfinite(darken_gaussians(black, torch.ones(50), 0.3).sh).all())
 
 
@@ -280,9 +280,9 @@ def test_kernels_do_as_the_definitions_do():
     rays = camera.ray_directions(torch.float64)
     depth = torch.where(rays[..., 2] < -0.01, -1.4 / rays[..., 2].clamp_max(-0.01), 0.0).float()
     depth[5:9, 5:9] = math.inf
-    shown = torch.rand(depth.shape, generator=gen)
-    share, rows = find_ground(camera, depth, shown, ground)
-    expected, same = find_ground(camera, depth, shown, ground, backend="reference")
+    visible_share = torch.rand(depth.shape, generator=gen)
+    share, rows = find_ground(camera, depth, visible_share, ground)
+    expected, same = find_ground(camera, depth, visible_share, ground, backend="reference")
     assert rows == same and torch.allclose(share, expected, atol=1e-5)
     picture = 1.2 * torch.rand(40, 97, 3, generator=gen)
     levels, defined = blur_upright(picture), blur_upright(picture, backend="reference")
@@ -292,9 +292,9 @@ def test_kernels_do_as_the_definitions_do():
     mirror = Mirror(view, levels, torch.where(far > 6, far, 0.0))
     film = Film(0.8, 0.3, rings_of(8.0, 7, camera.timestamp_ns))
     rgb = torch.rand(61, 97, 3, generator=gen)
-    rest = camera, depth, share, ground, film, mirror
-    actual = shade_wet(rgb.clone(), *rest)
-    defined = shade_wet(rgb.clone(), *rest, backend="reference")
+    arguments = camera, depth, share, ground, film, mirror
+    actual = shade_wet(rgb.clone(), *arguments)
+    defined = shade_wet(rgb.clone(), *arguments, backend="reference")
     assert bool(torch.isfinite(actual).all())
     # Depth of the mirror is noise here: a texel's border moves a few looks by the last bit.
     error = (actual - defined).abs()
@@ -306,11 +306,11 @@ def test_rings_on_a_flood_are_the_definitions():
     camera = looking((0.0, 0.0, 1.2), (2.0, 0.3, 0.0), 80, 60, 3000.0, timestamp_ns=987_654_321)
     still = WaveField(*(torch.zeros(60, 80) for _ in range(3)))
     rings = rings_of(20.0, 1, camera.timestamp_ns)
-    found = with_rings(still, camera, 0.0, rings)
+    field = with_rings(still, camera, 0.0, rings)
     expected = with_rings(still, camera, 0.0, rings, backend="reference")
     for name in ("normal_x", "normal_y", "slope_variance"):
-        assert torch.allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
-    assert float(found.normal_x.abs().max()) > 0.02 and float(still.normal_x.abs().max()) == 0
+        assert torch.allclose(getattr(field, name), getattr(expected, name), atol=1e-6)
+    assert float(field.normal_x.abs().max()) > 0.02 and float(still.normal_x.abs().max()) == 0
     assert with_rings(still, camera, 0.0, NO_RINGS) is still
 
 
@@ -410,9 +410,9 @@ def test_extremes_stay_finite():
     scene, eye = street()
     for recipe in (rain(300.0, puddles=1.0), rain(1e-6), rain(30.0, wetness=1.0, puddles=0.5)):
         tiny = recipe.model_copy(update={"render": Render(scale=0.02)})
-        for one in (recipe, tiny):
-            plan = make_plan(one, scene)
-            out = render_buffers(scene, eye.scaled(one.render.scale), plan)
+        for weather in (recipe, tiny):
+            plan = make_plan(weather, scene)
+            out = render_buffers(scene, eye.scaled(weather.render.scale), plan)
             assert bool(torch.isfinite(out.rgb).all())
     low = looking((5.0, 6.0, -0.5), (22.0, 6.0, 3.0), 64, 48, 60.0)
     assert bool(torch.isfinite(render_buffers(scene, low, make_plan(rain(), scene)).rgb).all())
