@@ -564,7 +564,7 @@ def test_no_grain_where_nothing_shows_it():
     size, even = (view.height, view.width), torch.full((view.height, view.width, 3), 0.7)
     cases: list[dict[str, Any]] = [
         {"snow": torch.zeros(size)},
-        {"hidden": torch.ones(size, dtype=torch.bool)},
+        {"occluded": torch.ones(size, dtype=torch.bool)},
         {"height_m": 0.0},
         {"height_m": MAX_GRAIN_DISTANCE_M + 0.1},
         {"height_m": math.nan},
