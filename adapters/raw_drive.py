@@ -139,7 +139,7 @@ class DriveOptions(UriOptions):
         return DriveFrames(selection, held_out, () if held_out else (problem,))
 
 
-def some(numbers: Sequence[int]) -> str:
+def describe_frames(numbers: Sequence[int]) -> str:
     """How many frames and the first of them, for messages."""
     first_numbers = ", ".join(map(str, numbers[:_MAX_NAMED]))
     more = ", ..." if len(numbers) > _MAX_NAMED else ""
@@ -615,7 +615,7 @@ def scene_of_drive(
     from adapters.lidar_scene.scene import build_lidar_scene
 
     drive = _checked(drive)
-    numbers = some([frame.index for frame in drive.used])
+    numbers = describe_frames([frame.index for frame in drive.used])
     held_out = " that are not held out" if drive.held_out else ""
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
     if not any(frame.image_paths for frame in drive.used):

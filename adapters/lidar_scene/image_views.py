@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.lidar_scene import kernels
-from adapters.lidar_scene.kernels import SkyGatherer, parts_of
+from adapters.lidar_scene.kernels import SkyGatherer, row_slices
 from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import Surfels
 from adapters.plain_files import decode_image
@@ -74,8 +74,13 @@ class Seen(NamedTuple):
 
 
 class _Observations(NamedTuple):
-    """The best KEPT observations of N surfels. scores: float32 [N, KEPT], 0 where there is none.
-    colours: uint8 [N, KEPT, 3]. cameras: uint8 [N, KEPT], numbers of cameras."""
+    """Best observations of N surfels, K = NUM_OBSERVATIONS of each.
+
+    Attributes:
+        scores: float32 [N, K], 0 where there is no observation.
+        colours: uint8 [N, K, 3].
+        cameras: uint8 [N, K], numbers of the cameras.
+    """
 
     scores: np.ndarray
     colours: np.ndarray
@@ -95,7 +100,7 @@ def observe_views(
         _Observations(
             np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         )
-        for shape in ((len(body.surfels), kernels.KEPT) for body in bodies)
+        for shape in ((len(body.surfels), kernels.NUM_OBSERVATIONS) for body in bodies)
     ]
     problems: list[str] = []
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -176,7 +181,7 @@ def _observe_one(
         part_pose = transform[:3, :3].copy(), transform[:3, 3].copy()
         parts += [
             _Part(body.surfels, store, extent, part_pose, body.track is not None, rows)
-            for rows in parts_of(len(body.surfels))
+            for rows in row_slices(len(body.surfels))
         ]
 
     def draw(part: _Part) -> np.ndarray:

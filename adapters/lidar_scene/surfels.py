@@ -17,7 +17,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from adapters.lidar_scene.kernels import in_parts
+from adapters.lidar_scene.kernels import for_row_slices
 from adapters.lidar_scene.split import PointSet, is_flat
 from augment.geometry import quat_from_rotmat
 from augment.render.cpu.jit import cached_njit
@@ -62,7 +62,7 @@ def levels_at(points: np.ndarray, path: np.ndarray) -> np.ndarray:
     """How far each position is from the path, in steps of voxels' sizes, uint8 [N]."""
     points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
     out = np.empty(len(points), np.uint8)
-    in_parts(lambda rows: _levels(points[rows], path, out[rows]), len(points))
+    for_row_slices(lambda rows: _levels(points[rows], path, out[rows]), len(points))
     return out
 
 
@@ -99,7 +99,9 @@ def _levels(points, path, out):  # pragma: no cover - compiled
 def _keys(points: np.ndarray, level: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """4 bits of level, then 20 a coordinate: 20 km each way at the finest edge."""
     out = np.empty(len(points), np.uint64)
-    in_parts(lambda rows: _fill_keys(points[rows], level[rows], edges, out[rows]), len(points))
+    for_row_slices(
+        lambda rows: _fill_keys(points[rows], level[rows], edges, out[rows]), len(points)
+    )
     return out
 
 

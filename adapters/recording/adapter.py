@@ -42,11 +42,11 @@ from adapters.raw_drive import (
     Sweep,
     TimedBoxes,
     class_of_air,
+    describe_frames,
     find_objects,
     is_in_box,
     names_in,
     scene_of_drive,
-    some,
     world_classes,
 )
 from adapters.recording.files import (
@@ -314,7 +314,9 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
     missing = [frame.index for frame in frames if frame.index not in files] if files else []
     problems = []
     if missing:
-        problems.append(f"lidar/: the files of {some(missing)} are missing, their points too")
+        problems.append(
+            f"lidar/: the files of {describe_frames(missing)} are missing, their points too"
+        )
     raws = []
     timeless = []
     for frame in tqdm(lidar_frames, desc="LiDAR", unit="frame", disable=None):

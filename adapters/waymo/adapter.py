@@ -31,12 +31,12 @@ from adapters.raw_drive import (
     Sweep,
     TimedBoxes,
     colour_every,
+    describe_frames,
     drive_origin,
     find_objects,
     is_usable,
     recentred,
     scene_of_drive,
-    some,
     world_classes,
 )
 from adapters.uri import format_uri
@@ -742,7 +742,7 @@ def read_sweeps(
     if len(problems) > _MAX_FAULTS:
         problems[_MAX_FAULTS:] = [f"so are those of {len(problems) - _MAX_FAULTS} more frames"]
     if missing:
-        problems.append(f"the LiDAR has no row of {some(sorted(missing))}")
+        problems.append(f"the LiDAR has no row of {describe_frames(sorted(missing))}")
     if step > 1:
         problems.append(
             f"the scene is built from one return in {step}, of {len(numbers)} frames; fewer "

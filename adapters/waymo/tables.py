@@ -21,7 +21,7 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from adapters.plain_files import LARGEST, checked_pose
-from adapters.raw_drive import some
+from adapters.raw_drive import describe_frames
 from adapters.scene_cache import image_folder
 from adapters.uri import WAYMO_REQUIRED, WAYMO_SPLITS
 from augment.errors import AdapterError
@@ -544,7 +544,7 @@ def extract_images(
             paths[n][name] = str(folder / file)
     for name in segment.cameras:
         if without := [n for n in numbers if name not in segment.shots.get(n, {})]:
-            problems.append(f"camera {name}: no image of {some(without)}")
+            problems.append(f"camera {name}: no image of {describe_frames(without)}")
     ordered = {
         n: {name: frame_paths[name] for name in CAMERAS if name in frame_paths}
         for n, frame_paths in paths.items()
