@@ -38,7 +38,7 @@ from adapters.camera_files.paths import (
     PathKind,
     frames_from_views,
     ground_under,
-    in_bulk,
+    is_in_bulk,
     lowest_ground,
     make_default_path,
     road_heights,
@@ -188,7 +188,7 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
     """The plane that is most like a ground; None where nothing is flat. near: a unit vector within
     45 degrees of which up must be, such as the cameras' mean."""
     points = solid_points(gaussians)
-    points = points[in_bulk(points, 3.0)]
+    points = points[is_in_bulk(points, 3.0)]
     if len(points) < _MIN_POINTS:
         return None
     surface = _Surface.of(points - points.mean(axis=0))
@@ -246,7 +246,7 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
 def doubt_about_metres(points: np.ndarray, scales: Tensor) -> str | None:
     """Why these solid points [N, 3] (+z up) and the scales of all Gaussians cannot be of a street
     in metres; None where they may be."""
-    points = points[in_bulk(points, BULK_REACH)]
+    points = points[is_in_bulk(points, BULK_REACH)]
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     measures = {
         "wide": (float(np.hypot(*(high - low)[:2])), _WIDE_M),

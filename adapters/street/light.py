@@ -1,9 +1,9 @@
-"""Baked light of the procedural street: a sun with soft shadows, sky light in a street canyon,
-reflections, haze, exposure; and the sky's cube map.
+"""Baked light of the procedural street, and the cube map of its sky.
 
-All light is a function of the place on a surface. Light that depends on the viewer (the sky in a
-window, the shine of paint) is computed for one viewer, at the nearest point of the ego cameras'
-path. The callers are `adapters.street.splats` and `adapters.procedural`.
+Light on surfaces: a sun with soft shadows, sky light in a street canyon, reflections, haze,
+exposure. All of it is a function of the place on a surface. Light that depends on the viewer (the
+sky in a window, the shine of paint) is computed for one viewer, at the nearest point of the ego
+cameras' path. The callers are `adapters.street.splats` and `adapters.procedural`.
 """
 
 from __future__ import annotations

@@ -114,8 +114,8 @@ def _rotate(m, x, y, z):
 @inner()
 def _box_entry_distance(box, origin, direction, limit):
     """Return the distance at which a ray enters a box; infinite if it misses or starts too late."""
-    entry = 0.0
-    exit = limit
+    entry_distance = 0.0
+    exit_distance = limit
     for axis in range(3):
         o = origin[axis]
         d = direction[axis]
@@ -127,9 +127,9 @@ def _box_entry_distance(box, origin, direction, limit):
         else:
             t0 = (a - o) * (1.0 / d)
             t1 = (b - o) * (1.0 / d)
-            entry = max(entry, min(t0, t1))
-            exit = min(exit, max(t0, t1))
-    return entry if entry <= exit else math.inf
+            entry_distance = max(entry_distance, min(t0, t1))
+            exit_distance = min(exit_distance, max(t0, t1))
+    return entry_distance if entry_distance <= exit_distance else math.inf
 
 
 @inner()

@@ -21,7 +21,7 @@ from adapters.drivestudio.adapter import (
     drivestudio_labels,
     open_drivestudio,
     read_sky,
-    turned_faces,
+    rotate_cubemap,
 )
 from augment.cameras import Camera
 from augment.errors import AdapterError
@@ -348,7 +348,7 @@ def test_sky_texels_are_the_checkpoint_s_own(flat):
 def test_a_sky_on_a_slope_is_looked_up_between_texels():
     faces = torch.rand(6, 9, 9, 3, generator=torch.Generator().manual_seed(3))
     turn = rotation_of(np.array([0.9, 0.3, -0.2, 0.25]))
-    shown = turned_faces(faces, turn)
+    shown = rotate_cubemap(faces, turn)
     there = directions_of_cubemap(9) @ torch.from_numpy(turn.T).float()
     assert torch.allclose(shown, CubemapSky(faces).sample(there), atol=1e-5)
 
