@@ -135,7 +135,7 @@ class Signature:
 
 
 def recognised(path: Path) -> str | None:
-    """Return the scheme of a path's contents. None if they are not known."""
+    """Return the scheme of a path's contents, or None if they are not known."""
     signatures = FILES if path.is_file() else FOLDERS
     try:
         return next((s.scheme for s in signatures if s.is_here(path)), None)

@@ -157,7 +157,7 @@ _MIN_POINTS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class GroundFound:
+class GroundPlane:
     """Ground plane of a splat file.
 
     Attributes:
@@ -189,7 +189,7 @@ class GroundFound:
         )
 
 
-def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundFound | None:
+def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> GroundPlane | None:
     """Return the plane that is most like a ground. None if nothing is flat.
 
     Args:
@@ -219,7 +219,7 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
     other_scores = scores[ups @ ups[best] < _OTHER_WAY]
     rival = max(float(other_scores.max(initial=0.0)), 1e-6)
     up, at = surface.refined(ups[best], places[best])
-    return GroundFound(_snapped(up), *surface.judge(up, at), float(scores[best]) / rival)
+    return GroundPlane(_snapped(up), *surface.judge(up, at), float(scores[best]) / rival)
 
 
 def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, str] | None:
@@ -296,7 +296,7 @@ class _Surface:
 
     @staticmethod
     def of(points: np.ndarray) -> _Surface | None:
-        """Return the surface of points. None if they are in too few places to have one."""
+        """Return the surface of points, or None if they are in too few places to have one."""
         size = float(np.linalg.norm(points, axis=1).max()) / 8 + 1e-9
         places = _voxel_means(points, size)
         for _ in range(_FINER_STEPS):

@@ -148,7 +148,7 @@ class _CameraTrack(NamedTuple):
     Attributes:
         lens, size: intrinsics, and (width, height), in pixels.
         world_from_camera: float64 [F, 4, 4] in the dataset's world.
-        times: int64 [F], times of its images.
+        timestamps_ns: int64 [F], times of its images.
     """
 
     lens: _Lens
@@ -288,13 +288,13 @@ def frame_file(root: Path, folder: str, frame: int) -> Path:
 
 
 def read_lidar(root: Path, frame: int) -> pd.DataFrame | None:
-    """Read the returns of a frame, columns x y z i t d as in the file. None without a file."""
+    """Read the returns of a frame, columns x y z i t d as in the file, or None without a file."""
     path = frame_file(root, "lidar", frame)
     return _read_table(path, LIDAR_COLUMNS) if path.exists() else None
 
 
 def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
-    """Read the class number of each return of the frame, int64 [rows]. None without a file."""
+    """Read the class number of each return of the frame, int64 [rows], or None without a file."""
     path = frame_file(root, "annotations/semseg", frame)
     if not path.exists():
         return None
@@ -308,7 +308,7 @@ def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
 
 
 def read_cuboids(root: Path, frame: int) -> pd.DataFrame | None:
-    """Read the boxes of a frame with all their columns. None without a file."""
+    """Read the boxes of a frame with all their columns, or None without a file."""
     path = frame_file(root, "annotations/cuboids", frame)
     needed = ("uuid", "label", "yaw", "stationary")
     needed += tuple(f"{group}.{axis}" for group in ("position", "dimensions") for axis in "xyz")
@@ -683,8 +683,9 @@ class PandaSetLabels:
         return replace(boxes, track_ids=tuple(objects.names[uuid] for uuid in boxes.track_ids))
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """Return the SemanticClass of each return, or NO_SURFACE. None for a sweep without
-        classes.
+        """Return the SemanticClass of each return, or NO_SURFACE.
+
+        The result is None for a sweep without classes.
         """
         numbers = sweep.columns.get("semantic")
         return None if numbers is None else world_classes(numbers, class_meanings(self.root))
@@ -720,8 +721,9 @@ class PandaSetLabels:
         return tuple(file for file in files if file.exists()) if files[0].exists() else ()
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        """Return tables of the sweep's rows under their own index. Rows of both files still name
-        each other.
+        """Return tables of the sweep's rows under their own index.
+
+        Rows of both files still name each other.
         """
         table = read_frame(file).iloc[sweep.columns[INDEX_COLUMN]].copy()
         if file == frame_file(self.root, "lidar", frame_index):

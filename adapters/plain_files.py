@@ -206,8 +206,9 @@ def check_image(path: Path, *, decode: bool = True) -> ImageHeader | str:
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
-    """Read the finite numbers of a text file, float64 in that shape, or flat; see
-    `parse_numbers`.
+    """Read the finite numbers of a text file, float64 in that shape, or flat.
+
+    See `parse_numbers`.
     """
     return parse_numbers(read_text(path).replace(",", " "), str(path), shape)
 

@@ -238,8 +238,9 @@ class StreetTruth:
 
 
 def _turn(yaw: float) -> np.ndarray:
-    """Return the rotation world_from_actor. `world @ turn` takes row vectors into the actor's
-    frame.
+    """Return the rotation world_from_actor.
+
+    `world @ turn` takes row vectors into the actor's frame.
     """
     c = np.cos(yaw)
     s = np.sin(yaw)

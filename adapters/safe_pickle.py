@@ -139,8 +139,9 @@ def _unwrapped(content: Any) -> dict[Any, Any]:
 
 
 class _Frame(Record):
-    """Stand-in for a DataFrame. Its state is a dictionary whose `_mgr` (before pandas 1.1
-    `_data`) holds all.
+    """Stand-in for a DataFrame.
+
+    Its state is a dictionary whose `_mgr` (before pandas 1.1 `_data`) holds all.
     """
 
     def __init__(self) -> None:

@@ -153,7 +153,7 @@ def leave_out_cache() -> None:
 
 
 def _cache_folder() -> Path | None:
-    """Return the folder of the entries. None if the user has no home."""
+    """Return the folder of the entries, or None if the user has no home."""
     folder = user_cache_folder()
     return None if folder is None else folder / "scenes"
 
@@ -228,8 +228,9 @@ def _files_of(
 
 
 def _facts_of(paths: Iterable[Path]) -> Iterator[tuple[str, int, int]]:
-    """Return path, size and time of change of files and of all files in folders. Missing ones
-    are marked.
+    """Return path, size and time of change of files and of all files in folders.
+
+    Missing ones are marked.
     """
     count = 0
     for path in paths:

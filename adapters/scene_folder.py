@@ -125,7 +125,7 @@ def _given(uri: str) -> Recording:
 
 
 def _recording(uri: str, working_folder: Path) -> Recording | None:
-    """Return a URI with its path made absolute. None if it names no recording."""
+    """Return a URI with its path made absolute, or None if it names no recording."""
     try:
         scheme, path, query = parse_uri(uri)
     except AdapterError:

@@ -150,8 +150,9 @@ def format_uri(scheme: str, path: str | Path, query: Mapping[str, str]) -> str:
 
 
 def add_to_uri(uri: str, key: str, value: str) -> str:
-    """Return a URI, which names its scheme, with one more key. It replaces an earlier value of
-    the key.
+    """Return a URI, which names its scheme, with one more key.
+
+    It replaces an earlier value of the key.
     """
     scheme, path, query = parse_uri(uri)
     assert scheme is not None, f"a scene's source names its scheme; got {uri!r}"

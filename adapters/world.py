@@ -55,8 +55,9 @@ class WorldChange:
         return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) - self.origin_m
 
     def pose(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """Return world_from_camera of the scene. It stays rigid: the scale changes its position
-        only.
+        """Return world_from_camera of the scene.
+
+        It stays rigid: the scale changes its position only.
         """
         pose = np.eye(4)
         pose[:3, :3] = self.rotation @ world_from_camera[:3, :3]
@@ -64,8 +65,9 @@ class WorldChange:
         return pose
 
     def gaussians(self, gaussians: Gaussians, source_origin: np.ndarray) -> Gaussians:
-        """Return Gaussians in the scene's world. Means, quats, scales, and SH of degree 1 and
-        above change.
+        """Return Gaussians in the scene's world.
+
+        Means, quats, scales, and SH of degree 1 and above change.
 
         source_origin: [3], offset that was already subtracted from their means, in the source's
         world.

@@ -270,7 +270,7 @@ class Av2Log:
         return LidarSweep(columns | {"timestamp_ns": stamp + returns.offsets_ns})
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """Return the map's semantic class of each return. None if the map is missing."""
+        """Return the map's semantic class of each return, or None if the map is missing."""
         if self.ground is None or self.ground.is_road is None:
             return None
         return self.ground.classes(sweep.points_m)
@@ -366,8 +366,9 @@ _MAX_ROUNDING_M = 1e-4
 
 
 def _stamps(folder: Path, suffix: str) -> list[int]:
-    """Return the nanoseconds in the names of a folder's files, ascending; empty without a
-    folder.
+    """Return the nanoseconds in the names of a folder's files, ascending.
+
+    It is empty without a folder.
     """
     names = (path.stem for path in folder.glob(f"*{suffix}"))
     return sorted(int(n) for n in names if n.isascii() and n.isdigit() and 0 < len(n) < 19)
@@ -723,7 +724,7 @@ def _moving_boxes(
 
 
 def _ground(log: Av2Log, drive: RawDrive) -> Ground | None:
-    """Return the map's heights under the drive. None if the map has no heights there."""
+    """Return the map's heights under the drive, or None if the map has no heights there."""
     if log.ground is None:
         return None
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in drive.frames])

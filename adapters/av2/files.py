@@ -456,8 +456,9 @@ class GroundMap:
 
 
 def _find_map_file(root: Path, pattern: str) -> Path | None:
-    """Return the only file of the log's map that matches a pattern. Return None if there is
-    none.
+    """Return the only file of the log's map that matches a pattern.
+
+    The result is None if there is none.
     """
     paths = sorted((root / "map").glob(pattern))
     if len(paths) > 1:

@@ -167,8 +167,9 @@ class _InriaFile(_ForeignModel):
 
 
 class _Intrinsics(_ForeignModel):
-    """Intrinsics of nerfstudio's format. They stand at the top, in a frame, or divided between
-    both.
+    """Intrinsics of nerfstudio's format.
+
+    They stand at the top, in a frame, or divided between both.
     """
 
     w: Pixels | None = None
@@ -288,7 +289,7 @@ _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
 
 def find_colmap_model(folder: Path) -> Path | None:
-    """Return the folder of the sparse model in or below `folder`. None if there is none."""
+    """Return the folder of the sparse model in or below `folder`, or None if there is none."""
     for name, suffix in itertools.product(_MODEL_FOLDERS, (".bin", ".txt")):
         model = folder / name
         if all((model / f"{table}{suffix}").is_file() for table in ("cameras", "images")):
@@ -481,8 +482,9 @@ def read_views(path: Path) -> ViewSet:
 
 
 def find_camera_file(folder: Path) -> Path | None:
-    """Return the camera file of a folder (a COLMAP model is itself a folder). None if there is
-    none.
+    """Return the camera file of a folder (a COLMAP model is itself a folder).
+
+    The result is None if there is none.
     """
     for name in _JSON_NAMES:
         if (folder / name).is_file():

@@ -157,8 +157,9 @@ def road_heights(
 
 
 def lowest_ground(points: np.ndarray, positions: np.ndarray, *, radius: float) -> float | None:
-    """Return the height of the ground where it is lowest under a path. None without points under
-    it.
+    """Return the height of the ground where it is lowest under a path.
+
+    The result is None without points under it.
     """
     heights, _ = ground_under(points, positions, radius=radius)
     # The 5 % quantile: one hole in the reconstruction must not set the level of a flood.
@@ -665,8 +666,9 @@ def _camera_and_frame_keys(
 
 
 def _split_name(name: str) -> tuple[str, ...]:
-    """Return folders and stem of a name. Only extensions of images are removed; a stem may hold
-    dots.
+    """Return folders and stem of a name.
+
+    Only extensions of images are removed; a stem may hold dots.
     """
     path = PurePosixPath(name.replace("\\", "/"))
     stem = path.stem if path.suffix.lower() in _IMAGE_SUFFIXES else path.name

@@ -66,7 +66,7 @@ def read_config(path: Path) -> Mapping[str, Any]:
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """Return the value of a dotted key. None if there is none."""
+    """Return the value of a dotted key, or None if there is none."""
     value: Any = config
     for name in key.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
@@ -749,8 +749,9 @@ class _Instances(RootModel[dict[Annotated[int, Field(ge=0, lt=10**9)], Instance]
 
 
 def read_instances(data: Path) -> dict[int, Instance]:
-    """Read all objects by their numbers, which are their keys in the file; empty without the
-    file.
+    """Read all objects by their numbers, which are their keys in the file.
+
+    It is empty without the file.
     """
     path = data / "instances" / "instances_info.json"
     return _read_instances(path, path.stat().st_mtime_ns) if path.is_file() else {}
@@ -809,7 +810,7 @@ class DriveStudioLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """Return the sweep of a frame in the scene's world. None without a file."""
+        """Return the sweep of a frame in the scene's world, or None without a file."""
         file = self._lidar_file(frame_index)
         if not file.is_file():
             return None

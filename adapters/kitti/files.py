@@ -150,8 +150,9 @@ def list_numbered_files(
 
 
 def resolve_file(root: Path, name: str) -> Path:
-    """Return the path of a file in the folder, which need not exist. A link out of the folder
-    raises.
+    """Return the path of a file in the folder, which need not exist.
+
+    A link out of the folder raises.
     """
     return inside(root, name, str(root))
 
@@ -298,7 +299,7 @@ def _read_camera(
 
 
 def _read_image_size(calibration_lines: KeyedLines, key: str) -> tuple[int, int] | None:
-    """Return the width and height that the calibration states for a camera. None if it has none."""
+    """Return the width and height that the calibration states for a camera, or None if it has none."""
     if not key.startswith("S_rect") or key not in calibration_lines.lines:
         return None
     width, height = calibration_lines.numbers(key, 2)

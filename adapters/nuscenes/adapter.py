@@ -189,7 +189,7 @@ class NuScenesLabels:
         return Boxes.empty() if frame is None else boxes_of_sweep(self.tables, frame.sweep)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """Return the sweep of a frame. None if its file is missing or damaged."""
+        """Return the sweep of a frame, or None if its file is missing or damaged."""
         frame = self._frame(frame_index)
         if frame is None:
             return None
@@ -205,7 +205,7 @@ class NuScenesLabels:
         return LidarSweep(columns)
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """Return the SemanticClass of each return. None if the sweep has no classes."""
+        """Return the SemanticClass of each return, or None if the sweep has no classes."""
         numbers = sweep.columns.get("semantic")
         return None if numbers is None else world_classes(numbers, _class_meanings(self.tables))
 

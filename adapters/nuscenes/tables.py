@@ -627,8 +627,9 @@ def _boxes(rows: Sequence[_Box]) -> Boxes:
 
 
 def _files_of_sweeps(root: Path, path: Path, lidar: Sequence[SensorFile]) -> dict[str, str]:
-    """Return the files that a table names for sweeps, by the sweep's token; empty without the
-    table.
+    """Return the files that a table names for sweeps, by the sweep's token.
+
+    It is empty without the table.
     """
     if not path.exists():
         return {}

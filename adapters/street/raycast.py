@@ -134,8 +134,9 @@ def _box_entry_distance(box, origin, direction, limit):
 
 @inner()
 def _shape_distance(kind, a, b, c, da, db, dc, limit):
-    """Return the distance at which a ray, in a shape's own frame, meets it; infinite if it does
-    not.
+    """Return the distance at which a ray, in a shape's own frame, meets it.
+
+    It is infinite if it does not.
     """
     if kind <= 2:  # flat
         if dc == 0.0:

@@ -205,8 +205,9 @@ def _find_visible(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
 
 
 def _sample_point(shapes: Shapes, index: np.ndarray, number: int) -> np.ndarray:
-    """Return a point on each shape at index (on the axis of round forms), [I, 3]; numbers spread
-    out.
+    """Return a point on each shape at index (on the axis of round forms), [I, 3].
+
+    Numbers spread out.
     """
     kind = shapes.kind[index]
     (u, v, w) = shapes.axes[index].transpose(1, 0, 2)
@@ -472,8 +473,9 @@ class ContactShadow:
     ground_z: float
 
     def cover(self, points: np.ndarray) -> np.ndarray:
-        """Return the bilinear cover at points [N, 3] of the mover's frame; zero away from the
-        ground.
+        """Return the bilinear cover at points [N, 3] of the mover's frame.
+
+        It is zero away from the ground.
         """
         cell = (points[:, :2] - self.origin) / CELL_M
         low_cell = np.floor(cell).astype(np.int64)

@@ -852,8 +852,9 @@ def _body(model: CarModel) -> Iterator[Shapes]:
 
 
 def _loft(rings: np.ndarray) -> Shapes:
-    """Return a smooth surface through rings [X, M, 3]. It faces outwards if rings run right to
-    left.
+    """Return a smooth surface through rings [X, M, 3].
+
+    It faces outwards if rings run right to left.
     """
     normals = np.cross(np.gradient(rings, axis=0), np.gradient(rings, axis=1))
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)

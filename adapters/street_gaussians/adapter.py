@@ -567,7 +567,7 @@ class _Reader:
         self._cloud_iterator = _cloud_iterator(path)
 
     def read(self, frame: int) -> PointCloud | None:
-        """Return the returns of a frame. None if the file lacks it."""
+        """Return the returns of a frame, or None if the file lacks it."""
         return self._recent_clouds.get(frame, lambda: self._read_forward(frame))
 
     def _read_forward(self, frame: int) -> PointCloud | None:
@@ -605,7 +605,7 @@ def _open_reader(path: Path, *_state: int) -> _Reader:
 
 
 def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
-    """Return the returns of a frame. None if there is no file, or no such frame in it."""
+    """Return the returns of a frame, or None if there is no file, or no such frame in it."""
     path = root / POINT_CLOUD_FILE
     if not path.exists():
         return None
@@ -616,8 +616,9 @@ def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
 
 
 def iterate_point_clouds(root: Path) -> Iterator[tuple[int, PointCloud]]:
-    """Return frame number and returns of every frame, in the file's order; nothing without the
-    file.
+    """Return frame number and returns of every frame, in the file's order.
+
+    Nothing without the file.
     """
     if (root / POINT_CLOUD_FILE).exists():
         yield from _cloud_iterator(root / POINT_CLOUD_FILE)
@@ -731,7 +732,7 @@ class StreetGaussiansLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        """Return the sweep of a frame in the world. None without returns or the car's pose."""
+        """Return the sweep of a frame in the world, or None without returns or the car's pose."""
         pose = self._world_from_ego(frame_index)
         cloud = None if pose is None else read_point_cloud(self.root, frame_index)
         if cloud is None:
@@ -769,7 +770,7 @@ class StreetGaussiansLabels:
 
 
 def labels_of(root: Path) -> StreetGaussiansLabels | None:
-    """Return the labels of a dataset directory. None if it is no dataset."""
+    """Return the labels of a dataset directory, or None if it is no dataset."""
     return StreetGaussiansLabels(root) if (root / "ego_pose").is_dir() else None
 
 

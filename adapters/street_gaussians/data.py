@@ -407,7 +407,7 @@ def find_images(
 
 
 def _image_header(path: Path) -> ImageHeader | None:
-    """Return the header of an image. None if the file is no image."""
+    """Return the header of an image, or None if the file is no image."""
     try:
         return read_image_header(path)
     except OSError:
@@ -449,8 +449,9 @@ class _TrackRow(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class TrackTable:
-    """A track file of N rows in its order. Everything is in the vehicle's frame at the frame's
-    time.
+    """A track file of N rows in its order.
+
+    Everything is in the vehicle's frame at the frame's time.
 
     Attributes:
         path: the file.

@@ -201,7 +201,7 @@ def _find_saved_weights(folder: Path) -> dict[str, dict[int, Path]]:
 
 
 def _iteration_of(weights: Path) -> int | None:
-    """Return the iteration in the name of a file or its folder. None if there is none."""
+    """Return the iteration in the name of a file or its folder, or None if there is none."""
     name = weights.stem if weights.suffix.lower() == ".pth" else weights.parent.name
     match = re.fullmatch(r"iteration_(\d+)", name)
     return int(match[1]) if match else None
@@ -217,7 +217,7 @@ _ACTOR_NAME = re.compile(r"obj_(\d{3,9})")
 
 
 def actor_id(name: str) -> int | None:
-    """Return the track id in a part's name, such as obj_003. None for other names."""
+    """Return the track id in a part's name, such as obj_003, or None for other names."""
     match = _ACTOR_NAME.fullmatch(name)
     number = int(match[1]) if match else None
     return number if number is not None and name == f"obj_{number:03d}" else None
@@ -471,7 +471,7 @@ class _Tables:
 
 
 def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | None:
-    """Return the changes of the actors' poses by training. None if they were not trained."""
+    """Return the changes of the actors' poses by training, or None if they were not trained."""
     if not has_actors:
         tables.read_names.add("actor_pose")
         return None
@@ -486,8 +486,9 @@ def _read_pose_changes(tables: _Tables, *, has_actors: bool) -> PoseChanges | No
 
 
 def _read_sky(tables: _Tables) -> Tensor | None:
-    """Return the faces of the sky, float32 [6, R, R, 3] in [0, 1]. None if there is no usable
-    sky.
+    """Return the faces of the sky, float32 [6, R, R, 3] in [0, 1].
+
+    The result is None if there is no usable sky.
 
     The project clamps looked-up colours. Clamped texels give the same, except between texels of
     which only some are out of range.
@@ -514,7 +515,7 @@ def _read_sky(tables: _Tables) -> Tensor | None:
 
 
 def _read_color_maps(tables: _Tables) -> Tensor | None:
-    """Return the colour maps, float32 [n, 3, 4]. None if there are no usable ones."""
+    """Return the colour maps, float32 [n, 3, 4], or None if there are no usable ones."""
     name = "color_correction"
     params = tables.of(name, "use_color_correction")
     if params is None:
