@@ -1,4 +1,4 @@
-"""A job file: which scenes, under which recipes, how many variants of each (docs/generate.md).
+"""Job files: scenes, recipes, and the number of variants of each recipe (docs/generate.md).
 
 Every scene is rendered under every recipe, or under those that it names itself.
 """
@@ -114,7 +114,7 @@ def _repeated(names: list[str]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class JobRecipes:
-    """The job's recipes, loaded. templates: by their names in the job, in its order."""
+    """Loaded recipes of a job. templates: by their names in the job, in its order."""
 
     job: Job
     templates: dict[str, RecipeTemplate]
@@ -133,10 +133,10 @@ class JobRecipes:
 
 
 def load_job(path: Path) -> Job:
-    """The job in a YAML file.
+    """Read the job in a YAML file.
 
     Raises:
-        RecipeError: there is no such file, or it is no valid job; one line for each problem.
+        RecipeError: the file does not exist, or is no valid job; one line for each problem.
     """
     missing = "no such file; a job is a YAML file"
     too_large = "name scenes by a pattern (*)"
@@ -145,8 +145,13 @@ def load_job(path: Path) -> Job:
 
 
 def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None = None) -> Job:
-    """The job in YAML `text`. source: stands before the line in messages. name: the default.
-    folder: where the files lie that its `set` names.
+    """Read the job in YAML `text`.
+
+    Args:
+        text: the YAML.
+        source: words before the line number in messages.
+        name: default of the job's name.
+        folder: folder of the files that its `set` names.
 
     Raises:
         RecipeError: it is no valid job; one line for each problem.
@@ -177,7 +182,7 @@ def parse_job(text: str, *, source: str, name: str = "job", folder: Path | None 
 
 
 def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
-    """The job's recipes from their presets and files. folder: where relative paths start.
+    """Load the job's recipes from their presets and files. folder: where relative paths start.
 
     Raises:
         RecipeError: a recipe is missing or invalid.
@@ -211,7 +216,11 @@ def seed_for_scene(seed: int, scene_name: str) -> int:
 
 
 def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
-    """The recipe at another resolution, its render.scale; RecipeError beyond the limits."""
+    """Return the recipe at another resolution, its render.scale.
+
+    Raises:
+        RecipeError: the scale is beyond the limits.
+    """
     if scale == 1:
         return recipe
     try:

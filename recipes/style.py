@@ -1,6 +1,6 @@
-"""The recipe section of style: the colour mood of a photograph, or of a preset.
+"""Recipe section of style: the colour mood of a photograph, or of a preset.
 
-The presets come with the package: statistics of colours, in YAML, and no picture.
+The presets come with the package: statistics of colours, in YAML, without pictures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ StyleName = Annotated[str, Strict(), STYLES]
 
 
 def style_preset_text(name: str) -> str:
-    """The YAML of a style: mean and covariance of the colours of land and of sky.
+    """Return the YAML of a style: mean and covariance of the colours of land and of sky.
 
     Raises:
         RecipeError: there is no style of that name.
@@ -41,7 +41,7 @@ class Style(EffectModel):
     model_config = ConfigDict(json_schema_extra=one_of("image", "preset"))
     later_fields = ("evaluated",)
     file_fields = ("image", "mask", "checkpoint")
-    meant_by = (
+    synonyms = (
         ("style", "mood look"),
         ("image", "photo picture file path"),
         ("mask", "sky_mask"),
@@ -57,7 +57,7 @@ class Style(EffectModel):
             ("sh", "color"),
             "map folded into the scene or put on each colour",
             9,
-            works=lambda style: style.applied_to == "scene",
+            applies_to=lambda style: style.applied_to == "scene",
         ),
     )
     columns = (
@@ -126,10 +126,10 @@ class Style(EffectModel):
 
     @property
     def changes(self) -> bool:
-        """A style of no strength changes nothing."""
+        """Return False for a style without strength, which changes nothing."""
         return self.strength > 0
 
     @property
     def name(self) -> str:
-        """Name of the preset, or of the image's file without its folders."""
+        """Return the name of the preset, or of the image's file without its folders."""
         return self.preset or PurePath(self.image or "").name

@@ -299,7 +299,7 @@ def _read_camera(
 
 
 def _read_image_size(calibration_lines: KeyedLines, key: str) -> tuple[int, int] | None:
-    """Return the width and height that the calibration states for a camera, or None if it has none."""
+    """Return the width and height of a camera's image in the calibration, or None without them."""
     if not key.startswith("S_rect") or key not in calibration_lines.lines:
         return None
     width, height = calibration_lines.numbers(key, 2)

@@ -60,7 +60,9 @@ def gatherer() -> SkyGatherer:
     return SkyGatherer(32, math.radians(15))
 
 
-def observed(*bodies: Body, views: list[View], sky: SkyGatherer | None = None) -> list[SurfelColours]:
+def observed(
+    *bodies: Body, views: list[View], sky: SkyGatherer | None = None
+) -> list[SurfelColours]:
     seen, problems = observe_views(bodies, views, sky or gatherer(), image_scale=1.0)
     assert problems == ()
     return list(seen)
