@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from adapters.camera_files.paths import with_camera_path
-from adapters.detect_format import looked_for, recognised
+from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.scene_cache import cached_scene
 from adapters.uri import (
     CAMERA_PATH_KEY,
@@ -94,10 +94,10 @@ def _with_ground(scene: Scene, text: str) -> Scene:
 def recognise(path: Path) -> str:
     """Return the scheme of a path by its contents."""
     _check_there(path)
-    scheme = recognised(path)
+    scheme = detect_scheme(path)
     if scheme is None:
         raise AdapterError(
-            f"{path}: not recognised as a scene. {looked_for(path)}. "
+            f"{path}: not recognised as a scene. {describe_unrecognised(path)}. "
             f"Or name the scheme: {known_schemes()}"
         )
     return scheme

@@ -1,8 +1,7 @@
-"""Detect the kind of scene that a path holds, from names in a folder and the first bytes of
-files.
+"""Detect the kind of scene that a path holds, from names in folders and the first bytes of files.
 
-`recognised` returns the scheme, `looked_for` explains a failure, `source_tree` finds the dataset
-behind a scene. The callers are `adapters.base` and `tools`.
+`detect_scheme` returns the scheme, `describe_unrecognised` explains a failure, `source_tree` finds
+the dataset behind a scene. The callers are `adapters.base` and `tools`.
 """
 
 from __future__ import annotations
@@ -134,7 +133,7 @@ class Signature:
     what: str
 
 
-def recognised(path: Path) -> str | None:
+def detect_scheme(path: Path) -> str | None:
     """Return the scheme of a path's contents, or None if they are not known."""
     signatures = FILES if path.is_file() else FOLDERS
     try:
@@ -143,7 +142,7 @@ def recognised(path: Path) -> str | None:
         raise AdapterError(f"{path}: cannot be read: {error}") from error
 
 
-def looked_for(path: Path) -> str:
+def describe_unrecognised(path: Path) -> str:
     """Return sentences on a path that is not recognised.
 
     They say what lies at the path or below it, what it lacks, and what was looked for.
@@ -247,7 +246,7 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
     for level in ("*", "*/*"):
         for entry in sorted(itertools.islice(folder.glob(level), _MAX_ENTRIES)):
             with contextlib.suppress(OSError, AdapterError):  # another user's
-                if entry.is_dir() and recognised(entry) is not None:
+                if entry.is_dir() and detect_scheme(entry) is not None:
                     yield entry
 
 

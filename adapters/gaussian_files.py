@@ -218,8 +218,8 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
     best = int(scores.argmax())
     other_scores = scores[ups @ ups[best] < _OTHER_WAY]
     rival = max(float(other_scores.max(initial=0.0)), 1e-6)
-    up, at = surface.refined(ups[best], places[best])
-    return GroundPlane(_snapped(up), *surface.judge(up, at), float(scores[best]) / rival)
+    up, at = surface.refine_plane(ups[best], places[best])
+    return GroundPlane(_snap_to_axis(up), *surface.judge(up, at), float(scores[best]) / rival)
 
 
 def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, str] | None:
@@ -331,7 +331,7 @@ class _Surface:
         share, below, above = self.judge(up, at)
         return (share - _COUNTERPART * above) * math.exp(-below / _MUCH_BELOW)
 
-    def refined(self, up: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def refine_plane(self, up: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the plane through the nearby surface, by least squares in ever closer
         surroundings.
         """
@@ -363,7 +363,7 @@ def _voxel_means(points: np.ndarray, size: float) -> np.ndarray:
     return (sums / count[:, None])[count >= 0.05 * np.median(count[voxel])]
 
 
-def _snapped(up: np.ndarray) -> np.ndarray:
+def _snap_to_axis(up: np.ndarray) -> np.ndarray:
     axis = np.zeros(3)
     index = int(np.abs(up).argmax())
     axis[index] = math.copysign(1.0, up[index])
@@ -566,14 +566,14 @@ class _World:
     Attributes:
         change: from the file's world to the scene's.
         problems: sentences on what is estimated or in doubt.
-        lacking: words for what of up and scale is not known; empty if both are.
+        unknown_facts: words for what of up and scale is not known; empty if both are.
     """
 
     change: WorldChange
     knows_up: bool
     is_metric: bool
     problems: tuple[str, ...]
-    lacking: str
+    unknown_facts: str
 
 
 def _find_world(
@@ -592,7 +592,7 @@ def _find_world(
             f"Give scale=METRES_PER_UNIT (scale=1 if it is in metres); {about_scale}"
         )
     facts = ((knows_up, "which way is up"), (is_metric, "how long a unit is"))
-    lacking = " and ".join(what for is_known, what in facts if not is_known)
+    unknown_facts = " and ".join(what for is_known, what in facts if not is_known)
     problems = [f"{file}: {sentence}" for sentence in (about_scale, about_up) if sentence]
     means = splats.gaussians.means
     sample = means[:: 1 + len(means) // 100_000].double().numpy() + splats.origin
@@ -605,7 +605,7 @@ def _find_world(
             "before is lost"
         )
     change = WorldChange(turned.rotation, scale, origin)
-    return _World(change, knows_up, is_metric, tuple(problems), lacking)
+    return _World(change, knows_up, is_metric, tuple(problems), unknown_facts)
 
 
 def _find_up(
@@ -680,10 +680,10 @@ def _frames_and_ground(
     change = world.change
     is_metric = world.is_metric
     if not views:
-        if options.path == "auto" and world.lacking:
+        if options.path == "auto" and world.unknown_facts:
             note = (
-                f"{NO_CAMERAS}, and no path is made where it is not known {world.lacking}; add "
-                "?up=+z&scale=1 to the file's name (its axis that points up, metres per unit), "
+                f"{NO_CAMERAS}, and no path is made where it is not known "
+                f"{world.unknown_facts}; add ?up=+z&scale=1 to the file's name (its axis that points up, metres per unit), "
                 "path=orbit to circle it as it lies, or camera_path=FILE"
             )
             return (), None, [note]

@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from tqdm import tqdm
 
 from adapters.lidar_scene.split import indices_between, inside_box
-from adapters.plain_files import Number, check_image, read_json, validated
+from adapters.plain_files import Number, check_image, read_json, validate_content
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -48,7 +48,7 @@ from adapters.raw_drive import (
     find_objects,
     is_usable,
     names_in,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     usable_images,
     world_classes,
@@ -185,13 +185,15 @@ def read_frames(
         Frame(
             index=n,
             timestamp_ns=int(times_ns[n]),
-            world_from_ego=recentred(world_from_ego[n], origin),
+            world_from_ego=recenter_pose(world_from_ego[n], origin),
             cameras={
                 name: Camera(
                     name,
                     *camera.size,
                     **camera.lens.model_dump(),
-                    camera_from_world=invert_rigid(recentred(camera.world_from_camera[n], origin)),
+                    camera_from_world=invert_rigid(
+                        recenter_pose(camera.world_from_camera[n], origin)
+                    ),
                     timestamp_ns=int(camera.timestamps_ns[n]),
                 )
                 for name, camera in cameras.items()
@@ -222,7 +224,7 @@ def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_camera(folder: Path, frames: int) -> _CameraTrack:
     path = folder / "intrinsics.json"
-    lens = validated(_Lens, read_json(path), str(path))
+    lens = validate_content(_Lens, read_json(path), str(path))
     poses = _read_poses(folder / "poses.json")
     if len(poses) != frames:
         raise AdapterError(
@@ -246,7 +248,9 @@ def _read_camera(folder: Path, frames: int) -> _CameraTrack:
 def _read_times(path: Path, expected: int) -> np.ndarray:
     """Read times in nanoseconds, int64 [expected]."""
     entries = enumerate(read_json(path, list))
-    times = np.array([validated(_Seconds, t, f"{path}, frame {n}, seconds") for n, t in entries])
+    times = np.array(
+        [validate_content(_Seconds, t, f"{path}, frame {n}, seconds") for n, t in entries]
+    )
     if len(times) != expected:
         raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
     if not (np.diff(times) > 0).all():
@@ -260,7 +264,10 @@ def _read_times(path: Path, expected: int) -> np.ndarray:
 
 def _read_poses(path: Path) -> np.ndarray:
     """Read rigid transforms, float64 [F, 4, 4]."""
-    poses = [validated(_Pose, p, f"{path}, frame {n}") for n, p in enumerate(read_json(path, list))]
+    poses = [
+        validate_content(_Pose, p, f"{path}, frame {n}")
+        for n, p in enumerate(read_json(path, list))
+    ]
     if not poses:
         raise AdapterError(f"{path} holds no poses")
     headings = np.array([(p.heading.w, p.heading.x, p.heading.y, p.heading.z) for p in poses])

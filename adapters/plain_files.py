@@ -125,7 +125,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def validated(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
+def validate_content(kind: type[Value], content: object, where: str, *, hint: str = _MEND) -> Value:
     """Validate the content of a file as a pydantic model, or as another type that pydantic
     validates.
 
@@ -256,7 +256,7 @@ def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     return pose
 
 
-def inside(root: Path, name: str, where: str) -> Path:
+def resolve_inside(root: Path, name: str, where: str) -> Path:
     """Return the path of a dataset's file that a table names relative to the dataset's folder.
 
     Absolute names and '..' are refused. Links are followed as long as they stay in the folder; the

@@ -156,7 +156,7 @@ def drive_origin(positions_m: np.ndarray) -> np.ndarray:
     return np.round(positions_m[0]) if far else np.zeros(3)
 
 
-def recentred(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
+def recenter_pose(world_from_thing: np.ndarray, world_origin_m: np.ndarray) -> torch.Tensor:
     """Return a pose [4, 4] of the dataset's world in the scene's."""
     pose = world_from_thing.copy()
     pose[:3, 3] -= world_origin_m
@@ -692,7 +692,7 @@ def scene_of_drive(
     # Labels are read without the kernels that scenes are built by.
     from adapters.lidar_scene.scene import build_lidar_scene
 
-    drive = _checked(drive)
+    drive = _check_frames_of_reference(drive)
     numbers = describe_frames([frame.index for frame in drive.used])
     held_out = " that are not held out" if drive.held_out else ""
     first = "".join(f"; {problem}" for problem in drive.problems[:_MAX_FAULTS])
@@ -713,7 +713,7 @@ def scene_of_drive(
     return build_lidar_scene(drive, options, added=added, ground=ground)
 
 
-def _checked(drive: RawDrive) -> RawDrive:
+def _check_frames_of_reference(drive: RawDrive) -> RawDrive:
     """Return the drive without returns beyond any LiDAR's reach, and with sentences on wrong
     frames.
     """

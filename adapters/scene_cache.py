@@ -39,7 +39,7 @@ from typing import Any
 from llvmlite.binding import get_host_cpu_name
 
 import augment
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.scene_folder import with_images_in
 from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
@@ -92,7 +92,7 @@ def cached_scene(
         return build()
     stored_scene = _read(folder, key)
     if stored_scene is None or not _has_images(stored_scene, folder):
-        with _alone(folder, key) as can_write:
+        with _lock_entry(folder, key) as can_write:
             stored_scene = _read(folder, key) if can_write else None  # by another process meanwhile
             if stored_scene is None or not _has_images(stored_scene, folder):
                 scene = build()
@@ -297,12 +297,12 @@ def scene_digest(uri: str) -> str | None:
     """
     try:
         scheme, path, query = parse_uri(uri)
-        scheme = scheme or recognised(Path(path))
+        scheme = scheme or detect_scheme(Path(path))
         entry = SCHEMES[scheme or ""]
         if path in entry.builtin:
             return _sha256([_DIGEST_FORMAT, scheme, sorted(query.items()), augment.__version__])
         files = _digest_files(str(scheme), path, query)
-        return _remembered([scheme, os.path.abspath(path), sorted(query.items())], files)
+        return _cached_digest([scheme, os.path.abspath(path), sorted(query.items())], files)
     except (KeyError, OSError, ClimateGSError):
         return None
 
@@ -345,7 +345,7 @@ def _visible_files(folder: Path) -> Iterator[Path]:
         yield from (Path(place, name) for name in names if name[0] != ".")
 
 
-def _remembered(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str:
+def _cached_digest(names: list[Any], files: Mapping[str, tuple[Path, bool]]) -> str:
     """Return the digest of the files, from the user's cache folder if none has changed since."""
     stats = {name: file.stat() for name, (file, _) in sorted(files.items()) if file.is_file()}
     if not stats:
@@ -419,7 +419,7 @@ def _store(scene: Scene, folder: Path, key: str, limit_bytes: float) -> None:
         os.replace(new, new.with_name(f"{key}-{_digest_of(new)}{SCENE_SUFFIX}"))
         _make_room(folder, limit_bytes)
     except (OSError, ClimateGSError) as error:
-        _complain(folder, error)
+        _warn_once(folder, error)
 
 
 def _make_room(folder: Path, limit_bytes: float) -> None:
@@ -438,7 +438,7 @@ def _make_room(folder: Path, limit_bytes: float) -> None:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path, key: str) -> Iterator[bool]:
+def _lock_entry(folder: Path, key: str) -> Iterator[bool]:
     """Let one process build a scene while others that want the same wait.
 
     It yields True if the folder can be written. Without the system's locks, each process builds its
@@ -450,7 +450,7 @@ def _alone(folder: Path, key: str) -> Iterator[bool]:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock = open_lock(path)
         except (OSError, OutputError) as error:
-            _complain(folder, error)
+            _warn_once(folder, error)
             yield False
             return
         stack.callback(os.close, lock)
@@ -474,7 +474,7 @@ def _digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()[:32]
 
 
-def _complain(folder: Path, error: Exception) -> None:
+def _warn_once(folder: Path, error: Exception) -> None:
     """Log once per process that scenes cannot be cached."""
     if folder not in _complained:
         logger.warning("scenes are not kept in %s for the next command: %s", folder, error)

@@ -61,7 +61,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     assert scene.recorded_source is not None
     recorded = _recording(scene.recorded_source, saved.working_folder)
     if _DATA_KEY in query:
-        new_recording = _given(query[_DATA_KEY])
+        new_recording = _recording_of_query(query[_DATA_KEY])
         if recorded is not None:
             moved = (
                 with_images_in(new_recording.path, frame, recorded.path) for frame in scene.frames
@@ -109,7 +109,7 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
     return SCHEMES[recording.scheme].open_labels(recording.path, query)
 
 
-def _given(uri: str) -> Recording:
+def _recording_of_query(uri: str) -> Recording:
     """Return the recording of the `data` key."""
     from adapters.base import recognise
 

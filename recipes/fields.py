@@ -156,7 +156,7 @@ def one_of(*names: str) -> JsonDict:
 
 
 @functools.cache
-def packaged(folder: str) -> tuple[str, ...]:
+def packaged_names(folder: str) -> tuple[str, ...]:
     """Return the stems of the YAML files in a folder of this package, in alphabetical order."""
     names = (Path(entry.name) for entry in resources.files("recipes").joinpath(folder).iterdir())
     return tuple(sorted(path.stem for path in names if path.suffix == ".yaml"))

@@ -38,7 +38,7 @@ def with_digest(recipe: Recipe) -> Recipe:
             continue
         try:
             hashes = {name: _hash(section, name) for name in section.files}
-            recipe = replaced(recipe, f"{path}.digest", _checked_digest(section, hashes))
+            recipe = replaced(recipe, f"{path}.digest", _check_digest(section, hashes))
         except ValueError as error:
             raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
     return recipe
@@ -56,7 +56,7 @@ def read_files(section: EffectModel) -> dict[str, bytes]:
             with _open(section, name) as file:
                 contents[name] = file.read()
         hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
-        _checked_digest(section, hashes)
+        _check_digest(section, hashes)
     except (ValueError, OSError) as error:
         raise RecipeError(str(error)) from None
     return contents
@@ -168,7 +168,7 @@ def _hash(section: EffectModel, name: str) -> str:
             raise ValueError(f"{_field_in_words(section, name)}: cannot be read: {error}") from None
 
 
-def _checked_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
+def _check_digest(section: EffectModel, hashes: Mapping[str, str]) -> str:
     digest = digest_of(hashes)
     recipe_digest: str | None = found(section, "digest")
     if recipe_digest not in (None, digest):

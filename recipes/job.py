@@ -25,14 +25,14 @@ Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
 Name = Annotated[str, Field(pattern=_NAME, strict=True)]
 
 
-def _in_full(key: str) -> BeforeValidator:
+def _expand_text(key: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
 
 
 ALL = ("all",)
 
 
-def _all_by_word(value: Any) -> Any:
+def _parse_all(value: Any) -> Any:
     return ALL if value == "all" else value
 
 
@@ -45,7 +45,7 @@ class JobScene(Closed):
     """Its folder in the output, where the scene's own will not do."""
     frames: Text = "all"
     """Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene."""
-    cameras: Annotated[tuple[Text, ...] | None, BeforeValidator(_all_by_word)] = Field(
+    cameras: Annotated[tuple[Text, ...] | None, BeforeValidator(_parse_all)] = Field(
         default=None, min_length=1
     )
     """Names of cameras; null for all, but of a fitted scene those that it was fitted to; `all` for
@@ -80,9 +80,9 @@ class Job(Closed):
     """Version of the format."""
     name: Name = "job"
     """The file's name if absent."""
-    scenes: tuple[Annotated[JobScene, _in_full("uri")], ...] = Field(min_length=1)
+    scenes: tuple[Annotated[JobScene, _expand_text("uri")], ...] = Field(min_length=1)
     """URIs, or mappings with a uri."""
-    recipes: tuple[Annotated[JobRecipe, _in_full("recipe")], ...] = Field(min_length=1)
+    recipes: tuple[Annotated[JobRecipe, _expand_text("recipe")], ...] = Field(min_length=1)
     """Presets and files, or mappings with a recipe."""
     draws: Literal["per_scene", "shared"] = "per_scene"
     """per_scene draws a recipe's ranges anew for every scene; shared gives variant k of a recipe
@@ -95,7 +95,7 @@ class Job(Closed):
     @model_validator(mode="after")
     def _names_known_recipes(self) -> Job:
         names = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
-        if repeated := _repeated(names):
+        if repeated := _repeated_names(names):
             raise ValueError(f"recipes are called the same: {repeated}; give one of them a name")
         for scene in self.scenes:
             for name in scene.recipes or ():
@@ -108,7 +108,7 @@ class Job(Closed):
         return self
 
 
-def _repeated(names: list[str]) -> str:
+def _repeated_names(names: list[str]) -> str:
     return ", ".join(sorted({name for name in names if names.count(name) > 1}))
 
 
@@ -201,7 +201,7 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
         if entry.variants is not None:
             template = dataclasses.replace(template, variants=entry.variants)
         templates[name] = template
-    if repeated := _repeated([template.name for template in templates.values()]):
+    if repeated := _repeated_names([template.name for template in templates.values()]):
         raise RecipeError(
             f"job {job.name}: recipes write to the same folders: {repeated}; give one of them a "
             "name in the job"

@@ -13,7 +13,7 @@ from ruamel.yaml.nodes import Node as YamlNode
 from ruamel.yaml.representer import SafeRepresenter
 
 from recipes.errors import Place, Problems, RecipeError, did_you_mean, short
-from recipes.fields import packaged, packaged_text
+from recipes.fields import packaged_names, packaged_text
 from recipes.files import file_below, open_file
 from recipes.guesses import show
 from recipes.ranges import is_number
@@ -107,7 +107,7 @@ def read_overrides(
 
 def preset_names() -> tuple[str, ...]:
     """Return the names of the recipes that come with the package, in alphabetical order."""
-    return packaged("presets")
+    return packaged_names("presets")
 
 
 def describe_preset(name: str) -> str:
@@ -163,7 +163,7 @@ def _template(
     problems = Problems()
     tree = _read_mapping(text, place, problems)
     for path, value in (overrides or {}).items():
-        tree = _merged(tree, _override(path, value), recipe_file())
+        tree = _merge_trees(tree, _override(path, value), recipe_file())
     _check_version(tree)
     if name is not None and "name" not in tree:
         tree["name"] = ScalarNode(place, name, name)
@@ -229,7 +229,7 @@ def _with_parents(tree: MapNode, place: Place, problems: Problems) -> MapNode:
         parent_tree = _read_mapping(text, place, problems)
         _check_version(parent_tree)
         parent_tree.pop("name", None)
-        tree = _merged(parent_tree, tree, recipe_file())
+        tree = _merge_trees(parent_tree, tree, recipe_file())
     return tree
 
 
@@ -257,7 +257,7 @@ def _read_parent(parent: Node) -> tuple[str, Place]:
         raise place.error(f"extends = {show(parent)}: {text}") from None
 
 
-def _merged(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
+def _merge_trees(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
     """Return `base` with the fields of `changes` in place of its own; sections merge."""
     entries = dict(base)
     for name, node in changes.items():
@@ -268,7 +268,7 @@ def _merged(base: MapNode, changes: MapNode, section: type[Section]) -> MapNode:
             and isinstance(base_node, MapNode)
             and isinstance(node, MapNode)
         ):
-            entries[name] = _merged(base_node, node, inner_section)
+            entries[name] = _merge_trees(base_node, node, inner_section)
         else:
             entries[name] = node
     return MapNode(changes.place, entries)

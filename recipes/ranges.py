@@ -100,7 +100,9 @@ class Uniform:
             number = low + unit * (high - low + 1)
         else:
             number = low + unit * (high - low)
-        return _floor(number, low, high) if is_whole else _rounded(number, low, high)
+        return (
+            _floor_to_range(number, low, high) if is_whole else _round_to_range(number, low, high)
+        )
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
@@ -134,8 +136,8 @@ class Normal:
         probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
         number = normal.inv_cdf(probability)
         if is_whole:
-            return _floor(number + 0.5, self.low, self.high)
-        return _rounded(number, self.low, self.high)
+            return _floor_to_range(number + 0.5, self.low, self.high)
+        return _round_to_range(number, self.low, self.high)
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
@@ -192,7 +194,7 @@ class TripleLine:
     def draw(self, draws: Draws, path: str) -> Triple:
         unit = draws.unit(path)
         ends = zip(self.start, self.end, strict=True)
-        return as_triple(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+        return as_triple(_round_to_range(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
 
     def probes(self) -> tuple[Triple, ...]:
         return (self.start, self.end)
@@ -222,11 +224,11 @@ class Channels:
 Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
 
 
-def _rounded(number: float, low: float, high: float) -> float:
+def _round_to_range(number: float, low: float, high: float) -> float:
     return min(max(float(f"{number:.10g}"), low), high)
 
 
-def _floor(number: float, low: float, high: float) -> int:
+def _floor_to_range(number: float, low: float, high: float) -> int:
     return min(max(math.floor(number), int(low)), int(high))
 
 

@@ -12,12 +12,21 @@ from pydantic import ConfigDict, Field, Strict, model_validator
 
 from recipes.effect import Column, EffectModel, Knob
 from recipes.errors import RecipeError
-from recipes.fields import Digest, FilePath, Flag, Number, OneOf, one_of, packaged, packaged_text
+from recipes.fields import (
+    Digest,
+    FilePath,
+    Flag,
+    Number,
+    OneOf,
+    one_of,
+    packaged_names,
+    packaged_text,
+)
 
 
 def style_preset_names() -> tuple[str, ...]:
     """Return the names of the style presets, in alphabetical order."""
-    return packaged("styles")
+    return packaged_names("styles")
 
 
 STYLES = OneOf("style", style_preset_names)

@@ -43,7 +43,7 @@ from adapters.av2.files import (
     sensor_of_laser,
 )
 from adapters.lidar_scene.image_views import read_image
-from adapters.plain_files import inside
+from adapters.plain_files import resolve_inside
 from adapters.raw_drive import (
     BoxSample,
     DriveImages,
@@ -57,7 +57,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     usable_images,
 )
@@ -294,7 +294,11 @@ class Av2Log:
     def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
         """Return the file of a frame's sweep."""
         stamp = self._stamp(frame_index)
-        return () if stamp is None else (inside(self.root, _sweep_name(stamp), str(self.root)),)
+        return (
+            ()
+            if stamp is None
+            else (resolve_inside(self.root, _sweep_name(stamp), str(self.root)),)
+        )
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
         """Return the content of a file that holds the sweep.
@@ -522,7 +526,7 @@ def _image_stamps(log: Av2Log, camera: str) -> tuple[np.ndarray, int]:
 
 
 def _image_file(log: Av2Log, camera: str, stamp_ns: int) -> Path:
-    return inside(log.root, f"sensors/cameras/{camera}/{stamp_ns}.jpg", str(log.root))
+    return resolve_inside(log.root, f"sensors/cameras/{camera}/{stamp_ns}.jpg", str(log.root))
 
 
 def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
@@ -613,7 +617,7 @@ def _frame(
     cameras = {}
     for (name, time), city_from_ego in zip(image_times.items(), poses[1:], strict=True):
         lens = log.lenses[name]
-        pose = recentred(city_from_ego @ lens.ego_from_camera, origin)
+        pose = recenter_pose(city_from_ego @ lens.ego_from_camera, origin)
         cameras[name] = Camera(
             name,
             *lens.size,
@@ -624,7 +628,7 @@ def _frame(
     return Frame(
         index=number,
         timestamp_ns=stamp,
-        world_from_ego=recentred(poses[0], origin),
+        world_from_ego=recenter_pose(poses[0], origin),
         cameras=cameras,
         image_paths=images.paths.get(number, {}),
     )

@@ -24,7 +24,7 @@ import pyarrow as pa
 from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation, Slerp
 
-from adapters.plain_files import LARGEST, Number, inside, read_json, validated
+from adapters.plain_files import LARGEST, Number, read_json, resolve_inside, validate_content
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError, read_npy
 from augment.files.stated_sizes import StatedSizeError, check_texts, read_feather
@@ -53,7 +53,7 @@ def read_columns(root: Path, name: str) -> Columns:
     Raises:
         AdapterError: the file is missing, or is no file of Feather's second version.
     """
-    path = inside(root, name, str(root))
+    path = resolve_inside(root, name, str(root))
     try:
         with open_file(path) as file:
             table = read_feather(file.read())
@@ -406,7 +406,7 @@ class GroundMap:
                 f"{heights} must hold heights [rows, columns]; it holds {values.dtype} "
                 f"{list(values.shape)}"
             )
-        stated_grid = validated(_Grid, read_json(grid), str(grid))
+        stated_grid = validate_content(_Grid, read_json(grid), str(grid))
         rotation = np.array(stated_grid.R).reshape(2, 2)
         if not np.allclose(rotation @ rotation.T, np.eye(2), atol=_UNIT_TOLERANCE):
             raise AdapterError(
@@ -466,13 +466,13 @@ def _find_map_file(root: Path, pattern: str) -> Path | None:
             f"{root / 'map'} holds {len(paths)} files {pattern}, of which a log has one: "
             f"{', '.join(path.name for path in paths[:3])}; leave its own"
         )
-    return inside(root, f"map/{paths[0].name}", str(root)) if paths else None
+    return resolve_inside(root, f"map/{paths[0].name}", str(root)) if paths else None
 
 
 def _rasterize_areas(path: Path, ground: GroundMap) -> np.ndarray:
     """Return a mask of the cells in drivable areas, bool [H, W]."""
     image = np.zeros(ground.heights_m.shape, np.uint8)
-    for area in validated(_Areas, read_json(path), str(path)).drivable_areas.values():
+    for area in validate_content(_Areas, read_json(path), str(path)).drivable_areas.values():
         xy = np.array([[corner.x, corner.y] for corner in area.area_boundary])
         # OpenCV's whole numbers are the middles of pixels.
         outline = np.round((ground.cells(xy) - 0.5) * (1 << _SUBPIXEL_BITS))

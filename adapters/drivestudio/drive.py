@@ -39,11 +39,11 @@ from adapters.camera_files.camera_files import validate
 from adapters.plain_files import (
     Number,
     array_of,
-    inside,
     read_json,
     read_numbers,
     read_pose,
     read_yaml,
+    resolve_inside,
 )
 from adapters.raw_drive import DriveOptions, stored_records
 from adapters.uri import UriOptions
@@ -340,7 +340,7 @@ def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
             )
         return path
     if options.checkpoint is not None:
-        checkpoint = inside(folder, options.checkpoint, "checkpoint=")
+        checkpoint = resolve_inside(folder, options.checkpoint, "checkpoint=")
         if not checkpoint.is_file():
             names = ", ".join(sorted(p.name for p in folder.glob("checkpoint_*.pth"))) or "none"
             raise AdapterError(f"{checkpoint} does not exist; the run has {names}")

@@ -62,7 +62,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_in_box,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     stored_records,
     usable_images,
@@ -456,7 +456,7 @@ def _read_sweeps(
 
 def _frame(source: DriveSource, images: DriveImages, number: int) -> Frame:
     """Return a frame with all cameras of the calibration."""
-    pose = recentred(source.labels.world_from_velodyne[number], source.world_origin_m)
+    pose = recenter_pose(source.labels.world_from_velodyne[number], source.world_origin_m)
     ego_from_world = invert_rigid(pose)
     time = source.labels.timestamps_ns[number]
     return Frame(

@@ -31,7 +31,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from adapters.plain_files import checked_pose, inside, parse_numbers, read_numbers, read_text
+from adapters.plain_files import (
+    checked_pose,
+    parse_numbers,
+    read_numbers,
+    read_text,
+    resolve_inside,
+)
 from adapters.raw_drive import describe_frames
 from augment.errors import AdapterError
 
@@ -154,7 +160,7 @@ def resolve_file(root: Path, name: str) -> Path:
 
     A link out of the folder raises.
     """
-    return inside(root, name, str(root))
+    return resolve_inside(root, name, str(root))
 
 
 class RectifiedCamera(NamedTuple):

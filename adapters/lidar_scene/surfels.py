@@ -574,8 +574,8 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     radius = round(CLOSE_M / CELL_M)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     inside = cv2.morphologyEx(has_ground.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-    inside |= _beside(path, origin, shape)
-    heights = _spread(heights, has_ground)
+    inside |= _is_near_path(path, origin, shape)
+    heights = _fill_holes(heights, has_ground)
     voxel_m = voxel_m * _SPARSER
     new = _candidates(heights, inside, origin, path, voxel_m)
     distance, nearest = cKDTree(ground[:, :2]).query(new[:, :2], workers=-1)
@@ -583,7 +583,7 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     return PointSet(new[missing], classes[nearest[missing]])
 
 
-def _beside(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarray:
+def _is_near_path(path: np.ndarray, origin: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return the cells within BESIDE_M of the path, bool [X, Y]: its car stood or drove there."""
     cells = np.floor((path[:, :2] - origin) / CELL_M).astype(np.int64)
     cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
@@ -606,7 +606,7 @@ def _height_grid(
     return heights, (count > 0).reshape(shape)
 
 
-def _spread(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
+def _fill_holes(heights: np.ndarray, has_ground: np.ndarray) -> np.ndarray:
     """Return heights for every cell.
 
     Holes get the smoothest surface that joins their rim (Laplace's equation, relaxed from averages

@@ -31,7 +31,7 @@ from adapters.nuscenes.tables import (
     read_tables,
     scene_frames,
 )
-from adapters.plain_files import inside
+from adapters.plain_files import resolve_inside
 from adapters.raw_drive import (
     NO_SURFACE,
     BoxSample,
@@ -44,7 +44,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     stored_records,
     usable_images,
@@ -232,7 +232,7 @@ class NuScenesLabels:
         label_names = (tables.semantic_files.get(token), tables.panoptic_files.get(token))
         names = [frame.sweep.filename, *(name for name in label_names if name is not None)]
         where = f"sample_data {token!r}"
-        files = [inside(tables.root, name, where) for name in names]
+        files = [resolve_inside(tables.root, name, where) for name in names]
         return tuple(file for file in files if file.exists()) if files[0].exists() else ()
 
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
@@ -276,7 +276,7 @@ def _read_classes(
     name = tables.semantic_files.get(sweep.token)
     if name is None:
         return None, ""
-    path = inside(tables.root, name, f"lidarseg of sample_data {sweep.token!r}")
+    path = resolve_inside(tables.root, name, f"lidarseg of sample_data {sweep.token!r}")
     try:
         classes = np.frombuffer(_read_bytes(path), np.uint8)
     except FileNotFoundError:
@@ -456,7 +456,7 @@ def read_nuscenes(path: str, query: dict[str, str], options: NuScenesOptions) ->
 
 def _path(tables: SceneTables, file: SensorFile) -> Path:
     """Return the path of a file of the dataset."""
-    return inside(tables.root, file.filename, f"sample_data {file.token!r}")
+    return resolve_inside(tables.root, file.filename, f"sample_data {file.token!r}")
 
 
 def _frame(file: FrameFiles, origin: np.ndarray, paths: Mapping[str, str]) -> Frame:
@@ -464,13 +464,13 @@ def _frame(file: FrameFiles, origin: np.ndarray, paths: Mapping[str, str]) -> Fr
     return Frame(
         index=file.index,
         timestamp_ns=file.sweep.timestamp_ns,
-        world_from_ego=recentred(file.sweep.world_from_ego, origin),
+        world_from_ego=recenter_pose(file.sweep.world_from_ego, origin),
         cameras={
             name: Camera(
                 name,
                 *image.size,
                 *image.intrinsic,
-                camera_from_world=invert_rigid(recentred(image.world_from_sensor, origin)),
+                camera_from_world=invert_rigid(recenter_pose(image.world_from_sensor, origin)),
                 timestamp_ns=image.timestamp_ns,
             )
             for name, image in sorted(file.images.items())

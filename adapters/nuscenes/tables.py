@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, FailFast, Field
 from scipy.spatial.transform import Rotation
 
-from adapters.plain_files import Number, Text, inside, validated
+from adapters.plain_files import Number, Text, resolve_inside, validate_content
 from adapters.raw_drive import DriveOptions
 from augment.errors import AdapterError
 from augment.labels import Boxes
@@ -181,7 +181,7 @@ class Row(NamedTuple):
 
     def read(self, model: type[_Model]) -> _Model:
         """Return the row's fields as a model."""
-        return validated(model, self.fields, str(self))
+        return validate_content(model, self.fields, str(self))
 
     def fault(self, field: str, expected: str) -> AdapterError:
         """Return the error that a field is not as expected."""
@@ -545,7 +545,7 @@ def _read_files(root: Path, folder: Path, samples: Mapping[str, Row]) -> tuple[S
         channel, calibration = channels[row.text("calibrated_sensor_token")]
         is_camera = isinstance(calibration, _CameraRow)
         data = row.read(_ImageRow if is_camera else _DataRow)
-        inside(root, data.filename, f"{row}: field 'filename'")
+        resolve_inside(root, data.filename, f"{row}: field 'filename'")
         files.append(
             SensorFile(
                 token=row.token,
@@ -638,7 +638,7 @@ def _files_of_sweeps(root: Path, path: Path, lidar: Sequence[SensorFile]) -> dic
     for row in read_rows(path):
         sweep = row.text("sample_data_token")
         if sweep in sweeps:
-            inside(root, row.text("filename"), f"{row}: field 'filename'")
+            resolve_inside(root, row.text("filename"), f"{row}: field 'filename'")
             files[sweep] = row.text("filename")
     return files
 

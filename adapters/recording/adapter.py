@@ -54,10 +54,10 @@ from adapters.recording.files import (
     Calibration,
     block_files,
     find_images,
-    inside,
     numbered_files,
     read_calibration,
     read_lidar_classes,
+    resolve_inside,
     unlisted_images,
 )
 from adapters.uri import format_uri
@@ -193,7 +193,7 @@ def all_boxes(root: Path) -> dict[int, FrameBoxes]:
     They are read from labels/boxes.parquet, or else from a job's blocks, each of which has all
     boxes of its frames."""
     path = root / "labels" / "boxes.parquet"
-    single_file = [inside(root, path)] if path.exists() else None
+    single_file = [resolve_inside(root, path)] if path.exists() else None
     boxes_by_frame: dict[int, FrameBoxes] = {}
     for path in single_file or block_files(root, "labels/boxes", ".parquet"):
         boxes_by_frame = read_frame_boxes(path) | boxes_by_frame

@@ -35,7 +35,7 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, BaseModel, Field
 
-from adapters.plain_files import Number, read_json, validated
+from adapters.plain_files import Number, read_json, validate_content
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError, SceneError
@@ -68,7 +68,7 @@ def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int
             raise AdapterError(
                 f"{paths[number]} and {path} are both of frame {number}; delete one of them"
             )
-        paths[number] = inside(root, path)
+        paths[number] = resolve_inside(root, path)
     return paths
 
 
@@ -76,10 +76,10 @@ def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
     """Return the files of a folder by blocks of frames, as a `generate` job writes them, in
     order.
     """
-    return [inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
+    return [resolve_inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
 
 
-def inside(root: Path, path: Path) -> Path:
+def resolve_inside(root: Path, path: Path) -> Path:
     """Return the path; raise AdapterError where a link in it leads out of `root`.
 
     A folder from elsewhere must not make this machine read its other files."""
@@ -245,7 +245,7 @@ class Calibration:
 def read_calibration(root: Path) -> Calibration:
     """Read the calibration of the recording in a folder."""
     path, content = _content(root)
-    settings = validated(_Settings, content, str(path), hint=_HINT)
+    settings = validate_content(_Settings, content, str(path), hint=_HINT)
     frames = sorted((_frame(path, entry) for entry in settings.frames), key=lambda f: f.index)
     for before, after in itertools.pairwise(frames):
         if after.index == before.index:
@@ -271,7 +271,7 @@ def read_calibration(root: Path) -> Calibration:
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
     """Read the calibration's lidar_classes alone."""
     path, content = _content(root)
-    return validated(_Settings, content, str(path), hint=_HINT).lidar_classes
+    return validate_content(_Settings, content, str(path), hint=_HINT).lidar_classes
 
 
 def _content(root: Path) -> tuple[Path, dict[str, Any]]:
@@ -309,11 +309,11 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
 def _frame(path: Path, content: Any) -> Frame:
     number = content.get("frame") if isinstance(content, dict) else None
     where = f"{path}, frame {number!r:.20}"
-    entry = validated(_FrameEntry, content, where, hint=_HINT)
+    entry = validate_content(_FrameEntry, content, where, hint=_HINT)
     cameras = {}
     for name, values in entry.cameras.items():
         camera_where = f"{where}, camera {name!r:.80}"
-        camera = validated(_CameraEntry, values, camera_where, hint=_HINT)
+        camera = validate_content(_CameraEntry, values, camera_where, hint=_HINT)
         lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns

@@ -25,7 +25,7 @@ from scipy.interpolate import LinearNDInterpolator
 from tqdm import tqdm
 
 from adapters.camera_files.camera_files import find_colmap_model, open_colmap_model
-from adapters.plain_files import LARGEST, decode_image, inside, read_text
+from adapters.plain_files import LARGEST, decode_image, read_text, resolve_inside
 from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
 from adapters.world import invert_pose
 from augment.errors import AdapterError
@@ -142,7 +142,7 @@ def record_colmap(
     road = find_road(shots)
     _check_path(shots, road, model)
     metres = None if camera_height_m is None else camera_height_m / road.height
-    world_from_model = _levelled(shots[0], road)
+    world_from_model = _level_pose(shots[0], road)
     residual_m = None
     if positions is not None:
         position_of_image = read_positions(positions)
@@ -316,7 +316,7 @@ def _check_path(shots: Sequence[Shot], road: Road, model: Path) -> None:
         )
 
 
-def _levelled(shot: Shot, road: Road) -> np.ndarray:
+def _level_pose(shot: Shot, road: Road) -> np.ndarray:
     """Return world_from_model in the model's unit: z up, the road at 0.
 
     The shot stands at x = y = 0 and looks along x.
@@ -435,7 +435,7 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
     """Write the image without its lens's distortion, and return width, height, fx, fy, cx, cy."""
     import pycolmap
 
-    source = inside(images, shot.name, "the model")
+    source = resolve_inside(images, shot.name, "the model")
     target = out / "images" / shot.camera / f"{shot.frame:06d}.jpg"
     target.parent.mkdir(parents=True, exist_ok=True)
     lens = shot.lens

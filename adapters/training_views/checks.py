@@ -216,7 +216,7 @@ def shared_information(points_by_view: Sequence[Points], reach: int) -> np.ndarr
     images = np.repeat(
         np.arange(len(points_by_view)), [len(p.rows[::stride]) for p in points_by_view]
     )
-    grey = _stacked([points.grey for points in points_by_view])
+    grey = _pad_and_stack([points.grey for points in points_by_view])
     ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
     a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
     bins = np.quantile(grey[images, rows, columns], ranks)
@@ -233,7 +233,7 @@ def shared_information(points_by_view: Sequence[Points], reach: int) -> np.ndarr
     return out
 
 
-def _stacked(images: Sequence[np.ndarray]) -> np.ndarray:
+def _pad_and_stack(images: Sequence[np.ndarray]) -> np.ndarray:
     """Return grey images uint8 [I, H, W]. Smaller ones are padded to the right and below."""
     size = np.max([image.shape for image in images], axis=0)
     out = np.zeros((len(images), *size), np.uint8)

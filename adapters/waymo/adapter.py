@@ -35,7 +35,7 @@ from adapters.raw_drive import (
     drive_origin,
     find_objects,
     is_usable,
-    recentred,
+    recenter_pose,
     scene_of_drive,
     world_classes,
 )
@@ -695,7 +695,7 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
         shot = segment.shots.get(n, {}).get(name)
         if shot is None:
             continue
-        pose = recentred(shot.world_from_vehicle @ mount.vehicle_from_camera, origin)
+        pose = recenter_pose(shot.world_from_vehicle @ mount.vehicle_from_camera, origin)
         cameras[name] = Camera(
             name,
             mount.lens.width,
@@ -707,7 +707,7 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
     return Frame(
         index=n,
         timestamp_ns=int(segment.pose_times_ns[n]),
-        world_from_ego=recentred(segment.world_from_vehicle[n], origin),
+        world_from_ego=recenter_pose(segment.world_from_vehicle[n], origin),
         cameras=cameras,
         image_paths=paths,
     )

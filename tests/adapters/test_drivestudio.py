@@ -16,7 +16,7 @@ from drivestudio_files import COUNT, START, STRIDE, quat_of, rotation_of, write_
 from scipy.spatial.transform import Rotation
 
 from adapters.base import open_scene
-from adapters.detect_format import recognised
+from adapters.detect_format import detect_scheme
 from adapters.drivestudio.adapter import (
     drivestudio_labels,
     open_drivestudio,
@@ -451,7 +451,7 @@ def test_options_that_cannot_be_used_are_refused(numbers):
 
 
 def test_runs_are_recognised_and_data_found(numbers, tmp_path, monkeypatch):
-    assert recognised(numbers.folder) == "drivestudio"
+    assert detect_scheme(numbers.folder) == "drivestudio"
     assert open_scene(str(numbers.folder)).name == "run"
     # A relative root is one from above the run, or from where one is.
     files.write_config(numbers.folder, Path("data"), "waymo", {})
