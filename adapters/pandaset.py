@@ -410,7 +410,7 @@ def _moving_boxes(
         (timed(frame, table) for frame, table in tables if table is not None), origin, several=True
     )
     by_frame: dict[int, list[BoxSample]] = defaultdict(list)
-    for box in objects.moving:
+    for box in objects.moving_boxes:
         by_frame[box.frame].append(box)
     return by_frame
 
@@ -507,7 +507,7 @@ class Objects:
     names: Mapping[str, str]
     ranks: Mapping[str, int]
 
-    def kept(self, uuids: Iterable[str]) -> np.ndarray:
+    def is_best_box(self, uuids: Iterable[str]) -> np.ndarray:
         """Return a mask of the boxes of one frame to keep, one per object, by their uuids."""
         uuids = list(uuids)
         best: dict[str, str] = {}
@@ -686,7 +686,7 @@ class PandaSetLabels:
         if table is None:
             return Boxes.empty()
         objects = read_objects(self.root)
-        boxes = boxes_of_cuboids(table[objects.kept(table["uuid"].astype(str))])
+        boxes = boxes_of_cuboids(table[objects.is_best_box(table["uuid"].astype(str))])
         return replace(boxes, track_ids=tuple(objects.names[uuid] for uuid in boxes.track_ids))
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:

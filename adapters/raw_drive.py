@@ -515,13 +515,13 @@ class RecordedObjects:
     """Objects of a drive.
 
     Attributes:
-        moving: samples of the objects that move, in order of frames.
-        still: one sample of each object that does not.
+        moving_boxes: samples of the objects that move, in order of frames.
+        static_boxes: one sample of each object that does not.
         problems: one sentence each.
     """
 
-    moving: tuple[BoxSample, ...]
-    still: tuple[BoxSample, ...]
+    moving_boxes: tuple[BoxSample, ...]
+    static_boxes: tuple[BoxSample, ...]
     problems: tuple[str, ...]
 
 

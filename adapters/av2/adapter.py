@@ -723,7 +723,7 @@ def _moving_boxes(
     first_sweep = np.searchsorted(stamps, frames[0].timestamp_ns, side="right") - 1
     last_sweep = np.searchsorted(stamps, frames[-1].timestamp_ns)
     return tuple(
-        box for box in objects.moving if first_sweep - 1 <= box.frame <= last_sweep + 1
+        box for box in objects.moving_boxes if first_sweep - 1 <= box.frame <= last_sweep + 1
     ), objects.problems
 
 

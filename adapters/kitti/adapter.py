@@ -410,7 +410,7 @@ def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDriv
         frames=frames,
         held_out=source.selection.held_out,
         sweeps=sweeps,
-        boxes=objects.moving,
+        boxes=objects.moving_boxes,
         labels=labels,
         world_origin_m=source.world_origin_m,
         lidar_top_deg=_LIDAR_TOP_DEG,

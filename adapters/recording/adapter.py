@@ -506,7 +506,7 @@ def read_recording(
         frames=frames,
         held_out=chosen.held_out,
         sweeps=lidar.sweeps,
-        boxes=objects.moving,
+        boxes=objects.moving_boxes,
         labels=RecordingLabels(root),
         world_origin_m=calibration.world_origin_m,
         lidar_top_deg=lidar.top_deg,
@@ -565,7 +565,7 @@ def _best_scene(
     objects = read_objects(root, drive.frames, drive.world_origin_m)
     guessed_drive = dataclasses.replace(
         drive,
-        sweeps=guess_surfaces(road, objects.moving, objects.still),
+        sweeps=guess_surfaces(road, objects.moving_boxes, objects.static_boxes),
         lidar_top_deg=_SKY_ABOVE_DEG,
         problems=(*drive.problems, *problems, start),
     )

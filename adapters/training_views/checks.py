@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from adapters.lidar_scene.depth import project_points
-from adapters.training_views.depth_priors import visible
+from adapters.training_views.depth_priors import is_visible_return
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -199,7 +199,7 @@ def project_returns(
         grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         points, intensity = returns[key.frame]
         depth_pixels, index = project_points(points, camera, near_m=near_m, margin_px=reach)
-        is_visible = visible(depth_pixels, camera)
+        is_visible = is_visible_return(depth_pixels, camera)
         rows, columns = np.divmod(depth_pixels.pixels[is_visible], camera.width)
         out.append(Points(columns, rows, intensity[index[is_visible]], grey))
     return out

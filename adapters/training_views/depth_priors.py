@@ -368,7 +368,7 @@ def hidden_returns(
     return out
 
 
-def visible(returns: DepthPixels, camera: Camera) -> np.ndarray:
+def is_visible_return(returns: DepthPixels, camera: Camera) -> np.ndarray:
     """Return True for the LiDAR's returns that the camera sees too, bool [M].
 
     A return is hidden if clearly nearer ones lie among its neighbours on three sides. One that is
@@ -457,7 +457,9 @@ class DepthSource:
             return dict.fromkeys(cameras, no_pixels)
         pixels_by_camera = {name: returns.seen_by(camera) for name, camera in cameras.items()}
         return {
-            name: pixels_by_camera[name].select(visible(pixels_by_camera[name], cameras[name]))
+            name: pixels_by_camera[name].select(
+                is_visible_return(pixels_by_camera[name], cameras[name])
+            )
             for name in cameras
         }
 

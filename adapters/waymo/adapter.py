@@ -582,7 +582,7 @@ def moving_boxes(
         times = segment.stamps_us[n] * 1000 + np.nan_to_num(share * _SPIN_NS).astype(np.int64)
         timed.append(TimedBoxes(n, boxes, times))
     objects = find_objects(timed, origin)
-    return objects.moving, objects.problems
+    return objects.moving_boxes, objects.problems
 
 
 # ---- The scene -----------------------------------------------------------------------------------
