@@ -684,7 +684,8 @@ def _frames_and_ground(
             note = (
                 f"{NO_CAMERAS}, and no path is made where it is not known "
                 f"{world.unknown_facts}; add ?up=+z&scale=1 to the file's name (its axis that "
-                "points up, metres per unit), path=orbit to circle it as it lies, or camera_path=FILE"
+                "points up, metres per unit), path=orbit to circle it as it lies, or "
+                "camera_path=FILE"
             )
             return (), None, [note]
         default_path = make_default_path(gaussians, is_metric=is_metric, kind=options.path)

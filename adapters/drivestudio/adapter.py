@@ -466,9 +466,9 @@ def _network(directions: Tensor, appearance: Tensor, layers: list[tuple[Tensor, 
     encoded = torch.cat([directions, waves.sin(), (waves + 0.5 * torch.pi).sin()], 1)
     inputs = torch.cat([encoded, appearance.expand(len(directions), -1)], 1)
     (first_weights, first_bias), (middle_weights, middle_bias), (last_weights, last_bias) = layers
-    hidden = (inputs @ first_weights.T + first_bias).relu()
-    hidden = (torch.cat([hidden, inputs], 1) @ middle_weights.T + middle_bias).relu()
-    return (hidden @ last_weights.T + last_bias).sigmoid()
+    activations = (inputs @ first_weights.T + first_bias).relu()
+    activations = (torch.cat([activations, inputs], 1) @ middle_weights.T + middle_bias).relu()
+    return (activations @ last_weights.T + last_bias).sigmoid()
 
 
 # ---- The scene -----------------------------------------------------------------------------------

@@ -160,8 +160,8 @@ class Row(NamedTuple):
 
     def __str__(self) -> str:
         name = self.fields.get("token")
-        named = repr(name) if isinstance(name, str) and name else f"number {self.number}"
-        return f"{self.path}: row {named}"
+        token_text = repr(name) if isinstance(name, str) and name else f"number {self.number}"
+        return f"{self.path}: row {token_text}"
 
     @property
     def token(self) -> str:

@@ -416,8 +416,8 @@ def _tube_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, is_hidden
     c = np.cos(angle)
     s = np.sin(angle)
     width = 2 * np.pi / counts[owner, 0]
-    one = np.ones_like(j)
-    middle, height = _cell_on_line(j, counts[owner, 1], one, one)
+    ones = np.ones_like(j)
+    middle, height = _cell_on_line(j, counts[owner, 1], ones, ones)
     sides = np.stack([xyz(-s * width, c * width, 0), xyz(0, 0, 2 * height)], 1)
     return index[owner], xyz(c, s, 2 * middle - 1), sides
 

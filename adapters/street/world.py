@@ -547,8 +547,10 @@ def _draw_patches(
         low_y = rectangle[1] - 0.1
         high_x = rectangle[2] + 0.1
         high_y = rectangle[3] + 0.1
-        others = [*occupied, *patches[0], *patches[1]]
-        if all(high_x < a[0] or a[2] < low_x or high_y < a[1] or a[3] < low_y for a in others):
+        other_rectangles = [*occupied, *patches[0], *patches[1]]
+        if all(
+            high_x < a[0] or a[2] < low_x or high_y < a[1] or a[3] < low_y for a in other_rectangles
+        ):
             patches[kind].append(rectangle)
     return patches
 

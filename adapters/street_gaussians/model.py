@@ -593,9 +593,13 @@ def _ply_problems(path: Path, config: ModelConfig) -> list[str]:
         "the colour correction": config.use_color_correction,
         "the pose correction": config.use_pose_correction,
     }
-    left_out = ", ".join(name for name, was_trained in is_trained_by_name.items() if was_trained)
+    missing_parts = ", ".join(
+        name for name, was_trained in is_trained_by_name.items() if was_trained
+    )
     advice = (
-        f"; left out: {left_out}. They are in trained_model/iteration_N.pth" if left_out else ""
+        f"; left out: {missing_parts}. They are in trained_model/iteration_N.pth"
+        if missing_parts
+        else ""
     )
     return [f"{path}: a .ply holds Gaussians only{advice}"]
 

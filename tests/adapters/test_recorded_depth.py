@@ -15,9 +15,9 @@ from adapters.training_views.depth_priors import (
     align,
     find_maps,
     find_sparse,
+    is_visible_return,
     join_priors,
     read_relative,
-    is_visible_return,
 )
 from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
