@@ -68,9 +68,9 @@ def kernels_for(backend: str, *images: Tensor | None) -> str:
     means CUDA if any of them lies on a GPU.
     """
     present_images = [image for image in images if image is not None]
-    tracking = torch.is_grad_enabled()
+    is_recording = torch.is_grad_enabled()
     if backend == REFERENCE or not all(
-        image.dtype == torch.float32 and not (tracking and image.requires_grad)
+        image.dtype == torch.float32 and not (is_recording and image.requires_grad)
         for image in present_images
     ):
         return REFERENCE

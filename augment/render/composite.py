@@ -190,6 +190,7 @@ def composite_sky(
 
 
 def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
+    """Return the image over a constant sky, by a kernel."""
     out = np.empty((*alpha.shape, 3), np.float32)
     color = sky.rgb.detach().to(torch.float32).numpy()
     with kernel_threads(ROWS):
@@ -202,6 +203,7 @@ def _composite_constant(rgb: Tensor, alpha: Tensor, sky: ConstantSky) -> Tensor:
 def _composite_cubemap(
     rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, fog: Fog | None
 ) -> Tensor:
+    """Return the image over a cube map, through fog if there is any, by a kernel."""
     out = np.empty((camera.height, camera.width, 3), np.float32)
     strength = -1.0
     gains = _gains(0.0)

@@ -105,7 +105,7 @@ def composite_cubemap(
     Args:
         rgb: float32 [H, W, 3].
         alpha: float32 [H, W].
-        faces: [6, R + 2, R + 2, 3], with a border (augment.sky.bordered_faces).
+        faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border).
         rotation: world_from_camera.
         ifx: 1 / focal length along x, 1/px.
         ify: 1 / focal length along y, 1/px.
@@ -133,12 +133,14 @@ def composite_cubemap(
         colors = rgb[i]
         alphas = alpha[i]
         target = out[i]
+        # Pixels in runs: runs without sky are copied.
         for first in range(U(0), U(width), U(_AHEAD)):
             if not _shows_sky(alphas, first, min(first + U(_AHEAD), U(width))):
                 for j in range(first, min(first + U(_AHEAD), U(width))):
                     for c in range(U(3)):
                         target[j, c] = colors[j, c]
                 continue
+            # Directions of the run's pixels, and their texels.
             for k in range(U(0), U(_AHEAD), U(LANES)):
                 u = v8.splat(np.float32(first + k)) + v8.lane_numbers()
                 u = (u + v8.splat(half) - v8.splat(cx)) * v8.splat(ifx)
@@ -147,13 +149,15 @@ def composite_cubemap(
                 z = v8.splat(rotation[2, 0]) * u + v8.splat(bz)
                 _place_eight(x, y, z, scale, np.float32(faces.shape[1]), texel_places, k)
             count = min(U(_AHEAD), U(width) - first)
-            for k in range(count):  # a row of pixels crosses many of texels, each far in memory
+            # Fetch the texels: a row of pixels crosses many rows of texels, each far in memory.
+            for k in range(count):
                 texel = U(np.int32(texel_places[k])) * row_stride + U(3) * U(
                     np.int32(texel_places[k + U(_AHEAD)])
                 )
                 v8.prefetch(texels, texel)
                 v8.prefetch(texels, texel + row_stride)
                 first_texels[k] = texel
+            # Fog before the sky, and the sky's colour between four texels.
             for k in range(count):
                 j = first + k
                 texel = first_texels[k]
@@ -191,10 +195,10 @@ def composite_cubemap(
 @inner()
 def _shows_sky(alphas, first, end):
     """Return True if a pixel lets light from behind through, or may: its alpha is NaN."""
-    shows = False
+    has_sky = False
     for j in range(first, end):
-        shows = shows or alphas[j] != np.float32(1)
-    return shows
+        has_sky = has_sky or alphas[j] != np.float32(1)
+    return has_sky
 
 
 # Pixels whose texels are computed, and fetched into the cache, before they are read.
@@ -339,7 +343,8 @@ def _fence(typingctx):
 def _map_splats(source, source_start, work, target_start, count, functions, folded):
     """Map `count` splats by one map, from source[source_start:] to work[target_start:].
 
-    min_value: see `color_maps.map_sh` of the style effect: a colour below black counts as black.
+    A splat of degree 0 whose colour is below 0 is mapped as the black that it shows (see `map_sh`
+    of augment.effects.style.color_maps).
     """
     min_value = BLACK if functions == U(1) else np.float32(-np.inf)
     a0 = folded[0]

@@ -88,19 +88,23 @@ def optical_depth(
     Raises:
         ValueError: the fog has a scale height and point_z_m is missing.
     """
-    uniform = fog.sigma_per_m * ray_distance
+    uniform_depth = fog.sigma_per_m * ray_distance
     if fog.scale_height_m is None:
-        return uniform
+        return uniform_depth
     if point_z_m is None:
         raise ValueError("point_z_m is needed for fog with a scale height")
     a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
     b = (point_z_m - fog.base_z_m) / fog.scale_height_m
     difference = (b - a).abs()
-    small = difference < 1e-4  # there 1 - x/2 is exact to float32, and expm1(x)/x would be 0/0 at 0
-    safe = torch.where(small, torch.ones_like(difference), difference)
-    mean = torch.where(small, 1 - difference / 2, -torch.expm1(-safe) / safe)
-    lower = torch.minimum(b, torch.full_like(b, a))
-    return uniform * torch.exp((-lower).clamp(max=MAX_EXPONENT)) * mean
+    is_small = (
+        difference < 1e-4
+    )  # there 1 - x/2 is exact to float32, and expm1(x)/x would be 0/0 at 0
+    safe_difference = torch.where(is_small, torch.ones_like(difference), difference)
+    mean_density = torch.where(
+        is_small, 1 - difference / 2, -torch.expm1(-safe_difference) / safe_difference
+    )
+    lower_end = torch.minimum(b, torch.full_like(b, a))
+    return uniform_depth * torch.exp((-lower_end).clamp(max=MAX_EXPONENT)) * mean_density
 
 
 def sky_optical_depth(fog: Fog, slope: Float[Tensor, "*B"], eye_z_m: float) -> Float[Tensor, "*B"]:
@@ -114,14 +118,16 @@ def sky_optical_depth(fog: Fog, slope: Float[Tensor, "*B"], eye_z_m: float) -> F
         slope: vertical part of the unit direction of each ray.
         eye_z_m: world height of the eye, metres.
     """
-    infinite = torch.full_like(slope, math.inf)
+    infinite_depth = torch.full_like(slope, math.inf)
     if fog.sigma_per_m == 0:
         return torch.zeros_like(slope)
     if fog.scale_height_m is None:
-        return infinite
-    vertical = vertical_optical_depth(fog, eye_z_m)
-    climbing = slope > 0
-    return torch.where(climbing, vertical / torch.where(climbing, slope, 1.0), infinite)
+        return infinite_depth
+    vertical_depth = vertical_optical_depth(fog, eye_z_m)
+    is_climbing = slope > 0
+    return torch.where(
+        is_climbing, vertical_depth / torch.where(is_climbing, slope, 1.0), infinite_depth
+    )
 
 
 def vertical_optical_depth(fog: Fog, eye_z_m: float) -> float:
@@ -154,8 +160,8 @@ def airlight_gain(fog: Fog, slope: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]
     `blend_airlight`.
     """
     growth = torch.log1p(2 * fog.overcast * slope.abs()) / ENCODING * slope.sign()
-    varying = fog.rgb if fog.varying_rgb is None else fog.varying_rgb
-    return torch.expm1(growth)[..., None] * growth.new_tensor(varying)
+    varying_rgb = fog.rgb if fog.varying_rgb is None else fog.varying_rgb
+    return torch.expm1(growth)[..., None] * growth.new_tensor(varying_rgb)
 
 
 def fog_buffers(
@@ -227,13 +233,15 @@ def optical_depth_of_arrays(
 
     series_below: height difference, in scale heights, below which a series replaces the quotient.
     """
-    uniform = fog.sigma_per_m * ray_distance
+    uniform_depth = fog.sigma_per_m * ray_distance
     if fog.scale_height_m is None:
-        return uniform
+        return uniform_depth
     a = (eye_z_m - fog.base_z_m) / fog.scale_height_m
     b = (point_z_m - fog.base_z_m) / fog.scale_height_m
     difference = np.abs(b - a)
-    small = difference < series_below
-    safe = np.where(small, 1.0, difference)
-    mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
-    return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean
+    is_small = difference < series_below
+    safe_difference = np.where(is_small, 1.0, difference)
+    mean_density = np.where(
+        is_small, 1 - difference / 2, -np.expm1(-safe_difference) / safe_difference
+    )
+    return uniform_depth * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean_density

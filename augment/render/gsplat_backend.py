@@ -218,6 +218,7 @@ def _gsplat_inputs(
 
 
 def _check_settings(camera: Camera, settings: RasterSettings) -> None:
+    """Check that gsplat can render with this camera and these settings."""
     if camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic; gradients are of pinhole cameras"

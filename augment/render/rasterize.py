@@ -67,8 +67,10 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
         from augment.render import composite_kernels
         from augment.render.threads import kernel_threads
 
-        flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
-        rgb, overlay = (flat.get(name, np.empty(0, np.float32)) for name in ("rgb", "overlay"))
+        flat_images = {name: image.numpy().reshape(-1) for name, image in images.items()}
+        rgb, overlay = (
+            flat_images.get(name, np.empty(0, np.float32)) for name in ("rgb", "overlay")
+        )
         with kernel_threads():
             composite_kernels.renormalise_alpha(
                 alpha.numpy().reshape(-1), rgb, overlay, np.float32(1 - stop)
@@ -76,12 +78,12 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
         return output
     is_finished = alpha >= 1 - stop
     scale = torch.where(is_finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
-    scaled = {
+    scaled_images = {
         name: image * (scale[..., None] if image.ndim == 3 else scale)
         for name, image in images.items()
     }
     opaque_alpha = torch.where(is_finished, torch.ones_like(alpha), alpha)
-    return dataclasses.replace(output, alpha=opaque_alpha, **scaled)
+    return dataclasses.replace(output, alpha=opaque_alpha, **scaled_images)
 
 
 logger = logging.getLogger(__name__)
@@ -106,7 +108,7 @@ def rasterize(
         buffers: names from augment.render.buffers; the other buffers are None in the result.
         settings: thresholds of the image.
         fog: fog that fades every splat's colour towards the airlight by the splat's own distance.
-        clip: height above, or below, which nothing is drawn (augment.render.layout).
+        clip: height above, or below, which splats are drawn (augment.render.layout).
         pixel_mask: bool [H, W], the pixels that will be looked at; a backend may leave the others
             0.
         backend: one of "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, for
@@ -146,12 +148,15 @@ def rasterize(
 
 
 def _render(image: _Image, backend: str) -> RenderOutput:
+    """Return the image; pixels behind a raised transmittance stop are opaque."""
     stop = image.settings.transmittance_stop
     if stop <= TRANSMITTANCE_STOP:
         return _call_backend(image, backend)
     output = _call_backend(image._replace(buffers=image.buffers | {ALPHA}), backend)
-    opaque = renormalise_alpha(output, stop, backend=backend)
-    return opaque if ALPHA in image.buffers else dataclasses.replace(opaque, alpha=None)
+    opaque_output = renormalise_alpha(output, stop, backend=backend)
+    return (
+        opaque_output if ALPHA in image.buffers else dataclasses.replace(opaque_output, alpha=None)
+    )
 
 
 class _Image(NamedTuple):
@@ -167,6 +172,7 @@ class _Image(NamedTuple):
 
 
 def _call_backend(image: _Image, backend: str) -> RenderOutput:
+    """Return the image by one backend, with its own function for gradients."""
     if backend == REFERENCE:
         return rasterize_reference(*image[:-1])
     module = import_cuda() if backend == CUDA else import_cpu()
@@ -249,6 +255,7 @@ def _check_arguments(
     buffers: Collection[str],
     settings: RasterSettings,
 ) -> None:
+    """Check parts, buffers and settings; the first fault is raised."""
     if isinstance(buffers, str):
         raise TypeError(f"buffers must be a collection of names; got the string {buffers!r}")
     unknown_buffers = sorted(set(buffers) - set(BUFFERS))
@@ -300,6 +307,7 @@ def _check_devices(parts: Sequence[PosedGaussians], backend: str) -> None:
 
 
 def _check_shading(part: PosedGaussians, number: int) -> None:
+    """Check the light of a part that is lit pixel by pixel."""
     if part.shading is None:
         return
     shape = (len(part.gaussians), 3)
@@ -319,6 +327,7 @@ def _check_shading(part: PosedGaussians, number: int) -> None:
 
 
 def _check_color_maps(part: PosedGaussians, number: int) -> None:
+    """Check the colour maps of a part and their rows."""
     maps = part.color_maps
     if maps is None:
         return
@@ -342,6 +351,7 @@ def _check_color_maps(part: PosedGaussians, number: int) -> None:
 
 
 def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
+    """Check the pose of a part."""
     pose = part.world_from_part
     if pose is None:
         return
@@ -358,6 +368,7 @@ def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
 
 
 def _check_settings(settings: RasterSettings) -> None:
+    """Check the range of every setting."""
     s = settings
     degree = settings.sh_degree
     max_stop = MAX_TRANSMITTANCE_STOP

@@ -134,19 +134,19 @@ def project_parts(
     Returns:
         Splats in the order of the Gaussians' indices.
     """
-    projected: list[Splats] = []
+    part_splats: list[Splats] = []
     any_light = with_color and any(part.shading is not None for part in parts)
     first_id = 0
     for part in parts:
-        projected.append(
+        part_splats.append(
             _project_part(part, first_id, camera, settings, fog, clip, with_color, any_light)
         )
         first_id += len(part.gaussians)
-    if len(projected) == 1:
-        return projected[0]
-    columns = [splats.columns() for splats in projected]
-    joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
-    return dataclasses.replace(projected[0], **joined)
+    if len(part_splats) == 1:
+        return part_splats[0]
+    columns = [splats.columns() for splats in part_splats]
+    joined_columns = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+    return dataclasses.replace(part_splats[0], **joined_columns)
 
 
 def _project_part(
@@ -159,6 +159,18 @@ def _project_part(
     with_color: bool,
     any_light: bool,
 ) -> Splats:
+    """Return the splats of one part.
+
+    Args:
+        part: Gaussians with their pose.
+        first_id: index of the part's first Gaussian, counted through all parts.
+        camera: the camera.
+        settings: thresholds of the image.
+        fog: fog before the splats; None for clear air.
+        clip: height at which splats are cut; None for no cut.
+        with_color: if False, colours and lights are not computed.
+        any_light: if True, some part is lit pixel by pixel, so every splat gets lights.
+    """
     camera_from_part = camera.camera_from_world
     if part.world_from_part is not None:
         camera_from_part = camera_from_part @ part.world_from_part
@@ -171,6 +183,7 @@ def _project_part(
     is_drawn = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
     index = torch.nonzero(is_drawn).squeeze(-1)
 
+    # Centres in the camera, and their ellipses in the image.
     gaussians = part.gaussians.select(index)
     offsets = offsets[index]
     depths = depths[index]
@@ -184,6 +197,7 @@ def _project_part(
     if settings.antialiased:
         tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
         opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
+    # Colour, then the light and the cut of parts that have them.
     colors = None
     if with_color:
         view_directions = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
@@ -305,6 +319,7 @@ def _offsets_from_eye(
 
 
 def _project_points(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M 2"]:
+    """Return the image positions of points in the camera, pixels."""
     x = points[:, 0]
     y = points[:, 1]
     divisors = _divisors(points, camera)
@@ -506,12 +521,16 @@ def bin_to_tiles(splats: Splats, camera: Camera) -> TileLists:
     widths = (x1 - x0).clamp_min(0)
     counts = widths * (y1 - y0).clamp_min(0)
     counts[splats.opacities < ALPHA_MIN] = 0  # antialiasing may have lowered them
-    owners = torch.repeat_interleave(counts)  # [E]
-    within = torch.arange(len(owners)) - (counts.cumsum(0) - counts)[owners]
-    tiles = (y0[owners] + within // widths[owners]) * columns + x0[owners] + within % widths[owners]
+    splat_ids = torch.repeat_interleave(counts)  # [E]
+    tile_in_box = torch.arange(len(splat_ids)) - (counts.cumsum(0) - counts)[splat_ids]
+    tiles = (
+        (y0[splat_ids] + tile_in_box // widths[splat_ids]) * columns
+        + x0[splat_ids]
+        + tile_in_box % widths[splat_ids]
+    )
     order = torch.argsort(tiles, stable=True)
     tile_offsets = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1))
-    return TileLists(owners[order], tile_offsets, columns, rows)
+    return TileLists(splat_ids[order], tile_offsets, columns, rows)
 
 
 def _tile_span(splats: Splats, axis: int, tiles: int) -> tuple[Tensor, Tensor]:
@@ -536,7 +555,7 @@ def blend(
     """Return buffers [H, W] of ordered splats. Tiles are blended one by one, which takes little
     memory.
     """
-    recompute = torch.is_grad_enabled() and any(
+    needs_checkpoint = torch.is_grad_enabled() and any(
         value.requires_grad for value in splats.columns().values()
     )
     sizes = lists.tile_offsets.diff().tolist()
@@ -545,18 +564,20 @@ def blend(
     # tile as long as the scene.
     for tile, tile_splat_ids in enumerate(splats.select(lists.tile_splat_ids).split(sizes)):
         args = (tile_splat_ids, divmod(tile, lists.columns), buffers, settings, camera)
-        if recompute and len(tile_splat_ids):  # a backward pass would else keep every splat x pixel
+        if needs_checkpoint and len(
+            tile_splat_ids
+        ):  # a backward pass would else keep every splat x pixel
             tiles.append(
                 checkpoint(blend_tile, *args, use_reentrant=False, preserve_rng_state=False)
             )
         else:
             tiles.append(blend_tile(*args))
     images = {name: _assemble([getattr(t, name) for t in tiles], lists, camera) for name in buffers}
-    if recompute and len(lists.tile_splat_ids) == 0:
+    if needs_checkpoint and len(lists.tile_splat_ids) == 0:
         # A view of nothing is a function of the splats too: its gradients are 0, not an error.
         floats = [value for value in splats.columns().values() if value.is_floating_point()]
-        nothing = torch.stack([value[:0].sum() for value in floats]).sum()
-        images = {n: i + nothing if i.is_floating_point() else i for n, i in images.items()}
+        zero_sum = torch.stack([value[:0].sum() for value in floats]).sum()
+        images = {n: i + zero_sum if i.is_floating_point() else i for n, i in images.items()}
     return RenderOutput(**images)
 
 
@@ -634,8 +655,10 @@ def blend_tile(
         MODE_DEPTH: clusters.heaviest_mode(),
         OVERLAY: overlay,
     }
-    shaped = {name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers}
-    return RenderOutput(**shaped)
+    tile_images = {
+        name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers
+    }
+    return RenderOutput(**tile_images)
 
 
 def blend_weights(

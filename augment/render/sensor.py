@@ -52,10 +52,10 @@ def blur_lens(rgb: Float[Tensor, "H W 3"], psf_px: float) -> Float[Tensor, "H W 
     radius_px = math.ceil(3 * psf_px)
     if rgb.device.type == "cpu":
         size = (2 * radius_px + 1, 2 * radius_px + 1)
-        blurred = cv2.GaussianBlur(
+        blurred_rgb = cv2.GaussianBlur(
             rgb.detach().numpy(), size, psf_px, borderType=cv2.BORDER_REPLICATE
         )
-        return torch.from_numpy(blurred)
+        return torch.from_numpy(blurred_rgb)
     taps = torch.from_numpy(cv2.getGaussianKernel(2 * radius_px + 1, psf_px).astype(np.float32))
     taps = taps.to(rgb.device, rgb.dtype)
     rows = F.pad(rgb.permute(2, 0, 1)[:, None], (radius_px,) * 4, mode="replicate")
@@ -85,11 +85,11 @@ def add_noise(
     draws = draw_noise(camera, seed=seed, scene=scene)
     sigmas = noise_sigmas() * np.float32(noise / (_LEVEL_SD * _DEMOSAICED_SD))
     if kernels_for(backend, rgb) == CPU:
-        noisy = rgb.detach().contiguous().numpy()
+        noisy_rgb = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS):
-            rows = noisy.reshape(len(noisy), -1), draws.reshape(len(noisy), -1)
+            rows = noisy_rgb.reshape(len(noisy_rgb), -1), draws.reshape(len(noisy_rgb), -1)
             picture_kernels.add_noise(*rows, sigmas)
-        return torch.from_numpy(noisy)
+        return torch.from_numpy(noisy_rgb)
     levels = (rgb.clamp(0, 1) * 255 + 0.5).long()
     sigma = torch.from_numpy(sigmas).to(rgb.device)[levels]
     return rgb + sigma * (torch.from_numpy(draws).to(rgb.device).float() - 128)

@@ -101,8 +101,8 @@ def _preload_tbb() -> bool:
         files = importlib.metadata.files("tbb") or []
     except importlib.metadata.PackageNotFoundError:
         files = []
-    installed = [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
-    for path in (*installed, Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
+    installed_paths = [Path(str(f.locate())).resolve() for f in files if f.name == TBB_LIBRARY]
+    for path in (*installed_paths, Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
         try:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
         except OSError:

@@ -111,9 +111,9 @@ class Tape:
         images = (self.rgb, self.alpha, depth, d_rgb, d_alpha, d_depth)
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            sums, touched = self._sum_shares(slopes, timer)
+            sums, is_touched = self._sum_shares(slopes, timer)
             backward_kernels.project_backward(
-                inputs.read, self.splats, touched, sums, rows.reshape(-1), ids, counts
+                inputs.read, self.splats, is_touched, sums, rows.reshape(-1), ids, counts
             )
             timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
@@ -130,13 +130,13 @@ class Tape:
         images = (self.rgb, self.alpha, None, d_rgb, d_alpha, None)
         slopes = backward_kernels.Slopes(*(None if i is None else i.reshape(-1) for i in images))
         with kernel_threads():
-            sums, touched = self._sum_shares(slopes, StageTimer(None))
+            sums, is_touched = self._sum_shares(slopes, StageTimer(None))
         is_filled = np.arange(BLOCK) < self.splats.splat_counts[:, None]  # [B, BLOCK]
         is_filled = is_filled.reshape(-1)
         records = self.splats.records.reshape(-1, RECORD)
         ids = records[is_filled, SPLAT_ID].view(np.int32)
         shares = sums.reshape(-1, backward_kernels.SHARE)[is_filled]
-        shares[touched[is_filled] == 0] = 0  # these slots hold what the last use left
+        shares[is_touched[is_filled] == 0] = 0  # these slots hold what the last use left
         by_log2 = shares[:, backward_kernels.S_0]
         return ids, shares[:, backward_kernels.S_RED], by_log2 / np.float32(math.log(2))
 
@@ -149,22 +149,22 @@ class Tape:
         slots = self.inputs.slots
         entries = len(tile_splats.tile_splat_ids)
         shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
-        reached = scratch.array("reached", (len(tile_splats.tile_offsets) - 1,), np.int64)
+        num_reached = scratch.array("reached", (len(tile_splats.tile_offsets) - 1,), np.int64)
         sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
-        touched = scratch.array("touched", (slots,), np.uint8)
-        backward_kernels.blend_backward(tile_splats, self.frame, slopes, shares, reached)
+        is_touched = scratch.array("touched", (slots,), np.uint8)
+        backward_kernels.blend_backward(tile_splats, self.frame, slopes, shares, num_reached)
         timer.end_stage("raster backward")
         backward_kernels.sum_shares(
             tile_splats.tile_splat_ids,
             tile_splats.tile_offsets,
-            reached,
+            num_reached,
             shares,
             _SUM_RANGES,
             sums,
-            touched,
+            is_touched,
         )
         timer.end_stage("sum backward")
-        return sums, touched
+        return sums, is_touched
 
 
 def record(
@@ -253,6 +253,8 @@ class _OperationArguments(NamedTuple):
 
 
 class _Rasterize(torch.autograd.Function):
+    """The render as an autograd operation; its tensors are those of all parts, part by part."""
+
     @staticmethod
     def forward(
         ctx: Any, arguments: _OperationArguments, *tensors: Tensor
@@ -300,6 +302,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _group_by_part(tensors: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+    """Return the tensors of each part."""
     return [tensors[i : i + len(_FIELDS)] for i in range(0, len(tensors), len(_FIELDS))]
 
 

@@ -83,16 +83,16 @@ class Slopes(NamedTuple):
 
 
 @kernel
-def blend_backward(splats, frame, slopes, shares, reached):
+def blend_backward(splats, frame, slopes, shares, num_reached):
     """Write dL of every list entry that the forward blend reached.
 
     Args:
         splats, frame: as for blend.blend_tiles, in one slice.
         slopes: images and derivatives.
-        shares: float32 [entries * SHARE], written up to reached[tile] entries of each list.
-        reached: int64 [tiles], written.
+        shares: float32 [entries * SHARE], written up to num_reached[tile] entries of each list.
+        num_reached: int64 [tiles], written.
     """
-    for group in prange((reached.size + GROUP - 1) // GROUP):
+    for group in prange((num_reached.size + GROUP - 1) // GROUP):
         columns = (frame.size[0] + TILE_W - 1) // TILE_W
         s = slopes
         state = np.empty(PLANES, np.float32)
@@ -103,7 +103,7 @@ def blend_backward(splats, frame, slopes, shares, reached):
         places = np.empty(ITEMS, np.int32)
         starts = aligned_floats(STARTS)
         work = Work(state, staged, spans, starts, values, places, rows, None, None, None, None)
-        for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
+        for tile in range(group * GROUP, min((group + 1) * GROUP, num_reached.size)):
             first = splats.tile_offsets[tile]
             last = splats.tile_offsets[tile + 1]
             left = tile % columns * TILE_W
@@ -122,7 +122,7 @@ def blend_backward(splats, frame, slopes, shares, reached):
                     s.d_depth,
                 )
             corner = (np.float32(left), np.float32(top))
-            reached[tile] = _replay_list(
+            num_reached[tile] = _replay_list(
                 splats, first, last, corner, frame.limits, work, slopes.d_depth, shares
             )
 
@@ -213,6 +213,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     stop = v8.splat(limits[7])
     zeros = v8.splat(np.float32(0))
     ones = v8.splat(np.float32(1))
+    # Shape and colour of the splat in all lanes.
     sharp = staged[U(L.SHARP_X) * n + k]
     fall = v8.splat(staged[U(L.FALL_Y) * n + k])
     tilt = v8.splat(-sharp * staged[U(L.LEAN_X) * n + k])
@@ -224,6 +225,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     z = zeros
     if d_depth is not None:
         z = v8.splat(staged[U(L.DEPTH) * n + k])
+    # Sums over the pixels: of g and its products, of colour and depth, of |dL/d mean|.
     s0 = zeros
     sx = zeros
     sxx = zeros
@@ -237,6 +239,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
     ax = zeros
     ay = zeros
     for i in range(item, end):
+        # Alpha, weight and transmittance, as in the forward blend.
         pixel = U(places[i]) % U(PLACES) * U(LANES)
         row = np.float32(pixel % U(STRIP) // U(LANES)) + np.float32(0.5)
         dy = v8.splat(row - staged[U(L.MEAN_Y) * n + k])
@@ -253,6 +256,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
             pixel,
             remaining_transmittance(transmittance, transmittance_behind, is_blended, stop),
         )
+        # q = dL/dw, and what remains of the sum behind the splat.
         g_red = v8.load(state, pixel + G_RED)
         g_green = v8.load(state, pixel + G_GREEN)
         g_blue = v8.load(state, pixel + G_BLUE)
@@ -265,6 +269,7 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
             sz = v8.fmuladd(weight, g_depth, sz)
         behind = v8.fmuladd(v8.negate(weight), q, v8.load(state, pixel + BEHIND))
         v8.store(state, pixel + BEHIND, behind)
+        # g = dL/de.
         by_alpha = transmittance * q - behind / (ones - alpha)
         # An alpha that is cut off, clamped or behind the stop has no gradient.
         is_free = v8.both(
@@ -290,30 +295,30 @@ def _add_share(work, k, item, end, limits, d_depth, shares, share):
 
 
 @kernel
-def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touched):
+def sum_shares(tile_splat_ids, tile_offsets, num_reached, shares, ranges, sums, is_touched):
     """Add every slot's shares of all tiles, in the order of the tiles.
 
     Each of `ranges` runs of slots looks at all entries and takes its own. So the order of addition
     is always the same.
 
-    sums: float32 [slots * SHARE], written. touched: uint8 [slots], written: 1 if any entry was
+    sums: float32 [slots * SHARE], written. is_touched: uint8 [slots], written: 1 if any entry was
     reached.
     """
-    slots = touched.size
+    slots = is_touched.size
     for run in prange(ranges):
         low = U(slots * run // ranges)
         high = U(slots * (run + 1) // ranges)
         for slot in range(low, high):
-            touched[slot] = 0
-        for tile in range(reached.size):
-            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + reached[tile])):
+            is_touched[slot] = 0
+        for tile in range(num_reached.size):
+            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + num_reached[tile])):
                 slot = U(tile_splat_ids[entry])
                 if slot < low or slot >= high:
                     continue
                 at = slot * U(SHARE)
                 share = entry * U(SHARE)
-                if touched[slot] == 0:
-                    touched[slot] = 1
+                if is_touched[slot] == 0:
+                    is_touched[slot] = 1
                     for i in range(U(0), U(SHARE), U(LANES)):
                         v8.store(sums, at + i, v8.load(shares, share + i))
                 else:
@@ -343,14 +348,14 @@ _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
 
 
 @kernel
-def project_backward(inputs, splats, touched, sums, grads, ids, counts):
+def project_backward(inputs, splats, is_touched, sums, grads, ids, counts):
     """Write a row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
     Block b fills rows b BLOCK to b BLOCK + counts[b].
 
     Args:
         inputs, splats: as for project_slice.
-        touched, sums: as sum_shares wrote them.
+        is_touched, sums: as sum_shares wrote them.
         grads: float32 [B BLOCK * GRAD], written.
         ids: int32 [B BLOCK], written: index of the Gaussian in its part.
         counts: int64 [B], written: rows of each block.
@@ -366,8 +371,9 @@ def project_backward(inputs, splats, touched, sums, grads, ids, counts):
         rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
         base = block * BLOCK
         num_touched = U(0)
+        # Touched splats of the block, filled up to a whole group of eight.
         for slot in range(base, base + splats.splat_counts[block]):
-            if touched[slot] != 0:
+            if is_touched[slot] != 0:
                 number = np.float32(records[slot * RECORD + L.SPLAT_ID]).view(np.int32)
                 slots[num_touched] = np.int32(slot)
                 gaussian_ids[num_touched] = number - np.int32(inputs.first_ids[part])
@@ -379,12 +385,14 @@ def project_backward(inputs, splats, touched, sums, grads, ids, counts):
         for lane in range(U(LANES)):
             slots[num_touched + lane] = slots[num_touched - U(1)]
             gaussian_ids[num_touched + lane] = gaussian_ids[num_touched - U(1)]
+        # Arrays of the block's part.
         count, functions = inputs.sizes[part]
         means = floats_at(addresses[part, L.A_MEANS], count * 3)
         quats = floats_at(addresses[part, L.A_QUATS], count * 4)
         scales = floats_at(addresses[part, L.A_SCALES], count * 3)
         sh = floats_at(addresses[part, L.A_SH], count * functions * 3)
         num_functions = min(modes[L.M_FUNCTIONS], functions)
+        # Gradients of eight Gaussians, then their rows.
         for group in range(U(0), num_touched, U(LANES)):
             _color_backward(
                 sh,

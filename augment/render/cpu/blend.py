@@ -245,11 +245,11 @@ def add_sample(state, at, depth, weight, floor):
     floor_margin = v8.splat_as(depth, floor) * reach * mass - v8.absolute(mass_offset)
     spread_margin = v8.fmuladd(reach_2, spread, v8.negate(mass_offset * mass_offset))
     has_joined = v8.greater(v8.maximum(floor_margin, spread_margin), zeros)
-    begins = v8.select(
+    new_cluster_sign = v8.select(
         has_joined, minus_ones, v8.select(v8.greater(weight, zeros), zeros, minus_ones)
     )
-    if v8.any_not_negative(begins):
-        is_new = v8.at_least(begins, zeros)
+    if v8.any_not_negative(new_cluster_sign):
+        is_new = v8.at_least(new_cluster_sign, zeros)
         best = v8.load_as(depth, state, at + HEAVIEST)
         is_heavier = v8.both(is_new, v8.greater(mass, best))
         mode = v8.select(
@@ -431,7 +431,7 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bi
     columns = (size[0] + TILE_W - 1) // TILE_W
     state_size = states.size // tiles.size
     work = Work(
-        aligned_floats(STATE + LINE),  # v8.load_row reads a number beyond
+        aligned_floats(STATE + LINE),  # v8.load_row reads one number beyond the state
         aligned_floats(RECORD * BATCH),
         np.empty(2 * BATCH, np.int32),
         aligned_floats(STARTS),
@@ -451,10 +451,12 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bi
             continue
         left = tile % columns * TILE_W
         top = tile // columns * TILE_H
+        # State of the tile before this slice.
         if tiles[tile] == FRESH:
             _clear(state, state_size, size[0] - left, size[1] - top)
         else:
             _copy(states, U(tile * state_size), state, U(0), U(state_size))
+        # Fetch the pixels' cache lines for writing.
         for y in range(min(TILE_H, size[1] - top)):
             at = U((top + y) * size[0] + left)
             v8.prefetch_to_write(images.alpha, at)
@@ -463,6 +465,7 @@ def _blend_group(group, splats, tiles, states, is_last, frame, images, buffer_bi
                     v8.prefetch_to_write(images.rgb, U(3) * at + line)
         corner = (np.float32(left), np.float32(top))
         is_open = _blend_list(splats, first, last, corner, frame.limits, buffer_bits, work)
+        # Keep the state for the next slice, or write the pixels.
         if is_open and not is_last:
             _copy(state, U(0), states, U(tile * state_size), U(state_size))
             tiles[tile] = OPEN
@@ -519,6 +522,7 @@ def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
     records = splats.records
     ids = splats.tile_splat_ids
     columns = v8.wide_columns()
+    # Open rows of every strip.
     for strip in range(STRIPS):
         rows[2 * strip] = 0
         rows[2 * strip + 1] = TILE_H
@@ -527,6 +531,7 @@ def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
         if is_closed(rows):
             return False
         count = U(min(BATCH, last - at))
+        # Fetch the next batch's records, then transpose this batch's records, lights and cuts.
         for k in range(U(at) + count, U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(ids[k]) * U(RECORD))
         stage(records, ids, U(at), count, corner, staged)
@@ -539,6 +544,7 @@ def _blend_list(splats, first, last, corner, limits, buffer_bits, work):
                 any_cut = stage_cuts(
                     splats.cuts, ids, U(at), count, staged, has_surfaces, work.lines
                 )
+        # Strip by strip, list the items of the batch and blend them.
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -649,6 +655,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
     next_log_alpha = log2_alpha(staged, values, item_code // U(PLACES), U(0), columns)
     next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
     for item in range(items):
+        # Take this item's alpha, and begin the next item's.
         splat = item_code // U(PLACES)
         place = item_code % U(PLACES)
         log_alpha = next_log_alpha
@@ -658,6 +665,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
         next_alpha = alpha_of(next_log_alpha, alpha_max, log_cut)
         if buffer_bits is not None and buffer_bits & CUT:
             alpha = alpha * kept_share(lines, work.edges, splat, item, columns)
+        # Weight of the splat, and the transmittance that remains.
         at = place * U(WIDE)
         transmittance = v8.load_as(columns, state, at)
         weight = alpha * transmittance
@@ -670,6 +678,7 @@ def _blend_items(work, items, columns, limits, buffer_bits):
             )
         v8.store(state, at, remaining)
         weight = v8.select(is_blended, weight, zeros)
+        # Sums of the images that are asked for.
         if buffer_bits is None or buffer_bits & RGB:
             _add(state, at + P_RED, weight, staged[U(L.RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(L.GREEN) * n + splat])
@@ -702,17 +711,19 @@ def _blend_items(work, items, columns, limits, buffer_bits):
                     v8.at_least(transmittance, half), v8.greater(half, transmittance_behind)
                 )
                 depth = v8.splat_as(columns, staged[U(L.DEPTH) * n + splat])
-                before = v8.load_as(columns, state, at + P_MEDIAN)
+                previous = v8.load_as(columns, state, at + P_MEDIAN)
                 v8.store(
-                    state, at + P_MEDIAN, v8.select(v8.both(has_crossed, is_blended), depth, before)
+                    state,
+                    at + P_MEDIAN,
+                    v8.select(v8.both(has_crossed, is_blended), depth, previous),
                 )
             if buffer_bits & IDS:
                 best = v8.load_as(columns, state, at + P_BEST)
                 is_heavier = v8.greater(weight, best)
                 v8.store(state, at + P_BEST, v8.select(is_heavier, weight, best))
                 number = v8.splat_as(columns, staged[U(L.SPLAT_ID) * n + splat])
-                before = v8.load_as(columns, state, at + P_ID)
-                v8.store(state, at + P_ID, v8.select(is_heavier, number, before))
+                previous = v8.load_as(columns, state, at + P_ID)
+                v8.store(state, at + P_ID, v8.select(is_heavier, number, previous))
 
 
 @inner()

@@ -121,17 +121,20 @@ def find_spans(staged, count, strip, rows, log_cut, spans, starts):
         blunt = v8.load_as(wide, staged, U(L.BLUNT_Y) * n + k)
         leftmost = west - mean_x
         rightmost = east - mean_x
+        # End of the rows: the ellipse's lowest point within the strip.
         d = v8.minimum(v8.maximum(top_column, leftmost), rightmost)
         log_margin = v8.fmuladd(fall * d, d, budget)
         half_height = v8.sqrt(v8.maximum(log_margin, zeros)) * blunt
         end_row = v8.fmuladd(lean, d, mean_y) + half_height + half
         end_row = v8.select(v8.at_least(log_margin, zeros), end_row, zeros)
+        # First row: the ellipse's highest point within the strip.
         d = v8.minimum(v8.maximum(v8.negate(top_column), leftmost), rightmost)
         log_margin = v8.fmuladd(fall * d, d, budget)
         half_height = v8.sqrt(v8.maximum(log_margin, zeros)) * blunt
         first_row = v8.fmuladd(lean, d, mean_y) - half_height + half
         first_row = v8.floor(v8.minimum(v8.maximum(first_row, low_row), high_row))
         end_row = v8.floor(v8.minimum(end_row, high_row))
+        # Spans, and the numbers that list_items begins with.
         v8.store_whole(spans, k, first_row)
         v8.store_whole(spans, n + k, v8.maximum(end_row, first_row))
         v8.store(starts, k, first_row + half - mean_y)
@@ -213,6 +216,7 @@ def from_eye(means, gaussian_ids, at, view):
 
 @inner()
 def dot(ax, ay, az, bx, by, bz):
+    """Return the dot product of two triples."""
     return v8.fmuladd(ax, bx, v8.fmuladd(ay, by, az * bz))
 
 
@@ -228,12 +232,14 @@ def cross(a, b, scale):
 
 @inner()
 def rotation_row(view, row):
+    """Return a row of the rotation camera_from_part, in all lanes."""
     at = U(L.V_ROTATION) + U(3) * row
     return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
 
 
 @inner()
 def to_camera(d, view):
+    """Return vectors from the eye, turned from the part's axes to the camera's."""
     r = rotation_row(view, U(0))
     s = rotation_row(view, U(1))
     t = rotation_row(view, U(2))
@@ -252,6 +258,7 @@ def inverse_divisor(z, view):
 
 @inner()
 def to_image(x, y, inverse, view):
+    """Return the image positions of points in the camera, pixels."""
     x = v8.fmuladd(v8.splat(view[L.V_FOCAL]) * x, inverse, v8.splat(view[L.V_CENTRE]))
     return x, v8.fmuladd(v8.splat(view[L.V_FOCAL + 1]) * y, inverse, v8.splat(view[L.V_CENTRE + 1]))
 

@@ -70,6 +70,7 @@ def serial_kernel(function: FunctionType) -> Any:
 
 
 def _compiled(function: FunctionType, *, parallel: bool) -> Any:
+    """Return a numba function that is compiled once for these sources, by one process at a time."""
     code = function.__code__.replace(co_freevars=("sources",))
     closure = FunctionType(
         code, function.__globals__, function.__name__, None, (CellType(SOURCES),)
@@ -127,6 +128,7 @@ class _Clock:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
+        """Count the time inside; nested uses count once."""
         started = time.perf_counter()
         self._depth += 1
         try:

@@ -110,6 +110,7 @@ class UserCacheLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> UserCacheLocator | None:
+        """Return the locator of a kernel; None if its folder cannot be written."""
         kernels = kernel_cache_folder()
         if kernels is None:
             return None

@@ -194,6 +194,7 @@ def order_of(gaussians: Gaussians) -> Order | None:
 
 
 def _order_of_visible(gaussians: Gaussians, mean_uses: _Uses) -> Order | None:
+    """Return the order without the Gaussians that are too faint for any view, once it pays."""
     if not _is_plain(gaussians.opacities):
         return mean_uses.order
     opacity_uses = known_of(gaussians.opacities, "order", _Uses)
@@ -218,6 +219,7 @@ def _is_plain(tensor: Tensor) -> bool:
 
 
 def _find_order(means: np.ndarray) -> Order:
+    """Return the order along a Morton curve through the box of the means."""
     is_finite = np.isfinite(means).all(1)
     finite_means = means[is_finite] if is_finite.any() else np.zeros((1, 3), np.float32)
     low_corner, high_corner = np.quantile(
@@ -234,6 +236,7 @@ def _find_order(means: np.ndarray) -> Order:
 
 
 def _in_cells(ids: np.ndarray, means: np.ndarray) -> Order:
+    """Return the order of ids, which are sorted within each cell, and the cells' boxes."""
     for first in range(0, len(ids), CELL):
         ids[first : first + CELL].sort()  # colours are read in the scene's own order
     rows = means[ids]
@@ -335,8 +338,8 @@ def _min_optical_depth(
     if not is_layered:
         return fog.sigma_per_m * distance
     blur = _BLUR_PX * distance / min(camera.fx, camera.fy)
-    highest = _heights(bounds, pose, np.array([0.0, 0.0, 1.0]))[1] + blur
-    return optical_depth_of_arrays(fog, distance, float(camera.centre[2]), highest)
+    highest_z_m = _heights(bounds, pose, np.array([0.0, 0.0, 1.0]))[1] + blur
+    return optical_depth_of_arrays(fog, distance, float(camera.centre[2]), highest_z_m)
 
 
 def _blocks_of(is_visible: np.ndarray, count: int) -> np.ndarray:

@@ -366,6 +366,7 @@ def _rank_eight(means, scales, opacities, view, gaussian_ids, depths, slot, area
     reach = longest * inverse
     extent_x = v8.fmuladd(v8.splat(view[L.V_GAIN]), reach, two)
     extent_y = v8.fmuladd(v8.splat(view[L.V_GAIN + 1]), reach, two)
+    # Near plane and opacity, the image's four edges, the fog, the clip, the radius clip.
     may_be_seen = v8.both(
         v8.at_least(z, v8.splat(view[L.V_NEAR])),
         v8.at_least(opacity, v8.splat(view[L.V_ALPHA_MIN])),
@@ -444,6 +445,7 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     gaussian_ids = np.empty(BLOCK + LANES, np.int32)
     rows = np.empty(_ROWS * LANES, np.float32)
     base = block * BLOCK
+    # Gaussians of the slice, and the arrays of their part.
     num_picked = _pick_bins(depth_bits, base, first, last, bins, gaussian_ids)
     count, functions = inputs.sizes[part]
     means = floats_at(addresses[part, L.A_MEANS], count * 3)
@@ -458,6 +460,7 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
     is_ordered = inputs.orders[part] != U(0)
     order = floats_at(inputs.orders[part], count if is_ordered else 1)
     num_functions = min(modes[L.M_FUNCTIONS], functions)
+    # Project eight Gaussians, then write those that touch an open tile one by one.
     slot = U(base)
     for group in range(U(0), U(num_picked), U(LANES)):
         _project_eight(
@@ -496,6 +499,7 @@ def _project_block(block, inputs, depth_bits, bins, open_sums, splats):
                 _write_lights(slopes, splat, modes[L.M_FOG], view, rows, lane, splats.lights, slot)
             keys[slot] = np.float32(records[record + U(L.DEPTH)]).view(np.uint32)
             slot += U(1)
+    # Count the block's splats, in all and in each bin of z.
     splats.splat_counts[block] = slot - U(base)
     for z_bin in range(bin_counts.shape[1]):
         bin_counts[block, z_bin] = 0
@@ -625,12 +629,14 @@ def _project_eight(
     means, quats, scales, opacities, view, gaussian_ids, group, functions, modes, rows
 ):
     """Write records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
+    # SH functions and fog towards the eye.
     d = from_eye(means, gaussian_ids, group, view)
     if modes[L.M_COLOR]:
         directions = rotation_row(view, U(2)) if view[L.V_PARALLEL] > 0 else d
         prepare_colors(
             directions[0], directions[1], directions[2], view, functions, modes[L.M_FOG], rows
         )
+    # Centre in the camera, and covariance in the image.
     x, y, z = to_camera(d, view)
     inverse = inverse_divisor(z, view)
     xx, xy, yy, minors = image_covariance(quats, scales, gaussian_ids, group, x, y, inverse, view)
@@ -648,6 +654,7 @@ def _project_eight(
     log_opacity = log2(v8.gather(opacities, gaussian_ids, group, U(1), U(0)))
     if modes[L.M_ANTIALIASED]:
         log_opacity = v8.fmuladd(half, log2(minors / variance_along_row), log_opacity)
+    # Box in which alpha reaches the cut.
     log_cut = v8.splat(view[L.V_LOG_CUT])
     budget = v8.maximum(log_opacity - log_cut, v8.splat(np.float32(0))) / k
     radius_x = v8.sqrt(budget * blurred_x)
@@ -659,6 +666,7 @@ def _project_eight(
     )
     larger_radius = v8.maximum(radius_x, radius_y)
     is_drawn = v8.both(is_drawn, v8.greater(larger_radius, v8.splat(view[L.V_RADIUS_CLIP])))
+    # Cut at a height, and lines of the light.
     if modes[L.M_CLIP]:
         has_kept_part, offset, lx, ly, gx, gy, growth_limit = cut_eight(
             quats, scales, gaussian_ids, group, d, x, y, inverse, view
@@ -680,6 +688,7 @@ def _project_eight(
         v8.store(rows, U((_LIGHTS + L_WRAP) * LANES), lines[3])
         v8.store(rows, U((_LIGHTS + L_LEAN_X) * LANES), lines[4])
         v8.store(rows, U((_LIGHTS + L_LEAN_Y) * LANES), lines[5])
+    # Covered pixels, and the fields of the record.
     _write_box(mean_x, radius_x, v8.splat(view[L.V_SIZE]), is_drawn, U(_X_LO), U(_X_HI), rows)
     _write_box(mean_y, radius_y, v8.splat(view[L.V_SIZE + 1]), is_drawn, U(_Y_LO), U(_Y_HI), rows)
     _write(rows, U(L.MEAN_X), mean_x)

@@ -531,6 +531,8 @@ def mantissa(builder, value):
 
 
 def _prefetch(to_write: int):
+    """Return the code generator of a prefetch, to read or to write."""
+
     def codegen(context, builder, sig, args):
         at = _pointer(context, builder, sig.args[0], *args)
         kind = ir.FunctionType(ir.VoidType(), [at.type, _INT, _INT, _INT])
