@@ -212,7 +212,7 @@ V_ALPHA_MIN = 29
 # log2 of that alpha.
 V_LOG_CUT = 30
 # Extinction of the fog at its base, 1/m.
-V_SIGMA = 31
+V_EXTINCTION = 31
 # Airlight of the fog, 3 display-encoded numbers.
 V_AIRLIGHT = 32
 # Height of the camera over the fog's base, scale heights.

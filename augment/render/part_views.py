@@ -101,7 +101,7 @@ def part_views(
     views[:, layout.V_ALPHA_MIN] = ALPHA_MIN
     views[:, layout.V_LOG_CUT] = math.log2(ALPHA_MIN)
     if fog is not None:
-        views[:, layout.V_SIGMA] = fog.sigma_per_m
+        views[:, layout.V_EXTINCTION] = fog.sigma_per_m
         views[:, layout.V_AIRLIGHT :][:, :3] = fog.rgb
         if fog.scale_height_m is not None:
             eye_above_base_m = float(camera.centre[2]) - fog.base_z_m

@@ -86,7 +86,7 @@ def prepare_colors(dx, dy, dz, view, functions, fog, rows):
     inverse = v8.splat(np.float32(1)) / distance
     write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
     if fog != L.NO_FOG:
-        tau = v8.splat(view[L.V_SIGMA]) * distance
+        tau = v8.splat(view[L.V_EXTINCTION]) * distance
         if fog == L.LAYERED_FOG:
             tau = tau * _layered_density(dx, dy, dz, view)
         lowest = v8.splat(np.float32(-126))  # 1e-38: fog that deep is opaque
