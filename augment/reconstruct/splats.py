@@ -68,7 +68,7 @@ class Splats:
         counts = [len(part) for part in parts]
         total = sum(counts)
 
-        def joined(name: str) -> np.ndarray:
+        def join(name: str) -> np.ndarray:
             tensors = [getattr(part, name).detach().float().numpy() for part in parts]
             return np.ascontiguousarray(np.concatenate(tensors))
 
