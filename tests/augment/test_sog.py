@@ -79,7 +79,7 @@ def test_a_palette_that_does_not_hold_all_is_near_all(
 ) -> None:
     """600 rows around 20 centres in a palette of 64: what is left is the spread around them."""
     monkeypatch.setattr(sog, "MAX_PALETTE", 64)
-    monkeypatch.setattr(sog, "_COARSE", 8)
+    monkeypatch.setattr(sog, "_NUM_GROUPS", 8)
     before = some_gaussians(600, 4)
     rng = torch.Generator().manual_seed(2)
     centres = torch.rand(20, 3, 3, generator=rng) - 0.5
