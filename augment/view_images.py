@@ -120,7 +120,7 @@ def _floats(image: Float[Tensor, "H W"] | None) -> Float[Tensor, "H W"] | None:
 
 
 def _semantic_table(parts: tuple[PosedGaussians, ...], device: torch.device) -> Tensor:
-    """Return the class of every splat, int16 [total splats], in the order in which splat_ids count."""
+    """Return the class of every splat, int16 [total splats], in the order of splat_ids."""
     classes = [p.gaussians.semantic for p in parts]
     return torch.cat(
         [
