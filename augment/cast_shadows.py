@@ -143,14 +143,14 @@ class CastShadows:
 
     def light_at(self, places_m: np.ndarray) -> np.ndarray:
         """Return luminance over that in the sun at places [N, 3], [N]; NaN off the known ground."""
-        lit, known, height_m = self.at(places_m[:, 0], places_m[:, 1])
+        lit, known_share, height_m = self.at(places_m[:, 0], places_m[:, 1])
         ratio = self.luminance_ratio
-        on_ground = (known > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
-        light = ratio + (1 - ratio) * lit / np.maximum(known, 0.5)
+        on_ground = (known_share > 0.5) & (np.abs(places_m[:, 2] - height_m) < ON_GROUND_M)
+        light = ratio + (1 - ratio) * lit / np.maximum(known_share, 0.5)
         return np.where(on_ground, light, np.nan)
 
     def at(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return lit, known and height_m at places of any shape, float32.
+        """Return lit, known and height_m at places of any shape, float32, interpolated.
 
         `known` is 0 beyond the map.
         """
@@ -166,8 +166,8 @@ class CastShadows:
             cv2.remap(m, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             for m in maps
         )
-        lit, known, height = (_unwrapped(values, shape) for values in map_values)
-        return lit, known, height
+        lit, known_share, height = (_unwrapped(values, shape) for values in map_values)
+        return lit, known_share, height
 
 
 def _wrapped(values: np.ndarray) -> np.ndarray:
@@ -242,7 +242,7 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     grid = _Grid.of(scene, g.means.double().numpy(), ground_masks[0])
     # Explain the road's brightness by the shadows of every direction; the best one is the sun's.
     road = grid.surface(g, ground_masks[0], np.ones(len(g)))
-    rows, columns = np.nonzero(road.known)
+    rows, columns = np.nonzero(road.is_known)
     if len(rows) < _MIN_CELLS:
         return None
     tops = grid.tops(g, is_solid & (g.scales.max(1).values < _LARGEST_M).numpy())
@@ -282,7 +282,7 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
     albedos = np.ones(len(g))
     for ground_mask in ground_masks[1:]:
         part = grid.surface(g, ground_mask, albedos)
-        known_cells = np.nonzero(part.known)
+        known_cells = np.nonzero(part.is_known)
         if len(known_cells[0]) == 0:
             continue
         horizon = grid.horizons(
@@ -303,13 +303,13 @@ def _find_shadows(scene: Scene) -> CastShadows | None:
         certainty=certainty,
         ratio=_triple(ratio),
         lit_rgb=_triple(np.exp(modes[1] if certainty > 0 else np.median(log_rgb, 0))),
-        lit_share=float(lit[all_ground.known].mean()),
+        lit_share=float(lit[all_ground.is_known].mean()),
         azimuth_deg=math.degrees(_AZIMUTHS[azimuth_index]),
         elevation_deg=math.degrees(_ELEVATIONS[elevation_index]),
         explained=explained.astype(np.float32),
-        lit=np.where(all_ground.known, lit, 0).astype(np.float32),
-        known=all_ground.known.astype(np.float32),
-        height_m=np.where(all_ground.known, all_ground.height_m, 0).astype(np.float32),
+        lit=np.where(all_ground.is_known, lit, 0).astype(np.float32),
+        known=all_ground.is_known.astype(np.float32),
+        height_m=np.where(all_ground.is_known, all_ground.height_m, 0).astype(np.float32),
         corner_m=(float(grid.corner[0]), float(grid.corner[1])),
         cell_m=grid.cell_m,
     )
@@ -338,7 +338,7 @@ class _Surface(NamedTuple):
     """Logarithm of luminance, [H, W]."""
     height_m: np.ndarray
     """Height, [H, W]."""
-    known: np.ndarray
+    is_known: np.ndarray
     """Mask of cells with ground, [H, W]."""
 
 
@@ -607,10 +607,10 @@ def _lit_near(
     shadows: CastShadows, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray
 ) -> np.ndarray:
     """Return the share of the sun that places see, blended to the mean off the ground."""
-    lit, known, height_m = shadows.at(x_m, y_m)
-    relative_height = np.abs(z_m - height_m / np.maximum(known, 1e-6)) / ON_GROUND_M
-    weight = known * (2 - 2 * relative_height).clip(0, 1)
-    return shadows.lit_share + weight * (lit / np.maximum(known, 1e-6) - shadows.lit_share)
+    lit, known_share, height_m = shadows.at(x_m, y_m)
+    relative_height = np.abs(z_m - height_m / np.maximum(known_share, 1e-6)) / ON_GROUND_M
+    weight = known_share * (2 - 2 * relative_height).clip(0, 1)
+    return shadows.lit_share + weight * (lit / np.maximum(known_share, 1e-6) - shadows.lit_share)
 
 
 def _fade_factors(shadows: CastShadows, transmittance: float, lit: np.ndarray) -> np.ndarray:
