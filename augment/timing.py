@@ -2,7 +2,7 @@
 
 `with timed("flood: bed"):` stands in a pass and costs two look-ups where nobody listens. `with
 stopwatch() as seconds:` around it measures. The GPU is then waited for at both ends of a pass,
-which makes the whole slower and each time its own. `with watched(tell):` around it reports which
+which makes the whole slower and each time its own. `with watched(report):` around it reports which
 pass has begun, and each step of long preparations (`counted`). It changes no picture and waits for
 nothing. An exception that the watcher raises gives up the work inside.
 """
@@ -65,27 +65,27 @@ class PassProgress:
 class PassWatch:
     """Reports the passes that run, one inside the other, to a function."""
 
-    def __init__(self, tell: Callable[[PassProgress], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[PassProgress], None]) -> None:
+        self._report = report
         self._open: list[PassProgress] = []
 
     def start(self, name: str, total: int = 0) -> None:
         """Report that a pass begins."""
         progress = PassProgress(name, 0, total)
-        self._tell(progress)
+        self._report(progress)
         self._open.append(progress)
 
     def advance(self) -> None:
         """Report one step more of the innermost pass."""
         last = self._open[-1]
         self._open[-1] = PassProgress(last.name, last.done + 1, last.total)
-        self._tell(self._open[-1])
+        self._report(self._open[-1])
 
     def stop(self, *, has_failed: bool) -> None:
         """End the innermost pass, and report the pass around it."""
         self._open.pop()
         if self._open and not has_failed:  # the pass around it goes on
-            self._tell(self._open[-1])
+            self._report(self._open[-1])
 
 
 _listening: ContextVar[StageTimer | None] = ContextVar("stopwatch", default=None)
@@ -139,14 +139,14 @@ def counted(name: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def watched(tell: Callable[[PassProgress], None]) -> Iterator[None]:
+def watched(report: Callable[[PassProgress], None]) -> Iterator[None]:
     """Have a function told of the passes that run inside, in this thread or task.
 
     Args:
-        tell: called at the start of each pass, after each step of one, and when a pass inside
+        report: called at the start of each pass, after each step of one, and when a pass inside
             another ends. An exception that it raises ends the work inside.
     """
-    outer = _watching.set(PassWatch(tell))
+    outer = _watching.set(PassWatch(report))
     try:
         yield
     finally:
