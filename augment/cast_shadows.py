@@ -1,8 +1,8 @@
 """Sun and shade on the ground of a scene, as its colours show them.
 
 In: a scene's background. Out: `CastShadows` (by `shadows_of`): the sun's direction, how dark its
-shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), wet ground and
-falling weather take the light from here.
+shadows are, and a map of lit ground. Smog fades these shadows (`faded_shadows`), and snow takes the
+sun from here.
 
 A dark ground is a shadow or dark asphalt. The things that stand on it tell which. They cast shadows
 on the ground from every direction of a coarse grid, and the direction whose shadows differ most in

@@ -8,8 +8,8 @@ URI says it. Else it is measured here, from the first of these that gives an ans
     ransac         level planes through low points near the path: LiDAR's, else solid Gaussians
     ego path       where the car must have stood; the adapter's estimate, where it made one
 
-All of these need metres and a world that is level. Flood, snow and wet ground call `ground_of`;
-adapters call `measure_ground`.
+All of these need metres and a world that is level. The flood effect and `climategs explain` call
+`ground_of`; adapters call `measure_ground` and `measure_from_classes`.
 """
 
 from __future__ import annotations

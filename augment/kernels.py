@@ -2,7 +2,8 @@
 against depth images, hashes.
 
 `augment.scene` (poses_at, colors_at), `augment.lod` (covered_plane) and `augment.boxes`
-(count_occlusion) prepare the arrays and call these. Every kernel fills its last arguments in place.
+(count_occlusion) prepare the arrays and call these. Kernels of effects call `mix`. Every other
+kernel fills its last arguments in place.
 """
 
 from __future__ import annotations

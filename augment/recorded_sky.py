@@ -1,8 +1,7 @@
 """Sky masks of recorded images, by brightness, place and graph cut.
 
 In: a recorded image, its camera, and LiDAR returns where there are any. Out: a bool mask, or two
-(`RecordedSky`). `augment.trust` judges views by it, styles read the sky's colour through it, and
-training views learn their sky from it.
+(`RecordedSky`). `augment.trust` judges views by it, and training views learn their sky from it.
 
 Bright smooth regions are sky. Regions below the horizon, or where the LiDAR had a return, are not.
 GrabCut (Rother et al. 2004, OpenCV's) draws the line between them. `find_sky` needs the image alone

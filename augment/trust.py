@@ -2,7 +2,7 @@
 
 In: a scene and its cameras. Out: `trust_mask`, a number for every pixel of a view, which jobs write
 beside the picture; and `judge_scene`, figures and sentences from a few small views, for `climategs`
-commands and quality checks.
+commands and the checks before a job.
 
 A clear render hides what weather shows: fog fills a hole in the road, and a sheet of sky 15 m away
 is a bright pane in it. So a view is judged by the scene itself:
