@@ -42,13 +42,15 @@ from augment.sky import is_stand_in
 
 LAYER_M = 1000.0  # from which rain and snow fall
 MAX_DROPS = 50_000  # drawn in a picture; what is beyond is veil sooner
-APERTURE_M, FOCUS_M = 3e-3, 6.0  # a lens of 6 mm at f/2, as cars have
+APERTURE_M = 3e-3
+FOCUS_M = 6.0  # a lens of 6 mm at f/2, as cars have
 NEAR_M = 0.2  # no drop is closer
 UNKNOWN_AIRLIGHT = (0.76, 0.78, 0.80)  # display-encoded, of scenes that know no sky
 _HORIZON_SINE = math.sin(math.radians(15.0))  # up to here is "above the horizon"
 _SAMPLES = 4096  # of directions
 _AROUND_M = 30.0  # how far away most of what lights a drop is
-_REFRACTED, _SCATTERED = 0.94, 0.5  # how much of its light a drop, or a flake, has from behind it
+_REFRACTED = 0.94
+_SCATTERED = 0.5  # how much of its light a drop, or a flake, has from behind it
 _AMONG_FLAKES = 0.5  # of a flake's light, which the flakes around it have scattered
 CLEAR = 0.95  # of a pixel: where near drops leave less it is the mask's
 SWAY_REACH_S = 0.95  # kernels._sway moves no flake farther than its speed in so long
@@ -93,7 +95,8 @@ def glow_of(scene: Scene) -> Glow:
     def find() -> Glow:
         index = np.arange(_SAMPLES)
         z = 1 - (2 * index + 1) / _SAMPLES
-        angle, flat = index * (math.pi * (3 - math.sqrt(5))), np.sqrt(1 - z * z)
+        angle = index * (math.pi * (3 - math.sqrt(5)))
+        flat = np.sqrt(1 - z * z)
         directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
         unknown = np.asarray(UNKNOWN_AIRLIGHT) ** 2
         light = np.tile(unknown, (_SAMPLES, 1))
@@ -114,7 +117,8 @@ def _in_fog(glow: Glow, fog: Fog | None, eye_z_m: float, extinction_per_m: float
     """The light where there is fog as well, which surrounds the drops and is behind them."""
     if fog is None:
         return glow
-    sigma, color = fog.sigma_per_m, np.asarray(fog.rgb, np.float64) ** 2
+    sigma = fog.sigma_per_m
+    color = np.asarray(fog.rgb, np.float64) ** 2
     if fog.scale_height_m is not None:
         climb = (eye_z_m - fog.base_z_m) / fog.scale_height_m
         sigma *= math.exp(min(max(-climb, -MAX_EXPONENT), MAX_EXPONENT))
@@ -150,7 +154,8 @@ def drawn_depths_m(falling: Falling, camera: Camera) -> np.ndarray:
     """Depth to which each class is drawn [B]: where it is `min_width_px` wide, less where there
     would be more than MAX_DROPS, 0 where none is worth it.
     """
-    sizes, focal = falling.sizes, math.sqrt(camera.fx * camera.fy)
+    sizes = falling.sizes
+    focal = math.sqrt(camera.fx * camera.fy)
     farthest = sizes.diameters_m * focal / falling.min_width_px
     solid = camera.width * camera.height / (3 * camera.fx * camera.fy)  # of a pyramid, over depth^3
     drawn = float((sizes.counts_per_m3 * farthest**3).sum()) * solid
@@ -160,12 +165,14 @@ def drawn_depths_m(falling: Falling, camera: Camera) -> np.ndarray:
 
 def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Walk:
     """Which cells the camera's view crosses, and where their drops are meanwhile."""
-    sizes, farthest = falling.sizes, drawn_depths_m(falling, camera)
+    sizes = falling.sizes
+    farthest = drawn_depths_m(falling, camera)
     half_s = falling.exposure_s / 2
     seconds = camera.timestamp_ns * 1e-9
     times = seconds + np.array([-half_s, 0.0, half_s])
     velocity = np.zeros((len(farthest), 3))
-    velocity[:, :2], velocity[:, 2] = falling.wind_mps, -sizes.speeds_mps
+    velocity[:, :2] = falling.wind_mps
+    velocity[:, 2] = -sizes.speeds_mps
     moves = velocity[:, None] * times[:, None]  # [B, 3, 3]
     poses = np.stack([motion.pose_after(camera, s) for s in (-half_s, half_s)])
     cells_m = sizes.cells_m
@@ -176,10 +183,15 @@ def walk_of(falling: Falling, camera: Camera, motion: Motion, scene: str) -> Wal
     spare += kernels.LEAST_RADIUS / math.sqrt(camera.fx * camera.fy) * farthest
     reach = cells_m * math.sqrt(0.75) + spare
     # Of the image's sides, inwards; then of its front.
-    normals = np.array([
-        [camera.fx, 0, camera.cx], [-camera.fx, 0, camera.width - camera.cx],
-        [0, camera.fy, camera.cy], [0, -camera.fy, camera.height - camera.cy], [0, 0, 1.0],
-    ])  # fmt: skip
+    normals = np.array(
+        [
+            [camera.fx, 0, camera.cx],
+            [-camera.fx, 0, camera.width - camera.cx],
+            [0, camera.fy, camera.cy],
+            [0, -camera.fy, camera.height - camera.cy],
+            [0, 0, 1.0],
+        ]
+    )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     pose = camera.camera_from_world.numpy()
     planes = np.concatenate([normals @ pose[:3, :3], normals @ pose[:3, 3:]], 1)
@@ -224,7 +236,8 @@ def _columns_of(
     around = camera.centre.numpy()[:2] + rays[:, :2] * farthest[:, None, None]  # [B, 5, 2]
     low = (around.min(1) - reach[:, None] - moved[:, :2]) / cells_m[:, None] - 0.5
     high = (around.max(1) + reach[:, None] - moved[:, :2]) / cells_m[:, None] - 0.5
-    first, end = np.floor(low).astype(np.int64), np.ceil(high).astype(np.int64) + 1
+    first = np.floor(low).astype(np.int64)
+    end = np.ceil(high).astype(np.int64) + 1
     slabs = [
         np.stack([np.full(b[0] - a[0], number), np.arange(a[0], b[0])], 1)
         for number, (a, b) in enumerate(zip(first, end, strict=True))
@@ -243,7 +256,8 @@ def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
         if not held.any():
             return empty
         found = np.empty((int(held.sum()), kernels.NUM_NUMBERS), np.float32)
-        offsets, counts = np.cumsum(held) - held, np.empty_like(held)
+        offsets = np.cumsum(held) - held
+        counts = np.empty_like(held)
         kernels.find_drops(*walk, offsets, counts, found)
     return np.concatenate([found[o : o + c] for o, c in zip(offsets, counts, strict=True)])
 
@@ -251,7 +265,8 @@ def find_drops(walk: Walk) -> Float32[np.ndarray, "N 9"]:
 def _listed(drops: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """drops, listed and begins as kernels.cover_pixels takes them."""
     bands = -(-height // kernels.ROWS)
-    begins, listed = np.empty(bands + 1, np.int64), np.empty(4 * len(drops), np.int64)
+    begins = np.empty(bands + 1, np.int64)
+    listed = np.empty(4 * len(drops), np.int64)
     needed = kernels.list_drops(drops, bands, begins, listed)
     if needed > len(listed):
         listed = np.empty(needed, np.int64)
@@ -295,7 +310,8 @@ class Veil(NamedTuple):
 
 def veil_of(falling: Falling, camera: Camera, glow: Glow) -> Veil:
     """What of the extinction is not drawn, and what light it gives."""
-    extinctions, whole = falling.sizes.extinctions_per_m, drawn_depths_m(falling, camera)
+    extinctions = falling.sizes.extinctions_per_m
+    whole = drawn_depths_m(falling, camera)
     begin = kernels.FADE * whole
     grows = whole - begin
     half_inverse = np.divide(0.5, grows, out=np.zeros_like(grows), where=grows > 0)
@@ -354,8 +370,11 @@ def draw_falling(
     mask = np.empty(wide.shape[:2], bool)
     with kernel_threads(1):
         kernels.blend_falling(
-            *(image.reshape(-1) for image in (wide, *surfaces)), *_listed(drops, len(mask)),
-            np.float32(CLEAR), *veil._replace(upwards=veil.upwards[()]), mask,
-        )  # fmt: skip
+            *(image.reshape(-1) for image in (wide, *surfaces)),
+            *_listed(drops, len(mask)),
+            np.float32(CLEAR),
+            *veil._replace(upwards=veil.upwards[()]),
+            mask,
+        )
     width = camera.width
     return torch.from_numpy(wide[:, :width]), torch.from_numpy(mask[:, :width])

@@ -28,7 +28,8 @@ from recipes.rain import Rain
 from recipes.schema import Recipe
 from recipes.snowfall import Snowfall
 
-STREAKS, FLAKES = "rain streaks and veil", "snowflakes and veil"
+STREAKS = "rain streaks and veil"
+FLAKES = "snowflakes and veil"
 
 
 class FallingEffect(Effect):
@@ -74,23 +75,32 @@ class FallingEffect(Effect):
         return measure_falling(self.table, placed, camera, view)
 
     def attenuate(self, own: Active, echoes: Echoes, rng: np.random.Generator) -> None:
-        kind, rate = own.data.kind, float(own.data.rate_mm_h)
+        kind = own.data.kind
+        rate = float(own.data.rate_mm_h)
         precipitation_echoes(echoes, scatterers_of(kind, rate), rng)
 
 
 class RainEffect(FallingEffect):
     """Rain in the air."""
 
-    name, section, model, mask = "rain", "weather.rain", Rain, "rain"
-    step, kind = STREAKS, "rain"
+    name = "rain"
+    section = "weather.rain"
+    model = Rain
+    mask = "rain"
+    step = STREAKS
+    kind = "rain"
     table = falling_table("rain", "streak")
 
 
 class SnowfallEffect(FallingEffect):
     """Snow in the air."""
 
-    name, section, model, mask = "snowfall", "weather.snowfall", Snowfall, "snowfall"
-    step, kind = FLAKES, "snow"
+    name = "snowfall"
+    section = "weather.snowfall"
+    model = Snowfall
+    mask = "snowfall"
+    step = FLAKES
+    kind = "snow"
     table = falling_table("snowfall", "flake")
 
 
@@ -123,7 +133,8 @@ def _placed(falling: Falling, step: str, scene: Scene) -> Placed:
 
 
 def _fallen(own: Active, drawn: Drawn, camera: Camera, step: str, mask: str) -> Drawn:
-    alpha, depth = drawn.raster.alpha, drawn.raster.expected_depth
+    alpha = drawn.raster.alpha
+    depth = drawn.raster.expected_depth
     assert alpha is not None and depth is not None
     with timed(step):
         rgb, near = draw_falling(

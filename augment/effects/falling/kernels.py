@@ -50,8 +50,11 @@ def _sway(x, y, z, sways, flutter):
     sways: as of find_drops. flutter: turns of the flake. Eddies: three waves across their direction
     of travel, so the air is neither pressed nor thinned; flutter: a level circle of its own.
     """
-    speed, per_turn = sways[0], 1 / (2 * math.pi)
-    a, b, c = 0.6 / 2.0 * speed, 0.6 / 2.7 * speed, 0.6 / 3.4 * speed
+    speed = sways[0]
+    per_turn = 1 / (2 * math.pi)
+    a = 0.6 / 2.0 * speed
+    b = 0.6 / 2.7 * speed
+    c = 0.6 / 3.4 * speed
     d = speed / (4 + 8 * (flutter * _HALF))
     along_x = 1.1 * per_turn * x + sways[2]
     along_y = 1.5 * per_turn * y + sways[3]
@@ -65,9 +68,21 @@ def _sway(x, y, z, sways, flutter):
 
 @kernel
 def find_drops(
-    slabs, columns, cells, keys, moves, sways, quantiles, shares, planes, shutter, lens,
-    offsets, counts, found,
-):  # fmt: skip
+    slabs,
+    columns,
+    cells,
+    keys,
+    moves,
+    sways,
+    quantiles,
+    shares,
+    planes,
+    shutter,
+    lens,
+    offsets,
+    counts,
+    found,
+):
     """counts [S]: drops of each slab of cells that are seen. found [N, NUM_NUMBERS]: theirs from
     offsets [S] on: column and row at both ends of a streak, 1 / z there, radius up to which it
     covers as much as in its middle, radius beyond which nothing, covered share. Empty: counts are
@@ -85,14 +100,20 @@ def find_drops(
     """
     is_counting = len(found) == 0
     for slab in prange(len(slabs)):
-        b, i = slabs[slab, 0], slabs[slab, 1]
-        size, reach, farthest = cells[b, 0], cells[b, 1], cells[b, 2]
+        b = slabs[slab, 0]
+        i = slabs[slab, 1]
+        size = cells[b, 0]
+        reach = cells[b, 1]
+        farthest = cells[b, 2]
         number = np.int64(0)
-        spare, at, ends = cells[b, 3], np.empty(3), np.empty((2, 3))
+        spare = cells[b, 3]
+        at = np.empty(3)
+        ends = np.empty((2, 3))
         for j in range(columns[b, 0], columns[b, 1]):
             x = (np.float64(i) + 0.5) * size + moves[b, 1, 0]
             y = (np.float64(j) + 0.5) * size + moves[b, 1, 1]
-            low, high = -1e18, 1e18  # z of the cells' middles, scene world
+            low = -1e18
+            high = 1e18  # z of the cells' middles, scene world
             for side in range(6):
                 n = min(side, 4)  # the last one is the far end, which faces the front
                 flip = -1.0 if side == 5 else 1.0
@@ -126,7 +147,8 @@ def find_drops(
                     at[0] = (np.float64(i) + _unit(bits, 0)) * size + moves[b, 1, 0]
                     at[1] = (np.float64(j) + _unit(bits, 21)) * size + moves[b, 1, 1]
                     at[2] = (np.float64(k) + _unit(bits, 42)) * size + moves[b, 1, 2]
-                    inside, ahead = np.inf, 0.0
+                    inside = np.inf
+                    ahead = 0.0
                     for n in range(5):
                         ahead = planes[n, 0] * at[0] + planes[n, 1] * at[1] + planes[n, 2] * at[2]
                         ahead += planes[n, 3]
@@ -152,7 +174,8 @@ def find_drops(
                                 + shutter[end, c, 3]
                             )
                     near = lens[6]
-                    z0, z1 = ends[0, 2], ends[1, 2]
+                    z0 = ends[0, 2]
+                    z1 = ends[1, 2]
                     if max(z0, z1) <= near:
                         continue
                     for end in range(2):  # what is behind the front is cut off
@@ -161,7 +184,8 @@ def find_drops(
                             for c in range(3):
                                 ends[end, c] = ends[0, c] + cut * (ends[1, c] - ends[0, c])
                             ends[end, 2] = near
-                            z0, z1 = ends[0, 2], ends[1, 2]
+                            z0 = ends[0, 2]
+                            z1 = ends[1, 2]
                     z = 0.5 * (z0 + z1)
                     if z >= farthest:
                         continue
@@ -192,10 +216,14 @@ def find_drops(
                     fade = min(max((farthest - z) / ((1 - FADE) * farthest), 0.0), 1.0)
                     cover = min(0.5 * math.pi * wide * wide / spread, 1.0)  # two cross-sections
                     row = offsets[slab] + number
-                    found[row, 0], found[row, 1] = u0, v0
-                    found[row, 2], found[row, 3] = u1, v1
-                    found[row, 4], found[row, 5] = 1 / z0, 1 / z1
-                    found[row, 6], found[row, 7] = inside, outside
+                    found[row, 0] = u0
+                    found[row, 1] = v0
+                    found[row, 2] = u1
+                    found[row, 3] = v1
+                    found[row, 4] = 1 / z0
+                    found[row, 5] = 1 / z1
+                    found[row, 6] = inside
+                    found[row, 7] = outside
                     found[row, 8] = cover * fade
                     number += 1
         counts[slab] = number
@@ -211,10 +239,13 @@ def list_drops(drops, bands, begins, listed):
     for band in range(bands + 1):
         begins[band] = 0
     most = np.float32(bands - 1)
-    per_row, zero = np.float32(1 / ROWS), np.float32(0)
+    per_row = np.float32(1 / ROWS)
+    zero = np.float32(0)
     for is_filling in range(2):
         for row in range(len(drops)):
-            v0, v1, outside = drops[row, 1], drops[row, 3], drops[row, 7]
+            v0 = drops[row, 1]
+            v1 = drops[row, 3]
+            outside = drops[row, 7]
             top = np.int64(min(max((min(v0, v1) - outside) * per_row, zero), most))
             end = np.int64(min(max((max(v0, v1) + outside) * per_row, zero), most))
             for band in range(top, end + 1):
@@ -237,7 +268,8 @@ def list_drops(drops, bands, begins, listed):
 @inner()
 def _nearest_in_row(row, width, alpha, depth, eight):
     """Depth of the nearest surface in an image row. eight: spare."""
-    zeros, never = v8.splat(np.float32(0)), v8.splat(np.float32(np.inf))
+    zeros = v8.splat(np.float32(0))
+    never = v8.splat(np.float32(np.inf))
     found = never
     for j in range(0, width, LANES):
         pixel = U(row * width + min(j, width - LANES))
@@ -256,15 +288,26 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
     """clear: share of each pixel of image rows top to bottom that none of the drops covers, in
     their order. alpha, depth: of all pixels.
     """
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    far, last_block = np.float32(width), width - LANES
-    zeros, ones, soft = v8.splat(zero), v8.splat(one), v8.splat(np.float32(1 / SOFT))
+    zero = np.float32(0)
+    half = np.float32(0.5)
+    one = np.float32(1)
+    far = np.float32(width)
+    last_block = width - LANES
+    zeros = v8.splat(zero)
+    ones = v8.splat(one)
+    soft = v8.splat(np.float32(1 / SOFT))
     for i in range(U((bottom - top) * width)):
         clear[i] = one
     for place in range(first, end):
         drop = drops[listed[place]]
-        u0, v0, near, outside, share = drop[0], drop[1], drop[4], drop[7], drop[8]
-        du, dv, farther = drop[2] - u0, drop[3] - v0, drop[5] - near
+        u0 = drop[0]
+        v0 = drop[1]
+        near = drop[4]
+        outside = drop[7]
+        share = drop[8]
+        du = drop[2] - u0
+        dv = drop[3] - v0
+        farther = drop[5] - near
         per_length = one / max(du * du + dv * dv, np.float32(1e-12))
         beyond = outside * outside
         ramp = share / (beyond - drop[6] * drop[6])
@@ -278,12 +321,14 @@ def _cover_band(drops, listed, first, end, top, bottom, width, alpha, depth, cle
         for row in range(begin, last):
             v = np.float32(row) + half - v0
             if leans:  # the piece of the streak that is so near to the row
-                middle, reach = v * per_row, outside * abs(per_row)
+                middle = v * per_row
+                reach = outside * abs(per_row)
                 ua = u0 + min(max(middle - reach, zero), one) * du
                 ub = u0 + min(max(middle + reach, zero), one) * du
                 left = np.int64(max(min(ua, ub) - outside, zero))
                 right = np.int64(min(max(max(ua, ub) + outside + one, zero), far))
-            ax, base = v8.splat(du * per_length), v8.splat(v * dv * per_length)
+            ax = v8.splat(du * per_length)
+            base = v8.splat(v * dv * per_length)
             for j in range(left, right, LANES):
                 at = min(j, last_block)  # the last eight pixels of a row take those before them
                 x = v8.splat(np.float32(at) + half - u0) + v8.lane_numbers()
@@ -320,9 +365,8 @@ def cover_pixels(drops, listed, begins, alpha, depth, clear):
         bottom = min(top + ROWS, height)
         own = np.empty(ROWS * width, np.float32)
         _cover_band(
-            drops, listed, begins[band], begins[band + 1],
-            top, bottom, width, alpha, depth, own,
-        )  # fmt: skip
+            drops, listed, begins[band], begins[band + 1], top, bottom, width, alpha, depth, own
+        )
         for row in range(top, bottom):
             for j in range(U(width)):
                 clear[U(row), j] = own[U((row - top) * width) + j]
@@ -334,7 +378,9 @@ def _classes_in_row(nearest, bands, own):
     that are not all veil where the nearest surface is, and slope and offset of the optical depth
     of the others, which grows with z alone.
     """
-    count, slope, offset = 0, np.float32(0), np.float32(0)
+    count = 0
+    slope = np.float32(0)
+    offset = np.float32(0)
     for b in range(NUM_CLASSES):
         if bands[b, 4] > nearest:
             for k in range(5):
@@ -361,11 +407,14 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, shown, clear, tau, sky,
     transmittance up to the sky. light [3, 4]: airlight; light of a drop in the mean, what of it
     grows to the right, and ahead.
     """
-    zeros, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    zeros = v8.splat(np.float32(0))
+    one = v8.splat(np.float32(1))
     near = _decay(tau * lengths)
     per_length = one / lengths
     red, green, blue = v8.load_colours(pixels, at)
-    r, g, b = red, green, blue
+    r = red
+    g = green
+    b = blue
     edge = v8.minimum(shown, one - shown) - v8.splat(np.float32(EDGE))
     is_mixed = False
     if splats.size > 0 and v8.any_not_negative(edge):
@@ -387,7 +436,8 @@ def _veil(own, splats, is_mixed, edge, light, shown, near, sky):
     """The square of a colour behind the veil. edge: lanes whose pixels show both surfaces and sky,
     each behind its own, if any is_mixed. near: transmittance up to the surfaces.
     """
-    zeros, air = v8.splat(np.float32(0)), v8.splat(light[0])
+    zeros = v8.splat(np.float32(0))
+    air = v8.splat(light[0])
     veiled = air + (sky + shown * (near - sky)) * (own * own - air)
     if is_mixed:
         rest = v8.splat(np.float32(1)) - shown
@@ -410,15 +460,33 @@ def _blend_colour(veiled, light, u, clear, per_length):
 
 @inner()
 def _blend_row(
-    row, width, rgb, splats, alpha, depth, clear, first, nearest,
-    rays, climb, bands, upwards, light, own, rest,
-):  # fmt: skip
+    row,
+    width,
+    rgb,
+    splats,
+    alpha,
+    depth,
+    clear,
+    first,
+    nearest,
+    rays,
+    climb,
+    bands,
+    upwards,
+    light,
+    own,
+    rest,
+):
     """A row of blend_falling. clear: from place `first` on. own, rest: spare."""
-    zeros, half, least = v8.splat(np.float32(0)), np.float32(0.5), np.float32(1e-6)
+    zeros = v8.splat(np.float32(0))
+    half = np.float32(0.5)
+    least = np.float32(1e-6)
     count, slope, offset = _classes_in_row(nearest, bands, own)
     v = (np.float32(row) + half - rays[3]) * rays[1]
-    flat, level = v8.splat(np.float32(1) + v * v), climb[1] * v + climb[2]
-    left, right = (half - rays[2]) * rays[0], (np.float32(width) - rays[2]) * rays[0]
+    flat = v8.splat(np.float32(1) + v * v)
+    level = climb[1] * v + climb[2]
+    left = (half - rays[2]) * rays[0]
+    right = (np.float32(width) - rays[2]) * rays[0]
     shows_sky = max(climb[0] * left, climb[0] * right) + level > least
     for j in range(0, width, LANES):
         # The last eight of a row take pixels before them, which are not written.
@@ -454,9 +522,22 @@ def _blend_row(
 
 @kernel
 def blend_falling(
-    rgb, splats, alpha, depth, drops, listed, begins, least,
-    rays, climb, bands, upwards, airlight, glow, mask,
-):  # fmt: skip
+    rgb,
+    splats,
+    alpha,
+    depth,
+    drops,
+    listed,
+    begins,
+    least,
+    rays,
+    climb,
+    bands,
+    upwards,
+    airlight,
+    glow,
+    mask,
+):
     """rgb [3 H W] behind the veil and the drops, in place; mask [H, W]: where a drawn drop leaves
     less than `least` of a pixel clear.
 
@@ -473,8 +554,10 @@ def blend_falling(
     for band in prange(len(begins) - 1):
         top = np.int64(band) * ROWS
         bottom = min(top + ROWS, height)
-        clear, nearest = np.empty(ROWS * width, np.float32), np.empty(ROWS, np.float32)
-        light, own = np.empty((3, 4), np.float32), np.empty((NUM_CLASSES, 5), np.float32)
+        clear = np.empty(ROWS * width, np.float32)
+        nearest = np.empty(ROWS, np.float32)
+        light = np.empty((3, 4), np.float32)
+        own = np.empty((NUM_CLASSES, 5), np.float32)
         rest = np.empty(3 * LANES, np.float32)
         for row in range(top, bottom):  # which brings the surfaces into the cache, in order
             nearest[row - top] = _nearest_in_row(row, width, alpha, depth, rest)
@@ -490,6 +573,20 @@ def blend_falling(
                 light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
                 light[c, 3] = glow[c, 1] * v + glow[c, 2]
             _blend_row(
-                row, width, rgb, splats, alpha, depth, clear, first, nearest[row - top],
-                rays, climb, bands, upwards, light, own, rest,
-            )  # fmt: skip
+                row,
+                width,
+                rgb,
+                splats,
+                alpha,
+                depth,
+                clear,
+                first,
+                nearest[row - top],
+                rays,
+                climb,
+                bands,
+                upwards,
+                light,
+                own,
+                rest,
+            )

@@ -21,7 +21,9 @@ def falling_table(name: str, drop: str) -> BoxTable:
     whose numbers are not finite. pixels: that show the box, or NOT_COUNTED. {drop}_pixels: those
     of them in the effect's mask.
     """
-    through, marked, share = f"{name}_transmittance", f"{drop}_pixels", f"{drop}_fraction"
+    through = f"{name}_transmittance"
+    marked = f"{drop}_pixels"
+    share = f"{drop}_fraction"
     return BoxTable(
         name=f"box_{name}",
         file=f"labels/{name}.parquet",

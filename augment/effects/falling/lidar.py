@@ -33,7 +33,9 @@ WATER_INDEX_905 = 1.3275  # of water at 0.9 um (Hale and Querry 1973)
 # releases, somewhat more since (Young et al. 2018). Not fitted to a car's sensor: nobody publishes
 # its receiver near by, on which echoes of flakes depend as much.
 ICE_LIDAR_RATIO_SR = 25.0
-_STEP_M, _NEAR_M, _GROWTH = 0.05, 5.0, 0.01  # of the ranges: even ones, then a share of the range
+_STEP_M = 0.05
+_NEAR_M = 5.0
+_GROWTH = 0.01  # of the ranges: even ones, then a share of the range
 _SIGNALS = 256
 
 
@@ -115,7 +117,9 @@ def echo_table(scatterers: Scatterers, model: LidarModel) -> EchoTable:
     strongest = scatterers.reflectance * white * share
     noise = model.noise_signal
     used = int((strongest > noise).nonzero()[0].max(initial=0)) + 1
-    ranges, white, width_mm = ranges[: used + 1], white[:used], width_mm[:used]
+    ranges = ranges[: used + 1]
+    white = white[:used]
+    width_mm = width_mm[:used]
     signals = np.geomspace(noise, max(2 * noise, strongest.max()), _SIGNALS)
     with np.errstate(divide="ignore"):  # where nothing comes through
         needed_mm = width_mm * np.sqrt(signals[:, None] / (scatterers.reflectance * white))
@@ -148,8 +152,10 @@ def strongest_drops(
 
     Two numbers a beam are drawn, whatever the table holds.
     """
-    number, place = rng.standard_exponential(len(ends_m)), rng.random(len(ends_m))
-    strength, ranges = np.zeros(len(ends_m)), np.zeros(len(ends_m))
+    number = rng.standard_exponential(len(ends_m))
+    place = rng.random(len(ends_m))
+    strength = np.zeros(len(ends_m))
+    ranges = np.zeros(len(ends_m))
     last = np.searchsorted(table.ranges_m, ends_m, side="right") - 1  # whole steps before the end
     last = np.clip(last, 0, len(table.ranges_m) - 1)
     hit = number < table.mean_number[0, last]
@@ -161,14 +167,16 @@ def strongest_drops(
     rows = np.flatnonzero(hit)
     which = np.searchsorted(table.signals, strength[rows], side="right") - 1
     for level in np.unique(which):
-        at, places = rows[which == level], table.places[level]
+        at = rows[which == level]
+        places = table.places[level]
         ranges[at] = np.interp(place[at] * places[last[at]], places, table.ranges_m)
     return strength, ranges
 
 
 def precipitation_echoes(echoes: Echoes, scatterers: Scatterers, rng: np.random.Generator) -> None:
     """Echoes seen through rain or snowfall, noisier by what it takes, or lost to a drop's own."""
-    model, air = echoes.model, echoes.air_m
+    model = echoes.model
+    air = echoes.air_m
     before = echoes.gain.copy()
     echoes.gain *= np.exp(-2 * scatterers.extinction_per_m * air)
     echoes.spread_ranges(before, rng.standard_normal(len(air)))

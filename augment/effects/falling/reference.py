@@ -90,14 +90,19 @@ def _streaks(
     """Drops in the picture from where they are as the shutter opens and closes, [N, 3] each."""
     fx, fy, cx, cy, width, height, near, aperture, focus = lens
     seen = np.maximum(opened[:, 2], closed[:, 2]) > near
-    opened, closed, across = opened[seen], closed[seen], across[seen]
+    opened = opened[seen]
+    closed = closed[seen]
+    across = across[seen]
     cut = (near - opened[:, 2]) / np.where(closed[:, 2] == opened[:, 2], 1, (closed - opened)[:, 2])
     crossing = opened + cut[:, None] * (closed - opened)
     crossing[:, 2] = near
     opened, closed = (np.where(e[:, 2:] < near, crossing, e) for e in (opened, closed))
-    z0, z1 = opened[:, 2], closed[:, 2]
-    z, focal = (z0 + z1) / 2, math.sqrt(fx * fy)
-    wide, blur = across / z * focal, aperture * np.abs(1 / z - 1 / focus) * focal
+    z0 = opened[:, 2]
+    z1 = closed[:, 2]
+    z = (z0 + z1) / 2
+    focal = math.sqrt(fx * fy)
+    wide = across / z * focal
+    blur = aperture * np.abs(1 / z - 1 / focus) * focal
     outside = np.maximum((wide + blur) / 2 + 0.5, LEAST_RADIUS)
     inside = np.maximum(np.abs(wide - blur) / 2 - 0.5, 0)
     u = np.stack([fx * opened[:, 0] / z0 + cx, fx * closed[:, 0] / z1 + cx])
@@ -127,12 +132,14 @@ def cover_by_numpy(
         )
         across = slice(max(0, math.floor(min(u0, u1) - outside)), math.ceil(max(u0, u1) + outside))
         y, x = np.mgrid[:height, :width][:, rows, across] + 0.5
-        du, dv = u1 - u0, v1 - v0
+        du = u1 - u0
+        dv = v1 - v0
         along = ((x - u0) * du + (y - v0) * dv) / max(du * du + dv * dv, 1e-12)
         along = along.clip(0, 1)
         away = (x - u0 - along * du) ** 2 + (y - v0 - along * dv) ** 2
         covered = ((outside**2 - away) / (outside**2 - inside**2)).clip(0, 1) * share
-        per_z, surface = near + along * (far - near), depth[rows, across]
+        per_z = near + along * (far - near)
+        surface = depth[rows, across]
         behind = ((1 - surface * per_z) / SOFT).clip(0, 1)
         hidden = np.where(surface > 0, alpha[rows, across] * behind, 0)
         clear[rows, across] *= 1 - covered * (1 - hidden)
@@ -169,7 +176,8 @@ def blend_by_torch(
     own = rgb.clamp_min(0)
     mixed = airlight + (sky + shown * (near - sky))[..., None] * (own**2 - airlight)
     if splats is not None:
-        parts, rest = shown[..., None], 1 - shown[..., None]
+        parts = shown[..., None]
+        rest = 1 - shown[..., None]
         behind = torch.minimum((own - splats).clamp_min(0), rest)
         ahead = ((own - behind) / parts.clamp_min(EDGE)) ** 2
         behind = (behind / rest.clamp_min(EDGE)) ** 2

@@ -81,6 +81,7 @@ def motion_of(scene: Scene, camera: Camera) -> Motion:
     seconds = (times[last] - times[first]) * 1e-9
     if seconds > _MAX_GAP_S:
         return STANDING
-    before, then = path.world_from_camera[first], path.world_from_camera[last]
+    before = path.world_from_camera[first]
+    then = path.world_from_camera[last]
     turn = Rotation.from_matrix(then[:3, :3] @ before[:3, :3].T).as_rotvec()
     return Motion((then[:3, 3] - before[:3, 3]) / seconds, turn / seconds)

@@ -53,7 +53,10 @@ _SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a co
 class FloodEffect(Effect):
     """Standing water; it draws the scene in layers, above the surface, below it and mirrored."""
 
-    name, section, model, mask = "flood", "weather.flood", Flood, "water"
+    name = "flood"
+    section = "weather.flood"
+    model = Flood
+    mask = "water"
     draws = PASSES[1:3]
     # submerged_fraction: of the box's height. pixels: that show the box, or NOT_COUNTED in an image
     # without water in view. hidden_pixels: those behind water.
@@ -130,10 +133,12 @@ class FloodEffect(Effect):
     ) -> dict[str, np.ndarray]:
         level_z_m = view.placed.water_level_z_m
         assert level_z_m is not None
-        pixels, hidden = np.full(len(placed), NOT_COUNTED), np.zeros(len(placed), np.int64)
+        pixels = np.full(len(placed), NOT_COUNTED)
+        hidden = np.zeros(len(placed), np.int64)
         if view.depth_m is not None and view.mask is not None:
             counted = hidden_pixels(placed, camera, view.depth_m, view.mask)
-            pixels, hidden = counted.pixels, counted.marked
+            pixels = counted.pixels
+            hidden = counted.marked
         submerged = submerged_fraction(placed, level_z_m)
         return {"submerged_fraction": submerged, "pixels": pixels, "hidden_pixels": hidden}
 
@@ -179,7 +184,8 @@ def flood_medium(
 
 
 def _steps(medium: FloodMedium, reason: str) -> tuple[Step, ...]:
-    waves, tier = len(medium.waves.amplitudes_m), medium.reflection
+    waves = len(medium.waves.amplitudes_m)
+    tier = medium.reflection
     mirrored = {
         "sky": "reflection 'sky' shows no scene",
         "screen_space": "at a quarter of the resolution, for what the screen does not show",
@@ -218,7 +224,8 @@ def submerged_fraction(placed: PlacedBoxes, level_z_m: float) -> Float64[np.ndar
     finite has NaN.
     """
     z = placed.corners_m[..., 2]  # [B, 8]
-    low, high = z.min(axis=1), z.max(axis=1)
+    low = z.min(axis=1)
+    high = z.max(axis=1)
     height = high - low
     with np.errstate(invalid="ignore"):
         fraction = (level_z_m - low) / np.where(height > 0, height, 1.0)

@@ -88,9 +88,11 @@ def composite_water(
     write to.
     """
     assert front.rgb is not None and front.alpha is not None
-    rgb, alpha = front.rgb, front.alpha
+    rgb = front.rgb
+    alpha = front.alpha
     in_place = kernels_for(renderer.backend, rgb, alpha) == CPU
-    image, dry = rgb if in_place else rgb.clone(), _dry_rows(camera)
+    image = rgb if in_place else rgb.clone()
+    dry = _dry_rows(camera)
     both = rgb[window.top : dry].clone()  # rows that show water and sky
     if dry:
         above = camera.cropped(0, 0, camera.width, dry)
@@ -161,7 +163,8 @@ def merge_depths(
     total = alpha + share
     merged = {ALPHA: total}
     for name in requested:
-        nearer, other = getattr(front, name)[here], getattr(behind, name)[there]
+        nearer = getattr(front, name)[here]
+        other = getattr(behind, name)[there]
         if name == EXPECTED_DEPTH:
             merged[name] = (alpha * nearer + share * other) / total.clamp_min(DEPTH_EPS)
         else:
@@ -184,7 +187,8 @@ def view_from_below(
     What the surface reflects back down counts as water.
     """
     camera = front.camera
-    rgb, device = front.rgb, front.rgb.device
+    rgb = front.rgb
+    device = front.rgb.device
     lengths = camera.ray_lengths(rgb.dtype, device)
     deep = torch.tensor(medium.rgb, dtype=rgb.dtype, device=device)
     to_bed = transmittance(medium, front.depth * lengths)
@@ -274,8 +278,10 @@ def render_flooded(
     with timed("rasterise"):
         front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
-    sky, fog = renderer.sky, renderer.fog
-    backend, device = renderer.backend, front.alpha.device
+    sky = renderer.sky
+    fog = renderer.fog
+    backend = renderer.backend
+    device = front.alpha.device
     with timed("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:

@@ -30,7 +30,8 @@ from augment.render.cpu.jit import inner, kernel
 # So float64 is needed once per wave and chunk of a row; float32 counts turns from the anchor.
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
-KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
+KEPT = 7
+FADING = 10  # float32 numbers that are laid out per wave
 _ZERO, _HALF, _ONE, _THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
 TINY = np.float32(1e-24)  # square of a normal's length, before it is made 1, at a cusp
 # sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
@@ -72,7 +73,8 @@ def _meets(column, row_z, rotation, lens, height, farthest):
 @inner()
 def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
     """First and one past the last column whose rays meet the plane, which are an interval."""
-    first, last = 0, width - 1
+    first = 0
+    last = width - 1
     meets_first = _meets(first, row_z, rotation, lens, height, farthest)
     meets_last = _meets(last, row_z, rotation, lens, height, farthest)
     if meets_first == meets_last:
@@ -99,15 +101,18 @@ def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept
     many = some = np.uint64(0)
     faded[:] = _ZERO
     for i in range(len(waves)):
-        kx, ky = waves[i, 0], waves[i, 1]
+        kx = waves[i, 0]
+        ky = waves[i, 1]
         along = kx * step[0] + ky * step[1]
         side = (along * z) ** 2
         down = kx * drop[0] + ky * drop[1]
         down_more = kx * bend[0] + ky * bend[1]
-        left, right = down + columns[0] * down_more, down + columns[1] * down_more
+        left = down + columns[0] * down_more
+        right = down + columns[1] * down_more
         nearest = 0.0 if left * right < 0.0 else min(left * left, right * right)
         if spacing[0] * (side + nearest) >= 1.0:
-            gx, gy = terms[i, 3], terms[i, 4]
+            gx = terms[i, 3]
+            gy = terms[i, 4]
             faded[0] += _HALF * gx * gx
             faded[1] += _HALF * gx * gy
             faded[2] += _HALF * gy * gy
@@ -164,7 +169,8 @@ def _add_fading(fading, count, way, n, spacing, limits, towards, sums):
     """
     vx, vy = towards
     lost, xx, xy, yy, gx, gy = sums
-    gone, rise = limits[1], _ONE / (limits[2] - limits[1])
+    gone = limits[1]
+    rise = _ONE / (limits[2] - limits[1])
     for i in range(count):
         at = i * np.uint64(FADING)
         down = v8.fmuladd(_term(fading, at, 9), n, _term(fading, at, 8))
@@ -173,11 +179,13 @@ def _add_fading(fading, count, way, n, spacing, limits, towards, sums):
         t = v8.minimum(v8.maximum(t, v8.splat(_ZERO)), v8.splat(_ONE))
         weight = t * t * (v8.splat(_THREE) - t - t)
         sine, cosine = _sin_cos(v8.fmuladd(_term(fading, at, 1), way, _term(fading, at, 0)))
-        sine, cosine = weight * sine, weight * cosine
+        sine = weight * sine
+        cosine = weight * cosine
         xx = v8.fmuladd(_term(fading, at, 2), sine, xx)
         xy = v8.fmuladd(_term(fading, at, 3), sine, xy)
         yy = v8.fmuladd(_term(fading, at, 4), sine, yy)
-        slope_x, slope_y = _term(fading, at, 5), _term(fading, at, 6)
+        slope_x = _term(fading, at, 5)
+        slope_y = _term(fading, at, 6)
         gx = v8.fmuladd(slope_x, cosine, gx)
         gy = v8.fmuladd(slope_y, cosine, gy)
         slope = slope_x * vx + slope_y * vy
@@ -192,7 +200,8 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, en
 
     ray: d0 and a, their x, y and z. limits [3]: of `fill_field`.
     """
-    zero, one = v8.splat(_ZERO), v8.splat(_ONE)
+    zero = v8.splat(_ZERO)
+    one = v8.splat(_ONE)
     x0, y0, z0, ax, ay, az = ray
     for block in range((end - begin + 7) // 8):
         n = v8.splat(np.float32(begin + 8 * block)) + v8.lane_numbers()
@@ -203,7 +212,8 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, en
         dy = v8.fmuladd(v8.splat(ay), n, v8.splat(y0))
         length = v8.sqrt(v8.fmuladd(dx, dx, dy * dy))
         slanted = v8.at_least(length, v8.splat(limits[0]))
-        vx, vy = v8.select(slanted, dx / length, one), v8.select(slanted, dy / length, zero)
+        vx = v8.select(slanted, dx / length, one)
+        vy = v8.select(slanted, dy / length, zero)
         lost = v8.splat(faded[0]) * vx * vx
         lost = v8.fmuladd(v8.splat(faded[1] + faded[1]) * vx, vy, lost)
         lost = v8.fmuladd(v8.splat(faded[2]) * vy, vy, lost)
@@ -212,7 +222,8 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, en
         lost, xx, xy, yy, gx, gy = _add_fading(
             fading, some, way, n, spacing, limits, (vx, vy), (lost, xx, xy, yy, gx, gy)
         )
-        wide, deep = one - xx, one - yy
+        wide = one - xx
+        deep = one - yy
         nx = v8.negate(v8.fmuladd(xy, gy, deep * gx))
         ny = v8.negate(v8.fmuladd(xy, gx, wide * gy))
         nz = v8.maximum(wide * deep - xy * xy, zero)
@@ -230,7 +241,8 @@ def _anchor(begin, end, row_z, rotation, lens):
 
     Turns counted from a point near the horizon would be lost in float32.
     """
-    middle, last = (begin + end) // 2, end - 1
+    middle = (begin + end) // 2
+    last = end - 1
     z = abs(_ray_z(middle, row_z, rotation, lens))
     z_begin = abs(_ray_z(begin, row_z, rotation, lens))
     z_last = abs(_ray_z(last, row_z, rotation, lens))
@@ -262,8 +274,12 @@ def fill_field(
 def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, images):
     normal_x, normal_y, slope_variance = images
     width = normal_x.shape[1]
-    ax, ay, az = rotation[0, 0] / lens[0], rotation[1, 0] / lens[0], rotation[2, 0] / lens[0]
-    bx, by, bz = rotation[0, 1] / lens[1], rotation[1, 1] / lens[1], rotation[2, 1] / lens[1]
+    ax = rotation[0, 0] / lens[0]
+    ay = rotation[1, 0] / lens[0]
+    az = rotation[2, 0] / lens[0]
+    bx = rotation[0, 1] / lens[1]
+    by = rotation[1, 1] / lens[1]
+    bz = rotation[2, 1] / lens[1]
     v = (i + 0.5 - lens[3]) / lens[1]
     row_z = v * rotation[2, 1]
     first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
@@ -287,7 +303,8 @@ def _fill_row(i, rotation, eye, height, lens, farthest, limits, waves, terms, im
         step = ax - az / z * x, ay - az / z * y
         drop = bx * z - bz * x, by * z - bz * y
         bend = bx * az - bz * ax, by * az - bz * ay
-        near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
+        near = max(abs(z_begin), abs(z_last))
+        far = min(abs(z_begin), abs(z_last))
         sparse = (limits[1] * height / (near * near)) ** 2
         dense = (limits[2] * height / (far * far)) ** 2
         columns = float(begin - at), float(stop - 1 - at)
@@ -331,7 +348,8 @@ NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
 _INFINITE = np.float32(math.inf)
 FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
 # Ways (in |x|) that one bilinear patch may hold: those of one surface.
-_SMOOTH, _SMOOTH_WAY = np.float32(0.2), np.float32(0.05)
+_SMOOTH = np.float32(0.2)
+_SMOOTH_WAY = np.float32(0.05)
 
 
 @kernel
@@ -344,24 +362,30 @@ def build_pyramid(alpha, depth, pyramid):
         for i in range(block * BLOCK, (block + 1) * BLOCK):
             out = pyramid[i]
             if i < height:
-                seen, z = alpha[i], depth[i]
+                seen = alpha[i]
+                z = depth[i]
                 for j in range(width):
                     out[j] = _ONE / z[j] if seen[j] >= _HALF else _ZERO
                 out[width:columns] = _ZERO
             else:
                 out[:columns] = _ZERO
-        fine, size = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns], 4
+        fine = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns]
+        size = 4
         for _ in range(LEVELS):
             first = rows - rows * 4 // size + block * (BLOCK // size)
             coarse = pyramid[first : first + BLOCK // size, columns : columns + columns // size]
             for i in range(coarse.shape[0]):
-                a, b, c, d = fine[4 * i], fine[4 * i + 1], fine[4 * i + 2], fine[4 * i + 3]
+                a = fine[4 * i]
+                b = fine[4 * i + 1]
+                c = fine[4 * i + 2]
+                d = fine[4 * i + 3]
                 for j in range(coarse.shape[1]):
                     largest = _ZERO
                     for k in range(4 * j, 4 * j + 4):
                         largest = max(largest, max(max(a[k], b[k]), max(c[k], d[k])))
                     coarse[i, j] = largest
-            fine, size = coarse, size * 4
+            fine = coarse
+            size = size * 4
 
 
 @intrinsic
@@ -369,13 +393,15 @@ def _fetch(typingctx, array, row, column):
     """array[row, column] for eight pairs of whole numbers >= -1, of a contiguous 2-D array."""
 
     def codegen(context, builder, sig, args):
-        whole, wide = ir.VectorType(ir.IntType(32), v8.LANES), ir.IntType(64)
+        whole = ir.VectorType(ir.IntType(32), v8.LANES)
+        wide = ir.IntType(64)
         held = context.make_array(sig.args[0])(context, builder, args[0])
         rows, columns = (
             builder.trunc(n, ir.IntType(32)) for n in cgutils.unpack_tuple(builder, held.shape)
         )
         undefined = ir.Constant(whole, ir.Undefined)
-        pitch, last = undefined, undefined
+        pitch = undefined
+        last = undefined
         size = builder.sub(builder.mul(rows, columns), ir.IntType(32)(1))
         for lane in range(v8.LANES):
             pitch = builder.insert_element(pitch, columns, ir.IntType(32)(lane))
@@ -399,7 +425,8 @@ def _fetch(typingctx, array, row, column):
 @inner()
 def _difference(before, here, after, has_before, has_after):
     """Change of the inverse depth per pixel, from those neighbours that belong to the surface."""
-    total, count = _ZERO, _ZERO
+    total = _ZERO
+    count = _ZERO
     if has_after and abs(after - here) < AGREEING * here:
         total += after - here
         count += _ONE
@@ -413,27 +440,35 @@ def _difference(before, here, after, has_before, has_after):
 def _edge_weight(x, y, width, height):
     fx = min(max(min(x, width - x) / (EDGE * width), _ZERO), _ONE)
     fy = min(max(min(y, height - y) / (EDGE * height), _ZERO), _ONE)
-    two, three = np.float32(2), np.float32(3)
+    two = np.float32(2)
+    three = np.float32(3)
     return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
 
 
 @inner()
 def _set_up(view, xs, ys, first):
     """Numbers of eight mirrored rays, those of the definition's record, and where they begin."""
-    width, height = view[11], view[12]
-    x0, y0 = v8.load(xs, first), v8.load(ys, first)
-    one, zero = v8.splat(_ONE), v8.splat(_ZERO)
-    nx, ny, nz = v8.splat(view[0]), v8.splat(view[1]), v8.splat(view[2])
+    width = view[11]
+    height = view[12]
+    x0 = v8.load(xs, first)
+    y0 = v8.load(ys, first)
+    one = v8.splat(_ONE)
+    zero = v8.splat(_ZERO)
+    nx = v8.splat(view[0])
+    ny = v8.splat(view[1])
+    nz = v8.splat(view[2])
     u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
     v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
     slope = u * nx + v * ny + nz
-    gx, gy = v8.splat(view[3]) - x0 * nz, v8.splat(view[4]) - y0 * nz
+    gx = v8.splat(view[3]) - x0 * nz
+    gy = v8.splat(view[4]) - y0 * nz
     g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.splat(np.float32(1e-9)))
     rise = slope * v8.splat(np.float32(-2))
     scale = rise * g
     bend = (one + rise * nz) / scale
     near = v8.negate(slope) / v8.splat(view[10])
-    dx, dy = gx / g, gy / g
+    dx = gx / g
+    dy = gy / g
     # A ray along an axis never gets to the other axis's next border.
     tiny = v8.splat(np.float32(1e-30))
     inverse_x = one / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
@@ -466,8 +501,11 @@ def _step(pyramid, ray, state):
     """
     x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
     t, stop, size, inverse, hidden, clean, met = state
-    zero, half, one = (v8.splat(_ZERO), v8.splat(_HALF), v8.splat(_ONE))
-    four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
+    zero = v8.splat(_ZERO)
+    half = v8.splat(_HALF)
+    one = v8.splat(_ONE)
+    four = v8.splat(np.float32(4))
+    quarter = v8.splat(np.float32(0.25))
     rows = v8.splat(np.float32(pyramid.shape[0]))
     columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
     going = v8.greater(stop, t)
@@ -488,7 +526,8 @@ def _step(pyramid, ray, state):
         v8.greater(v8.splat(np.float32(BLOCK)), size),
         v8.greater(v8.absolute(other_x) + v8.absolute(other_y), half),
     )
-    k0, k1 = near - change * t, near - change * leave
+    k0 = near - change * t
+    k1 = near - change * leave
     nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(FARTHEST))
     reached = v8.both(going, v8.at_least(surface, nearest))
     thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
@@ -514,7 +553,8 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts
     """Results of eight rays that have ended."""
     x0, y0, dx, dy, _, _, _, _, near, change, end = ray
     t, stop, _, _, _, clean, met = state
-    half, zero = v8.splat(_HALF), v8.splat(_ZERO)
+    half = v8.splat(_HALF)
+    zero = v8.splat(_ZERO)
     sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
     t = v8.select(v8.greater(met, half), t, end)
     v8.store(lanes, np.uint64(0), met)
@@ -528,13 +568,19 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts
     v8.store(lanes, np.uint64(64), scale)
     v8.store(lanes, np.uint64(72), x0)
     v8.store(lanes, np.uint64(80), y0)
-    width, height = view[11], view[12]
+    width = view[11]
+    height = view[12]
     for lane in range(8):
-        way, trust, t_last = _INFINITE, _ZERO, lanes[16 + lane]
-        x, y = lanes[72 + lane], lanes[80 + lane]
-        step_x, step_y = lanes[24 + lane], lanes[32 + lane]
+        way = _INFINITE
+        trust = _ZERO
+        t_last = lanes[16 + lane]
+        x = lanes[72 + lane]
+        y = lanes[80 + lane]
+        step_x = lanes[24 + lane]
+        step_y = lanes[32 + lane]
         if lanes[lane] > _HALF:
-            change_, near_ = lanes[40 + lane], lanes[48 + lane]
+            change_ = lanes[40 + lane]
+            near_ = lanes[48 + lane]
             way, t_last = _meet(
                 pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
             )
@@ -555,11 +601,14 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     cx = min(max(int(x0 + t * dx), 0), int(width) - 1)
     cy = min(max(int(y0 + t * dy), 0), int(height) - 1)
     here = pyramid[cy, cx]
-    left, above = max(cx - 1, 0), max(cy - 1, 0)  # a pixel is its own neighbour at the border
-    right, below = min(cx + 1, int(width) - 1), min(cy + 1, int(height) - 1)
+    left = max(cx - 1, 0)
+    above = max(cy - 1, 0)  # a pixel is its own neighbour at the border
+    right = min(cx + 1, int(width) - 1)
+    below = min(cy + 1, int(height) - 1)
     across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
     down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
-    off_x, off_y = (np.float32(cx) + _HALF - x0, np.float32(cy) + _HALF - y0)
+    off_x = np.float32(cx) + _HALF - x0
+    off_y = np.float32(cy) + _HALF - y0
     closing = -change - across * dx - down * dy
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
     meet = middle
@@ -579,7 +628,8 @@ def _run(pyramid, view, lanes, xs, ys, count, ways, trusts):
     """
     for first in range(0, count, 8):
         for spare in range(count, first + 8):
-            xs[spare], ys[spare] = xs[count - 1], ys[count - 1]
+            xs[spare] = xs[count - 1]
+            ys[spare] = ys[count - 1]
         at = np.uint64(first)
         ray, state, to_sky, scale = _set_up(view, xs, ys, at)
         for _ in range(MAX_STEPS):
@@ -612,7 +662,8 @@ def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
     for i in numba.prange(ways.shape[0]):
         lanes = np.empty(88, np.float32)
         lists = np.empty((4, columns + 8), np.float32)
-        row, count = top + i * stride, 0
+        row = top + i * stride
+        count = 0
         for j in range(columns):
             column = left + j * stride
             ways[i, j] = _INFINITE
@@ -634,7 +685,8 @@ def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
 def _to_metres(view, alpha, needed, column, row, distance, weight):
     """A row of ways (in |x|) becomes metres; only needed pixels that show water get a weight."""
     v = (np.float32(row) + _HALF - view[9]) / view[7]
-    vv, slope_v = _ONE + v * v, v * view[1] + view[2]
+    vv = _ONE + v * v
+    slope_v = v * view[1] + view[2]
     inside = 0 <= row < alpha.shape[0]
     for j in range(distance.shape[0]):
         u = (np.float32(column + j) + _HALF - view[8]) / view[6]
@@ -659,15 +711,23 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
         lanes = np.empty(88, np.float32)
         lists = np.empty((4, stride * (width + stride) + 8), np.float32)
         count = 0
-        below, deep = min(i + 1, rows - 1), min(stride, height - i * stride)
+        below = min(i + 1, rows - 1)
+        deep = min(stride, height - i * stride)
         y0 = i * stride
         for j in range(columns):
-            right, wide = min(j + 1, columns - 1), min(stride, width - j * stride)
+            right = min(j + 1, columns - 1)
+            wide = min(stride, width - j * stride)
             x0 = j * stride
-            w00, w01, w10, w11 = ways[i, j], ways[i, right], ways[below, j], ways[below, right]
-            t00, t01 = weights[i, j], weights[i, right]
-            t10, t11 = weights[below, j], weights[below, right]
-            least, most = min(min(w00, w01), min(w10, w11)), max(max(w00, w01), max(w10, w11))
+            w00 = ways[i, j]
+            w01 = ways[i, right]
+            w10 = ways[below, j]
+            w11 = ways[below, right]
+            t00 = weights[i, j]
+            t01 = weights[i, right]
+            t10 = weights[below, j]
+            t11 = weights[below, right]
+            least = min(min(w00, w01), min(w10, w11))
+            most = max(max(w00, w01), max(w10, w11))
             sure = min(min(t00, t01), min(t10, t11))
             doubt = max(max(t00, t01), max(t10, t11))
             same = sure > _ZERO or (sure == _ZERO and doubt == _ZERO)
@@ -676,8 +736,10 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
             if same or doubt < _ZERO:
                 for di in range(deep):
                     fy = np.float32(di) * part
-                    w0, w1 = w00 + (w10 - w00) * fy, w01 + (w11 - w01) * fy
-                    t0, t1 = t00 + (t10 - t00) * fy, t01 + (t11 - t01) * fy
+                    w0 = w00 + (w10 - w00) * fy
+                    w1 = w01 + (w11 - w01) * fy
+                    t0 = t00 + (t10 - t00) * fy
+                    t1 = t01 + (t11 - t01) * fy
                     for dj in range(wide):
                         fx = np.float32(dj) * part
                         way = w0 + (w1 - w0) * fx if least < _INFINITE else _INFINITE
@@ -686,10 +748,13 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
                 continue
             for di in range(deep):
                 for dj in range(wide):
-                    way, trust = w00, t00
-                    column, row = left + x0 + dj, top + y0 + di
+                    way = w00
+                    trust = t00
+                    column = left + x0 + dj
+                    row = top + y0 + di
                     if di > 0 or dj > 0:
-                        way, trust = _INFINITE, _ZERO
+                        way = _INFINITE
+                        trust = _ZERO
                         asked = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
                         if asked and _sees_water(view, alpha, column, row):
                             lists[0, count] = np.float32(column) + _HALF
@@ -699,7 +764,8 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
                     weight[y0 + di, x0 + dj] = trust
         _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
         for n in range(count):
-            x, y = int(lists[0, n]) - left, int(lists[1, n]) - top
+            x = int(lists[0, n]) - left
+            y = int(lists[1, n]) - top
             distance[y, x] = lists[2, n]
             weight[y, x] = lists[3, n]
         for y in range(y0, y0 + deep):

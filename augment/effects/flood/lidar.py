@@ -70,7 +70,8 @@ def meet_water(
     drop = origins[:, 2] - medium.level_z_m
     fall = -directions[:, 2]
     rows = np.flatnonzero((drop > 0) & (fall * ends_m > drop))
-    fall, ends = fall[rows], ends_m[rows]
+    fall = fall[rows]
+    ends = ends_m[rows]
     surface = drop[rows] / fall
     index = medium.refraction_index
     passed = 1 - reflectance(torch.from_numpy(np.minimum(fall, 1.0)), index, medium.fresnel).numpy()
@@ -92,6 +93,7 @@ def meet_flood(echoes: Echoes, medium: FloodMedium) -> None:
     echoes.codes[drowned & (echoes.ranges_m > 0)] = LOST
     ends = np.where(drowned, 0.0, echoes.ranges_m)
     water = meet_water(medium, echoes.origins, echoes.directions, ends, echoes.reflectance)
-    bed, mud = water.is_bed, ~water.is_bed
+    bed = water.is_bed
+    mud = ~water.is_bed
     echoes.see_through(water.rows[bed], water.range_m[bed], water.surface_m[bed], water.kept[bed])
     echoes.replace(water.rows[mud], water.surface_m[mud], water.reflectance[mud], SCATTERED)

@@ -37,8 +37,10 @@ from augment.render.threads import kernel_threads
 COVERED, THICKNESS_M, THICKNESS = map(
     float, (kernels.COVERED, kernels.THICKNESS_M, kernels.THICKNESS)
 )
-HIDDEN_PX, NEAR_M = float(kernels.HIDDEN_PX), float(kernels.NEAR_M)
-AGREEING, EDGE = float(kernels.AGREEING), float(kernels.EDGE)
+HIDDEN_PX = float(kernels.HIDDEN_PX)
+NEAR_M = float(kernels.NEAR_M)
+AGREEING = float(kernels.AGREEING)
+EDGE = float(kernels.EDGE)
 
 SAMPLES = 1 << 23  # that the definition looks at at a time; rays go on by at least MIN_PX
 MIN_PX = 16
@@ -84,7 +86,8 @@ def trace_screen(
         ValueError: the camera is no window of the front's.
     """
     left, top = window_offset(front.camera, camera)
-    size, device = (camera.height, camera.width), front.alpha.device
+    size = (camera.height, camera.width)
+    device = front.alpha.device
     if float(camera.centre[2]) <= level_z_m:
         distance = torch.full(size, math.inf, device=device)
         return ScreenReflection(front, distance, torch.zeros_like(distance))
@@ -113,7 +116,8 @@ def _run_kernels(
     stride: int,
     needed: Bool[Tensor, "h w"],
 ) -> tuple[Tensor, Tensor]:
-    whole, (up, image, eye_height_m) = front.camera, vertical
+    whole = front.camera
+    (up, image, eye_height_m) = vertical
     alpha = front.alpha.detach().contiguous().numpy()
     asked = needed.contiguous().numpy()
     block = kernels.BLOCK
@@ -122,7 +126,8 @@ def _run_kernels(
     numbers = (*up, *image, whole.fx, whole.fy, whole.cx, whole.cy, eye_height_m)
     numbers += (whole.width, whole.height)
     view = np.array(numbers, np.float32)
-    rows, columns = -(-camera.height // stride), -(-camera.width // stride)
+    rows = -(-camera.height // stride)
+    columns = -(-camera.width // stride)
     ways, trust = np.empty((2, rows, columns), np.float32)
     distance, weight = np.empty((2, camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
@@ -166,14 +171,17 @@ class _Rays(NamedTuple):
 def _mirrored_rays(camera: Camera, level_z_m: float, x: Tensor, y: Tensor) -> _Rays:
     """Of the pixels with centres (x, y), which see the water."""
     up, image, eye_height_m = _vertical(camera, level_z_m)
-    u, v = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    u = (x - camera.cx) / camera.fx
+    v = (y - camera.cy) / camera.fy
     slope = u * up[0] + v * up[1] + up[2]  # d_z < 0
-    gx, gy = image[0] - x * up[2], image[1] - y * up[2]
+    gx = image[0] - x * up[2]
+    gy = image[1] - y * up[2]
     g = torch.maximum(gx.abs(), gy.abs()).clamp_min(1e-9)  # 0 at the point below the eye
     scale = -2 * slope * g
     bend = (1 - 2 * slope * up[2]) / scale
     near = -slope / eye_height_m
-    step_x, step_y = gx / g, gy / g
+    step_x = gx / g
+    step_y = gy / g
     far = torch.where(bend > 0, 1 / bend, math.inf)
     back = torch.where(bend < 0, (1 - 1 / (near * NEAR_M)) / bend, math.inf)
     out_x = torch.where(gx > 0, camera.width - x, x) / step_x.abs()
@@ -188,21 +196,25 @@ def _trace(
     front: Layer, camera: Camera, level_z_m: float, left: int, top: int, needed: Bool[Tensor, "h w"]
 ) -> tuple[Tensor, Tensor]:
     """The definition: every pixel, in steps of a pixel along the ray's longer axis."""
-    whole, device = front.camera, front.alpha.device
-    alpha, depth = front.alpha.detach(), front.depth.detach()
+    whole = front.camera
+    device = front.alpha.device
+    alpha = front.alpha.detach()
+    depth = front.depth.detach()
     window = Window(left, top, left + camera.width, top + camera.height)
     cover = torch.ones(camera.height, camera.width, dtype=alpha.dtype, device=device)
     here, there = window.overlap(alpha)
     cover[there] = alpha[here]
     asked = needed & (cover < COVERED) & falling(camera, device)
     row, column = torch.nonzero(asked, as_tuple=True)
-    x, y = (column + (left + 0.5)).double(), (row + (top + 0.5)).double()
+    x = (column + (left + 0.5)).double()
+    y = (row + (top + 0.5)).double()
     rays = _mirrored_rays(whole, level_z_m, x, y)
     solid = torch.where(alpha >= 0.5, 1 / depth.double(), 0.0)
     distance = torch.full(cover.shape, math.inf, device=device)
     weight = torch.zeros_like(distance)
     way, trust = _march(rays, solid)
-    distance[row, column], weight[row, column] = way.float(), trust.float()
+    distance[row, column] = way.float()
+    weight[row, column] = trust.float()
     return distance, weight
 
 
@@ -213,7 +225,8 @@ def _march(rays: _Rays, solid: Tensor) -> tuple[Tensor, Tensor]:
     met_any = torch.zeros_like(rays.to_sky)
     hidden = torch.zeros_like(rays.x, dtype=torch.long)  # steps behind something without a break
     clean = torch.ones_like(rays.to_sky)  # never was behind anything
-    going, first = torch.arange(len(rays.x), device=solid.device), 1
+    going = torch.arange(len(rays.x), device=solid.device)
+    first = 1
     while len(going):
         count = min(max(SAMPLES // len(going), MIN_PX), max(width, height) + 2)
         r = rays.select(going[:, None])
@@ -236,9 +249,11 @@ def _march(rays: _Rays, solid: Tensor) -> tuple[Tensor, Tensor]:
         to_sky = over.gather(1, at)[:, 0] & stopped & was_clean & rays.to_sky[going]
         reach = torch.where(hits, (first + at[:, 0]).to(solid.dtype), rays.end[going])
         end_at[going] = torch.where(hits | to_sky, reach, math.nan)
-        met_any[going], clean[going] = hits, was_clean
+        met_any[going] = hits
+        clean[going] = was_clean
         hidden[going] = first + count - 1 - free[:, -1]
-        going, first = going[~stopped], first + count
+        going = going[~stopped]
+        first = first + count
     x, y = rays.pixel(end_at.nan_to_num(0), width, height)
     here = solid[y, x]
     t = torch.where(met_any, _refine(rays, solid, x, y), end_at)
@@ -262,7 +277,8 @@ def _refine(rays: _Rays, solid: Tensor, x: Tensor, y: Tensor) -> Tensor:
     here = solid[y, x]
     across = _slope(solid, here, y, x, 0, 1)
     down = _slope(solid, here, y, x, 1, 0)
-    off_x, off_y = x + 0.5 - rays.x, y + 0.5 - rays.y
+    off_x = x + 0.5 - rays.x
+    off_y = y + 0.5 - rays.y
     closing = -rays.bend * rays.near - across * rays.step_x - down * rays.step_y
     meet = (here - across * off_x - down * off_y - rays.near) / closing
     steep = rays.step_x.abs() < rays.step_y.abs()
@@ -276,9 +292,11 @@ def _slope(
     solid: Tensor, here: Tensor, row: Tensor, column: Tensor, down: int, across: int
 ) -> Tensor:
     """Change of the inverse depth per pixel along one axis."""
-    total, count = torch.zeros_like(here), torch.zeros_like(here)
+    total = torch.zeros_like(here)
+    count = torch.zeros_like(here)
     for sign in (-1, 1):
-        r, c = row + sign * down, column + sign * across
+        r = row + sign * down
+        c = column + sign * across
         inside = (r >= 0) & (r < solid.shape[0]) & (c >= 0) & (c < solid.shape[1])
         other = solid[r.clamp(0, solid.shape[0] - 1), c.clamp(0, solid.shape[1] - 1)]
         change = other - here

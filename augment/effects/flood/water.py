@@ -157,7 +157,8 @@ def _axes(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
 def point_at(layer: Layer, column: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
     """(is there a surface, vector to it [*B, 3]) at the nearest pixel of coordinates inside."""
     camera = layer.camera
-    column, row = column.clamp(0, camera.width - 1).long(), row.clamp(0, camera.height - 1).long()
+    column = column.clamp(0, camera.width - 1).long()
+    row = row.clamp(0, camera.height - 1).long()
     solid = layer.alpha[row, column] >= SOLID_ALPHA
     depth = torch.where(solid, layer.depth[row, column], 0)  # meaningless where nothing is
     x = (column + (0.5 - camera.cx)) * depth / camera.fx
@@ -185,12 +186,17 @@ def _between(
     height: int | Tensor,
 ) -> Tensor:
     """first, width, height: of the image in the flat one, of each pixel its own or one for all."""
-    x, y = (column - 0.5).clamp_min(0).clamp_max(width - 1), (row - 0.5).clamp_min(0)
+    x = (column - 0.5).clamp_min(0).clamp_max(width - 1)
+    y = (row - 0.5).clamp_min(0)
     y = y.clamp_max(height - 1)
-    c0, r0 = x.long(), y.long()
-    c1, r1 = (c0 + 1).clamp_max(width - 1), (r0 + 1).clamp_max(height - 1)
-    fc, fr = (x - c0)[..., None], (y - r0)[..., None]
-    above, below = first + r0 * width, first + r1 * width
+    c0 = x.long()
+    r0 = y.long()
+    c1 = (c0 + 1).clamp_max(width - 1)
+    r1 = (r0 + 1).clamp_max(height - 1)
+    fc = (x - c0)[..., None]
+    fr = (y - r0)[..., None]
+    above = first + r0 * width
+    below = first + r1 * width
     top = flat[above + c0] * (1 - fc) + flat[above + c1] * fc
     bottom = flat[below + c0] * (1 - fc) + flat[below + c1] * fc
     return top * (1 - fr) + bottom * fr
@@ -215,7 +221,8 @@ def blurred(
     levels: list[Tensor], column: Tensor, row: Tensor, spacing: Float[Tensor, "H W"]
 ) -> Float[Tensor, "T H W C"]:
     """Bilinear from the mip level whose pixels are `spacing` wide (pixels), blended between two."""
-    sizes, first = [], 0
+    sizes = []
+    first = 0
     for image in levels:
         sizes.append((first, image.shape[1], image.shape[0]))
         first += image.shape[0] * image.shape[1]
@@ -300,7 +307,8 @@ def tilted_normals(
     In smooth pixels the first alone counts.
     """
     dtype = surface.points.dtype
-    nx, ny = field.normal_x.to(dtype), field.normal_y.to(dtype)
+    nx = field.normal_x.to(dtype)
+    ny = field.normal_y.to(dtype)
     nz = torch.sqrt((1 - nx * nx - ny * ny).clamp_min(STEEPEST))
     horizontal = surface.to_eye[..., :2]
     # Seen straight from above the view has no horizontal direction: nothing is tilted then.
@@ -350,7 +358,10 @@ def through_the_surface(
     where it leaves the bed's image or meets a hole; the water's own colour where there is no bed
     behind the pixel, or too deep to be seen.
     """
-    camera, medium, bed, fog = water.camera, water.medium, water.bed, water.fog
+    camera = water.camera
+    medium = water.medium
+    bed = water.bed
+    fog = water.fog
     deep = _tensor(medium.rgb, normal).expand(normal.shape)
     if fog is not None:
         deep = blend_airlight(deep, fog_before(surface, water, fog), fog)
@@ -371,7 +382,8 @@ def through_the_surface(
     own_solid = own_solid & is_inside(bed.camera, own_column, own_row)
     own_solid = own_solid & (opaque < -math.log(medium.bed_cut))
     image = stacked(bed)
-    depth, colors = own_depth, bilinear(image, own_column, own_row)
+    depth = own_depth
+    colors = bilinear(image, own_column, own_row)
     if bends:
         found, met_depth, met_colors = _search(surface, ray, bed, image, own_solid, own_depth)
         depth = torch.where(found, met_depth, depth)
@@ -393,7 +405,8 @@ def _search(
         solid, point = point_at(bed, column, row)
         found = found & (~going | (is_inside(bed.camera, column, row) & solid))
         going = going & found
-        last, depth = depth, torch.where(going, _depth_below(surface, point), depth)
+        last = depth
+        depth = torch.where(going, _depth_below(surface, point), depth)
         going = going & ((depth - last).abs() > SETTLED_M)
     column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
     colors = bilinear(image, column, row)
@@ -484,7 +497,8 @@ def reflect_screen(
 
 def before_sky(seen: Float[Tensor, "*B 4"], sky: Float[Tensor, "*B 3"]) -> Tensor:
     """Premultiplied colours and alphas before a sky, which is left out where it hardly shows."""
-    color, alpha = seen[..., :3], seen[..., 3:]
+    color = seen[..., :3]
+    alpha = seen[..., 3:]
     opaque = 1 - alpha <= FAINT
     return torch.where(opaque, color / alpha.clamp_min(0.5), color + (1 - alpha) * sky)
 
@@ -493,7 +507,8 @@ def _end_in_image(
     surface: Surface, ray: Tensor, screen: ScreenReflection
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(column, row, does the image show there what the ray ends at)."""
-    layer, far = screen.layer, screen.distance.isinf()
+    layer = screen.layer
+    far = screen.distance.isinf()
     forward = _axes(layer.camera, ray)[2]
 
     def look(distance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -520,13 +535,19 @@ LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 
 def _run_kernel(water: Water) -> Tensor:
-    camera, field, screen = water.camera, water.field, water.screen
+    camera = water.camera
+    field = water.field
+    screen = water.screen
     texels, size, layered = _flat_faces(water.sky, water.fog)
     limit = smooth_variance(camera)
     axes = np.ascontiguousarray(camera.world_from_camera[:3, :3].numpy())
-    front, distance, weight = None, water.cover, water.cover
+    front = None
+    distance = water.cover
+    weight = water.cover
     if screen is not None:
-        front, distance, weight = screen.layer, screen.distance, screen.weight
+        front = screen.layer
+        distance = screen.distance
+        weight = screen.weight
     x, y, variance = map(_array, (field.normal_x, field.normal_y, field.slope_variance))
     pixels = kernels.Pixels(
         *image_coordinates(camera), axes, _array(water.cover), places_in(water.bed.camera, camera)
@@ -586,7 +607,10 @@ def _image(layer: Layer | None) -> kernels.Image:
         return kernels.Image(np.zeros(22, np.float32), nothing, nothing, nothing)
     camera = layer.camera
     rotation = camera.camera_from_world[:3, :3].numpy()
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    fx = camera.fx
+    fy = camera.fy
+    cx = camera.cx
+    cy = camera.cy
     project = rotation * [[fx], [fy], [1.0]]
     rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
     numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
@@ -599,11 +623,15 @@ def _image(layer: Layer | None) -> kernels.Image:
 def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
     if layer is None or not rough:
         return kernels.Mips(np.zeros(1, np.float32), np.zeros((1, 3), np.int64))
-    rgb, alpha = _array(layer.rgb), _array(layer.alpha)
+    rgb = _array(layer.rgb)
+    alpha = _array(layer.alpha)
     height, width = alpha.shape
-    spare, sizes, first = width + 1, [(0, width, height)], height * width
+    spare = width + 1
+    sizes = [(0, width, height)]
+    first = height * width
     while len(sizes) < MIP_LEVELS and max(height, width) > 1:
-        height, width = (height + 1) // 2, (width + 1) // 2
+        height = (height + 1) // 2
+        width = (width + 1) // 2
         sizes.append((first, width, height))
         first += height * width
     mips = np.empty((first + spare, 4), np.float32)
@@ -618,12 +646,16 @@ def _mips(layer: Layer | None, rough: bool) -> kernels.Mips:
 
 def _medium_numbers(water: Water, layered: Fog | None) -> np.ndarray:
     """`kernels.Medium`. layered: the fog before the sky."""
-    medium, eye_z = water.medium, float(water.camera.centre[2])
+    medium = water.medium
+    eye_z = float(water.camera.centre[2])
     level = medium.level_z_m
-    per_m, above, airlight = 0.0, -1.0, (0.0, 0.0, 0.0)
+    per_m = 0.0
+    above = -1.0
+    airlight = (0.0, 0.0, 0.0)
     if water.fog is not None:
         metre, height = torch.tensor([1.0, level], dtype=torch.float64)
-        per_m, airlight = float(optical_depth(water.fog, metre, eye_z, height)), water.fog.rgb
+        per_m = float(optical_depth(water.fog, metre, eye_z, height))
+        airlight = water.fog.rgb
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]

@@ -38,7 +38,8 @@ STEEPEST = 1e-6  # least square of a normal's z
 BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
 SETTLED_M = 0.01  # unless the last one was smaller
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
-MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
+MATCH_M = 0.3
+MATCH_SHARE = 0.05  # how far beside a surface a ray may end and still show it
 FAINT = 1 / 256  # a share of the sky that does not change what it shows through
 
 # ---- Mip levels ----------------------------------------------------------------------------------
@@ -60,7 +61,8 @@ def halve_mip(image, out):
     height, width, _ = image.shape
     quarter = np.float32(0.25)
     for i in prange(out.shape[0]):
-        top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
+        top = np.uint64(2 * i)
+        bottom = np.uint64(min(2 * i + 1, height - 1))
         for j in range(np.uint64(out.shape[1])):
             c0 = np.uint64(2) * j
             c1 = min(c0 + np.uint64(1), np.uint64(width - 1))
@@ -146,7 +148,10 @@ def join_alpha(alpha, behind_alpha):
 # ---- The water's colour --------------------------------------------------------------------------
 
 F = np.float32
-ZERO, HALF, ONE, SOLID = F(0), F(0.5), F(1), F(SOLID_ALPHA)
+ZERO = F(0)
+HALF = F(0.5)
+ONE = F(1)
+SOLID = F(SOLID_ALPHA)
 TINY = F(1e-7)
 STRIP = 64  # pixels of a list that are worked on at a time
 LANES = U(8)
@@ -165,7 +170,9 @@ LOW, WIDE, HIGH, SCALE = (U(56 + 16 * k) for k in range(4))
 RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(120 + 24 * k) for k in range(6))
 SCRATCH = 120 + 24 * 6
 # Where flat images begin, of eight pixels each: two mip levels, and 0.
-LOWER, UPPER, WHOLE = U(0), U(8), U(16)
+LOWER = U(0)
+UPPER = U(8)
+WHOLE = U(16)
 
 
 class View(NamedTuple):
@@ -212,13 +219,16 @@ class Medium(NamedTuple):
 def _view(n):
     project = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
     rays = (n[9], n[10], n[11], n[12], n[13], n[14], n[15], n[16], n[17])
-    width, height = U(np.int32(n[20])), U(np.int32(n[21]))
+    width = U(np.int32(n[20]))
+    height = U(np.int32(n[21]))
     return View(project, rays, n[18], n[19], n[20], n[21], width, height)
 
 
 @inner()
 def _medium(n):
-    extinction, rgb, airlight = (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[11], n[12], n[13])
+    extinction = (n[3], n[4], n[5])
+    rgb = (n[6], n[7], n[8])
+    airlight = (n[11], n[12], n[13])
     least = min(n[3], min(n[4], n[5]))
     return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, n[14], least)
 
@@ -246,7 +256,8 @@ def _squares(context, builder, sig, args):
 
 
 def _pointer_to(builder, data, indices, lane, stride, count):
-    wide, lanes = ir.IntType(64), ir.VectorType(ir.FloatType(), count)
+    wide = ir.IntType(64)
+    lanes = ir.VectorType(ir.FloatType(), count)
     at = builder.mul(builder.extract_element(indices, ir.IntType(32)(lane)), wide(stride))
     return builder.gep(data, [at]), lanes.as_pointer()
 
@@ -286,7 +297,8 @@ def _texels(typingctx, image, firsts, start, row, column, width, across, down):
                     found.append(builder.load(builder.bitcast(at, kind), align=4))
                 return _shuffled(builder, *found, [*range(16)])
 
-            own, both = [lane] * 8 + [lane + 1] * 8, []
+            own = [lane] * 8 + [lane + 1] * 8
+            both = []
             for indices, share in ((above, up), (below, down)):
                 both.append(builder.fmul(pairs(indices), _shuffled(builder, share, share, own)))
             order = [k + side for k in (lane, lane + 1) for side in (0, 8) for _ in range(4)]
@@ -341,7 +353,8 @@ def _pixels(typingctx, alpha, depth, row, column, width):
     """Two flat images at eight whole rows and columns inside them."""
 
     def codegen(context, builder, sig, args):
-        number, wide = ir.IntType(32), ir.IntType(64)
+        number = ir.IntType(32)
+        wide = ir.IntType(64)
         whole = ir.VectorType(number, v8.LANES)
         rows, columns = (builder.fptosi(arg, whole) for arg in args[2:4])
         found = [ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)] * 2
@@ -477,7 +490,10 @@ def _place(column, row, columns, rows):
 
     columns, rows: the image's sides, vectors. On the last pixels the way is 1, from those before.
     """
-    half, one, two, zero = v8.splat(HALF), v8.splat(ONE), v8.splat(F(2)), v8.splat(ZERO)
+    half = v8.splat(HALF)
+    one = v8.splat(ONE)
+    two = v8.splat(F(2))
+    zero = v8.splat(ZERO)
     x = v8.minimum(v8.maximum(column - half, zero), columns - one)
     y = v8.minimum(v8.maximum(row - half, zero), rows - one)
     c0 = v8.maximum(v8.minimum(v8.floor(x), columns - two), zero)
@@ -500,14 +516,16 @@ def _fetch(starts, column, row, rgb, alpha, view):
 @inner()
 def _choose_levels(s, starts, level, sizes):
     """The two mip levels round real ones: first pixels, sizes, scales of coordinates."""
-    low, top = v8.floor(level), v8.splat(F(np.int32(sizes.shape[0] - 1)))
+    low = v8.floor(level)
+    top = v8.splat(F(np.int32(sizes.shape[0] - 1)))
     v8.store(s, SHARE_ABOVE, level - low)
     v8.store(s, LOW, low)
     v8.store(s, LOW + LANES, v8.minimum(low + v8.splat(ONE), top))
     for k in range(U(2) * LANES):
         n = _pixel(s[LOW + k])
         starts[k] = sizes[n, 0]
-        s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[n, 1])), F(np.int32(sizes[n, 2]))
+        s[WIDE + k] = F(np.int32(sizes[n, 1]))
+        s[HIGH + k] = F(np.int32(sizes[n, 2]))
         s[SCALE + k] = ONE / F(np.int32(1) << np.int32(n))
 
 
@@ -515,7 +533,8 @@ def _choose_levels(s, starts, level, sizes):
 def _fetch_level(s, starts, second, column, row, mips):
     """Colours and alphas from one of the chosen levels; second: LANES for the upper one."""
     scale = v8.load(s, SCALE + second)
-    wide, high = v8.load(s, WIDE + second), v8.load(s, HIGH + second)
+    wide = v8.load(s, WIDE + second)
+    high = v8.load(s, HIGH + second)
     r0, c0, across, down = _place(column * scale, row * scale, wide, high)
     return _texels(mips, starts, second, r0, c0, wide, across, down)
 
@@ -524,11 +543,13 @@ def _fetch_level(s, starts, second, column, row, mips):
 def _sky(starts, faces, size, x, y, z, near, medium):
     """Colours of a flat, bordered cube map in directions that climb, behind fog."""
     zero = v8.splat(ZERO)
-    ax, ay = v8.absolute(x), v8.absolute(y)
+    ax = v8.absolute(x)
+    ay = v8.absolute(y)
     by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
     by_y = v8.at_least(ay, z)
     major = v8.select(by_x, ax, v8.select(by_y, ay, z))
-    right, ahead = v8.at_least(x, zero), v8.at_least(y, zero)
+    right = v8.at_least(x, zero)
+    ahead = v8.at_least(y, zero)
     across = v8.select(by_x, v8.select(right, v8.negate(z), z), x)
     turned = v8.select(v8.both(by_y, ahead), z, v8.select(by_y, v8.negate(z), v8.negate(y)))
     down = v8.select(by_x, v8.negate(y), turned)
@@ -549,16 +570,20 @@ def _sky(starts, faces, size, x, y, z, near, medium):
 @inner()
 def _reflectance(c, inside, medium):
     """Share of reflected light. c, inside: cosines in the air and in the water."""
-    one, n = v8.splat(ONE), v8.splat(medium.index)
+    one = v8.splat(ONE)
+    n = v8.splat(medium.index)
     if medium.schlick:
         base = (n - one) / (n + one)
         base = base * base
         x = one - c
         return base + (one - base) * ((x * x) * (x * x) * x)
-    a, b = c - n * inside, c + n * inside
-    d, e = n * c - inside, n * c + inside
+    a = c - n * inside
+    b = c + n * inside
+    d = n * c - inside
+    e = n * c + inside
     quotient = one / (b * e)
-    rs, rp = a * e * quotient, d * b * quotient
+    rs = a * e * quotient
+    rp = d * b * quotient
     return v8.splat(HALF) * (rs * rs + rp * rp)
 
 
@@ -567,16 +592,19 @@ def _facet(sx, sy, view, medium):
     """Facets with these slopes, seen from unit `view`: (normals, cosines in air and water,
     reflected share, mirrored rays).
     """
-    one, least = v8.splat(ONE), v8.splat(F(MIN_COSINE))
+    one = v8.splat(ONE)
+    least = v8.splat(F(MIN_COSINE))
     vx, vy, vz = view
     nz = one / v8.sqrt(sx * sx + sy * sy + one)
-    nx, ny = sx * nz, sy * nz
+    nx = sx * nz
+    ny = sy * nz
     cosine = nx * vx + ny * vy + nz * vz
     c = v8.minimum(v8.maximum(cosine, least), one)
     inverse = v8.splat(ONE / medium.index)
     inside = v8.sqrt(v8.maximum(one - (one - c * c) * inverse * inverse, v8.splat(ZERO)))
     twice = cosine + cosine
-    x, y = twice * nx - vx, twice * ny - vy
+    x = twice * nx - vx
+    y = twice * ny - vy
     z = v8.maximum(twice * nz - vz, least)
     unit = one / _norm(x, y, z)
     share = _reflectance(c, inside, medium)
@@ -586,9 +614,11 @@ def _facet(sx, sy, view, medium):
 @inner()
 def _refract(normal, c, inside, view, medium):
     """Refracted rays per metre of depth, and their length per metre."""
-    one, ratio = v8.splat(ONE), v8.splat(ONE / medium.index)
+    one = v8.splat(ONE)
+    ratio = v8.splat(ONE / medium.index)
     bend = c * ratio - inside
-    x, y = bend * normal[0] - view[0] * ratio, bend * normal[1] - view[1] * ratio
+    x = bend * normal[0] - view[0] * ratio
+    y = bend * normal[1] - view[1] * ratio
     z = v8.maximum(view[2] * ratio - bend * normal[2], v8.splat(F(MIN_COSINE)))
     steep = one / z
     return x * steep, y * steep, _norm(x, y, z) * steep
@@ -606,7 +636,8 @@ def _search_bed(found, depth, px, py, tx, ty, alpha, depths, bed, medium):
     """Where refracted rays meet the bed: its depth and its place in the bed's image; 1 where they
     do, else 0.
     """
-    zero, one = v8.splat(ZERO), v8.splat(ONE)
+    zero = v8.splat(ZERO)
+    one = v8.splat(ONE)
     going = found
     for _ in range(BED_STEPS):
         goes = v8.greater(going, zero)
@@ -638,8 +669,10 @@ def _own_bed(s, q, own, place, at, depth, colors, rgb, alpha):
     for k in range(LANES):
         if s[FOUND + k] == ZERO:
             pixel = U(own[place + k])
-            s[R + k], s[G + k] = rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)]
-            s[B + k], s[A + k] = rgb[U(3) * pixel + U(2)], alpha[pixel]
+            s[R + k] = rgb[U(3) * pixel]
+            s[G + k] = rgb[U(3) * pixel + U(1)]
+            s[B + k] = rgb[U(3) * pixel + U(2)]
+            s[A + k] = alpha[pixel]
             s[DEPTH + k] = q[OWN_DEPTH + at + k]
     return v8.load(s, DEPTH), v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
 
@@ -680,9 +713,12 @@ def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium):
 @inner()
 def _level(s, sizes):
     """Mip level whose pixels are as wide as a pixel's three places lie apart."""
-    c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
-    x1, y1 = (v8.load(s, MIRROR_C + U(8)) - c, v8.load(s, MIRROR_R + U(8)) - r)
-    x2, y2 = (v8.load(s, MIRROR_C + U(16)) - c, v8.load(s, MIRROR_R + U(16)) - r)
+    c = v8.load(s, MIRROR_C)
+    r = v8.load(s, MIRROR_R)
+    x1 = v8.load(s, MIRROR_C + U(8)) - c
+    y1 = v8.load(s, MIRROR_R + U(8)) - r
+    x2 = v8.load(s, MIRROR_C + U(16)) - c
+    y2 = v8.load(s, MIRROR_R + U(16)) - r
     apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
     spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
     top = F(np.int32(sizes.shape[0] - 1))
@@ -692,8 +728,11 @@ def _level(s, sizes):
 @inner()
 def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium):
     """(column, row, weight) of the image's pixels in which the first ray ends."""
-    zero, one, solid = v8.splat(ZERO), v8.splat(ONE), v8.splat(SOLID)
-    p, ray = (px, py, v8.splat(-medium.height)), _load3(s, RX, RY, RZ)
+    zero = v8.splat(ZERO)
+    one = v8.splat(ONE)
+    solid = v8.splat(SOLID)
+    p = (px, py, v8.splat(-medium.height))
+    ray = _load3(s, RX, RY, RZ)
     column, row = _project(front, _end(p, d, ray))
     a, z, c, r = _look(alpha, depth, front, column, row)
     better = v8.select(v8.at_least(a, solid), _way(front, z, c, r, p), d)
@@ -706,7 +745,8 @@ def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium):
     near = v8.both(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
     on_sky = v8.select(v8.at_least(a, solid), zero, one)
     seen = v8.select(finite, v8.select(near, one, zero), on_sky)
-    columns, rows = v8.splat(front.columns), v8.splat(front.rows)
+    columns = v8.splat(front.columns)
+    rows = v8.splat(front.rows)
     across = v8.minimum(column, columns - column) / columns
     border = v8.minimum(across, v8.minimum(row, rows - row) / rows)
     fade = _clamp(border / v8.splat(F(EDGE)), ZERO, ONE)
@@ -788,7 +828,10 @@ def _shade_row(
     i, pixels, normals, bed_image, mirror_image, mips, front_image, rays, sky, water, out
 ):
     u, v, axes, cover, in_bed = pixels
-    bed_right, bed_left, bed_down, bed_top = in_bed[0], in_bed[1], in_bed[2], in_bed[3]
+    bed_right = in_bed[0]
+    bed_left = in_bed[1]
+    bed_down = in_bed[2]
+    bed_top = in_bed[3]
     normal_x, normal_y, variance, smooth_variance = normals
     bed_view, bed_rgb, bed_alpha, bed_depth = bed_image
     mirror_view, mirror_rgb, mirror_alpha, mirror_depth = mirror_image
@@ -796,15 +839,24 @@ def _shade_row(
     mirror_mips, mirror_sizes = mips
     front_distance, front_weight = rays
     faces, size = sky
-    has_mirror, has_front = mirror_alpha.size > 0, front_alpha.size > 0
+    has_mirror = mirror_alpha.size > 0
+    has_front = front_alpha.size > 0
     width = cover.shape[1]
-    bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
+    bed = _view(bed_view)
+    mirror = _view(mirror_view)
+    front = _view(front_view)
     medium = _medium(water)
-    q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
-    places, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+    q = np.zeros(2 * STRIP * 10, np.float32)
+    s = np.zeros(SCRATCH, np.float32)
+    places = np.zeros(2 * STRIP, np.int64)
+    own = np.zeros(2 * STRIP, np.int64)
     starts = np.zeros(24, np.int64)
-    smooth_count, rough_count, j = U(0), U(0), 0
-    bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
+    smooth_count = U(0)
+    rough_count = U(0)
+    j = 0
+    bx = v[i] * axes[0, 1]
+    by = v[i] * axes[1, 1]
+    bz = v[i] * axes[2, 1]
     own_row = np.int64(np.floor((np.float64(i) + 0.5) * bed_down + bed_top))
     row_inside = own_row >= 0 and own_row < np.int64(bed.height)
     far = np.float64(F(FARTHEST))
@@ -821,7 +873,8 @@ def _shade_row(
                 continue
             spread = variance[i, j]
             if spread >= smooth_variance:
-                n, p = LIST + rough_count, U(STRIP) + rough_count
+                n = LIST + rough_count
+                p = U(STRIP) + rough_count
                 rough_count += U(1)
             else:
                 n = p = smooth_count
@@ -830,7 +883,9 @@ def _shade_row(
             q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
             q[DZ + n] = F(fall)
             q[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
-            q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
+            q[NX + n] = normal_x[i, j]
+            q[NY + n] = normal_y[i, j]
+            q[ROUGH + n] = spread
             q[OWN_DEPTH + n] = -ONE
             own[p] = 0
             column = np.int64(np.floor((np.float64(j) + 0.5) * bed_right + bed_left))
@@ -850,9 +905,13 @@ def _shade_row(
         n = rough_count if rough else smooth_count
         if n == U(0):
             break
-        base, start, taps = U(0), U(0), U(1)
+        base = U(0)
+        start = U(0)
+        taps = U(1)
         if rough:
-            base, start, taps = LIST, U(STRIP), U(3)
+            base = LIST
+            start = U(STRIP)
+            taps = U(3)
             rough_count = U(0)
         else:
             smooth_count = U(0)
@@ -863,19 +922,26 @@ def _shade_row(
                 q[at + last] = q[at + n - U(1)]
         for first in range(U(0), n, LANES):
             at = base + first
-            one, zero = v8.splat(ONE), v8.splat(ZERO)
-            dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
+            one = v8.splat(ONE)
+            zero = v8.splat(ZERO)
+            dx = v8.load(q, DX + at)
+            dy = v8.load(q, DY + at)
+            dz = v8.load(q, DZ + at)
             along = v8.load(q, ALONG + at)
-            px, py = along * dx, along * dy
+            px = along * dx
+            py = along * dy
             length = _norm(dx, dy, dz)
             inverse = one / length
-            vx, vy = v8.negate(dx) * inverse, v8.negate(dy) * inverse
+            vx = v8.negate(dx) * inverse
+            vy = v8.negate(dy) * inverse
             view = vx, vy, v8.negate(dz) * inverse
             near = v8.splat(medium.fog_per_m) * along * length
-            nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
+            nx = v8.load(q, NX + at)
+            ny = v8.load(q, NY + at)
             upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(F(STEEPEST)))
             upright = one / v8.sqrt(upright)
-            sx, sy = nx * upright, ny * upright
+            sx = nx * upright
+            sy = ny * upright
             normal, c, inside, share, ray = _facet(sx, sy, view, medium)
             # Through the surface.
             deep = _splat3(medium.rgb)
@@ -884,7 +950,9 @@ def _shade_row(
             below = deep
             own_depth = v8.load(q, OWN_DEPTH + at)
             bends = medium.index != ONE
-            tx, ty, steep = zero, zero, one / view[2]
+            tx = zero
+            ty = zero
+            steep = one / view[2]
             if bends:
                 tx, ty, steep = _refract(normal, c, inside, view, medium)
             thick = own_depth * steep * v8.splat(medium.least_extinction)
@@ -892,12 +960,22 @@ def _shade_row(
                 v8.at_least(own_depth, zero), v8.greater(v8.splat(medium.opaque), thick)
             )
             if _any(clear):
-                found, depth, colors = zero, own_depth, (zero, zero, zero, zero)
+                found = zero
+                depth = own_depth
+                colors = (zero, zero, zero, zero)
                 if bends:
                     depth, column, row, found = _search_bed(
-                        v8.select(clear, one, zero), own_depth, px, py, tx, ty,
-                        bed_alpha, bed_depth, bed, medium,
-                    )  # fmt: skip
+                        v8.select(clear, one, zero),
+                        own_depth,
+                        px,
+                        py,
+                        tx,
+                        ty,
+                        bed_alpha,
+                        bed_depth,
+                        bed,
+                        medium,
+                    )
                     colors = _fetch(starts, column, row, bed_rgb, bed_alpha, bed)
                     found = v8.select(v8.at_least(colors[3], v8.splat(SOLID)), found, zero)
                 v8.store(s, FOUND, found)
@@ -930,13 +1008,21 @@ def _shade_row(
                         )
                         _store_tap(s, tap, v8.splat(F(1 / 6)) * share, ray)
                 # What stands above the water, where the image shows it.
-                image, weight = (zero, zero, zero, zero), zero
+                image = (zero, zero, zero, zero)
+                weight = zero
                 needs_mirror = has_mirror
                 if has_front and not rough:
                     column, row, weight = _find_in_image(
-                        s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
-                        front_alpha, front_depth, front, medium,
-                    )  # fmt: skip
+                        s,
+                        v8.load(q, DISTANCE + at),
+                        v8.load(q, TRUST + at),
+                        px,
+                        py,
+                        front_alpha,
+                        front_depth,
+                        front,
+                        medium,
+                    )
                     if _any(v8.greater(weight, zero)):
                         image = _fetch(starts, column, row, front_rgb, front_alpha, front)
                     rest = _any(v8.greater(one - weight, v8.splat(TINY)))
@@ -951,7 +1037,8 @@ def _shade_row(
                     t8 = tap * LANES
                     seen = zero, zero, zero, zero
                     if needs_mirror:
-                        column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
+                        column = v8.load(s, MIRROR_C + t8)
+                        row = v8.load(s, MIRROR_R + t8)
                         if rough:
                             lower = _fetch_level(s, starts, LOWER, column, row, mirror_mips)
                             upper = _fetch_level(s, starts, UPPER, column, row, mirror_mips)
@@ -983,7 +1070,8 @@ def _shade_row(
             v8.store(s, B, sum_b)
             for k in range(min(LANES, n - first)):
                 pixel = places[start + first + k]
-                out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
+                out[i, pixel, 0] = s[R + k]
+                out[i, pixel, 1] = s[G + k]
                 out[i, pixel, 2] = s[B + k]
 
 

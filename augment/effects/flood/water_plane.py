@@ -67,7 +67,8 @@ class Margins:
         left, up, right, down = (-(-side // GRAIN) for side in dataclasses.astuple(reach))
         high = mask.shape[0] + self.top + self.bottom
         wide = mask.shape[1] + self.left + self.right
-        rows, columns = -(-high // GRAIN), -(-wide // GRAIN)
+        rows = -(-high // GRAIN)
+        columns = -(-wide // GRAIN)
         inside = np.zeros((high, wide), bool)
         inside[self.top :, self.left :][: mask.shape[0], : mask.shape[1]] = mask.cpu().numpy()
         coarse = np.pad(any_in_squares(inside, GRAIN), ((down, up), (right, left)))
@@ -124,7 +125,8 @@ def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
     Raises:
         ValueError: they are not windows of one image.
     """
-    left, top = outer.cx - inner.cx, outer.cy - inner.cy
+    left = outer.cx - inner.cx
+    top = outer.cy - inner.cy
     focal = max(abs(outer.fx / inner.fx - 1), abs(outer.fy / inner.fy - 1))
     apart = float((outer.camera_from_world - inner.camera_from_world).abs().max())
     off_grid = max(abs(left - round(left)), abs(top - round(top)))
@@ -151,7 +153,8 @@ def places_in(outer: Camera, inner: Camera) -> Float64[np.ndarray, "4"]:
             f"cameras {outer.name!r} and {inner.name!r} must be windows of one image; their poses "
             f"differ by {apart:.3g}"
         )
-    right, down = outer.fx / inner.fx, outer.fy / inner.fy
+    right = outer.fx / inner.fx
+    down = outer.fy / inner.fy
     return np.array([right, outer.cx - right * inner.cx, down, outer.cy - down * inner.cy])
 
 
@@ -179,7 +182,8 @@ def _most(slope: float, size: int, centre: float) -> float:
 
 def _span(slope: float, best: float, size: int, centre: float) -> tuple[int, int] | None:
     """First and one past the last i with slope (i + 0.5 - centre) + best > 0 in [0, size)."""
-    first, last = 0, size
+    first = 0
+    last = size
     if slope == 0:
         return (0, size) if best > 0 else None
     edge = centre - 0.5 - best / slope  # where the sum is zero
@@ -219,5 +223,6 @@ def resized(mask: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "h w"]:
 
 def mirrored_window(window: Window, camera: Camera) -> Window:
     """Where the reflections of a window's pixels stand in the mirrored camera's image."""
-    top, bottom = camera.height - window.bottom, camera.height - window.top
+    top = camera.height - window.bottom
+    bottom = camera.height - window.top
     return Window(window.left, top, window.right, bottom)

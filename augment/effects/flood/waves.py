@@ -64,7 +64,8 @@ class WaveSet:
     @property
     def tangent_factors(self) -> tuple[np.ndarray, ...]:
         """S (Dx Dx, Dx Dy, Dy Dy), k A (Dx, Dy): [N] each, see `tangents_of`."""
-        (dx, dy), bends = self.directions.T, self.steepness
+        (dx, dy) = self.directions.T
+        bends = self.steepness
         slopes = self.wavenumbers * self.amplitudes_m
         return bends * dx * dx, bends * dx * dy, bends * dy * dy, slopes * dx, slopes * dy
 
@@ -119,7 +120,8 @@ def tangents_of(
     With them the tangents are (1 - xx, -xy, gx) and (-xy, 1 - yy, gy).
     """
     factors = torch.from_numpy(np.stack(waves.tangent_factors, axis=1)).to(theta.device)
-    squeezes, slopes = weight * theta.sin() @ factors[:, :3], weight * theta.cos() @ factors[:, 3:]
+    squeezes = weight * theta.sin() @ factors[:, :3]
+    slopes = weight * theta.cos() @ factors[:, 3:]
     return torch.cat([squeezes, slopes], dim=-1)
 
 
@@ -213,7 +215,8 @@ def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m:
 # along the view: (k A)^2 (1 - w^2) (D.v)^2 / 2, v the ray's horizontal direction (as Bruneton et
 # al. 2010 split a sea into normals and a variance).
 
-FADED_PX, FULL_PX = 2.0, 4.0  # lengths in pixels at which a wave is gone, and at full height
+FADED_PX = 2.0
+FULL_PX = 4.0  # lengths in pixels at which a wave is gone, and at full height
 FARTHEST_M = 1e7  # depth beyond which a ray counts as running beside the plane
 TOUCHING_M = 1e-9  # an eye closer to the plane than this lies in it and sees nothing of it
 UPRIGHT = 1e-6  # horizontal part of a ray, at unit z, below which its direction is world x
@@ -243,14 +246,16 @@ def wave_field(
     rays = camera.ray_directions(torch.float64, device)
     away = -height / rays[..., 2]
     meets = (away > 0) & (away <= FARTHEST_M)
-    away, z = away.where(meets, 0.0), rays[..., 2].where(meets, 1.0)
+    away = away.where(meets, 0.0)
+    z = rays[..., 2].where(meets, 1.0)
     points = camera.centre[:2].to(rays.device) + away[..., None] * rays[..., :2]
     per_column, per_row = _footprint(camera, rays, away, z)
     level = rays[..., :2].norm(dim=-1, keepdim=True)
     east = torch.tensor([1.0, 0.0], dtype=torch.float64, device=device)
     view = torch.where(level >= UPRIGHT, rays[..., :2] / level.clamp_min(UPRIGHT), east)
 
-    tangents, variance = torch.zeros_like(rays[..., :1]), torch.zeros_like(away)
+    tangents = torch.zeros_like(rays[..., :1])
+    variance = torch.zeros_like(away)
     turns = turns_at(waves, camera.timestamp_ns)
     for first in range(0, len(turns), WAVES):
         some = waves.select(slice(first, first + WAVES))

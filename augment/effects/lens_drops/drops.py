@@ -32,7 +32,8 @@ RUNS_FROM_M = 1.2e-3  # radius from which a drop overcomes the glass's hold
 RUN_MPS = 3e-3  # of a drop larger than that by a millimetre
 BALANCE_MPS = 15.0  # speed of the car at which the air stream carries as strongly as gravity
 _MAX_RUN = 2.0  # times RUN_MPS
-_MEANDER_M, _MEANDER_TURN_M = 0.6e-3, 8e-3  # to the sides of a drop's way, and how long a bend is
+_MEANDER_M = 0.6e-3
+_MEANDER_TURN_M = 8e-3  # to the sides of a drop's way, and how long a bend is
 _LARGEST_SD = 2.5  # of the radii's logarithm, where their distribution ends
 _DRAWS = 12
 
@@ -70,7 +71,8 @@ class PlacedDrops:
 
 def drops_at(placed: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
     """The drops on the camera's glass at its time."""
-    own, count = placed.drops, placed.count_on(camera)
+    own = placed.drops
+    count = placed.count_on(camera)
     rng = rng_for(
         seed=placed.seed, scene=scene.name, effect="camera.lens_drops", camera=camera.name
     )
@@ -97,8 +99,10 @@ def drops_at(placed: PlacedDrops, scene: Scene, camera: Camera) -> Drops:
     extent = own.glass_m * np.array([camera.width / camera.fx, camera.height / camera.fy])
     centres_m = low + extent * units[:, 4:6]
     centres_m += _run(scene, camera, np.maximum(age_s, 0.0), radii_m, units)
-    bends = np.stack([0.14 * units[:, 8], math.tau * units[:, 9], 0.08 * units[:, 10],
-                      math.tau * units[:, 7]], -1)  # fmt: skip
+    bends = np.stack(
+        [0.14 * units[:, 8], math.tau * units[:, 9], 0.08 * units[:, 10], math.tau * units[:, 7]],
+        -1,
+    )
     contact_rad = np.radians(35 + 30 * units[:, 11])
     there = age_s >= 0
     return Drops(centres_m[there], radii_m[there], bends[there], contact_rad[there])

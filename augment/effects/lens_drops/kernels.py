@@ -18,7 +18,9 @@ def blend_drops(rgb, layer, step, margin, least, shown, mask):
     layer [h, w, 4]: light and c of cells `step` pixels wide, the picture's first after `margin`
     cells. Bilinear. All floats float32.
     """
-    half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
+    half = np.float32(0.5)
+    one = np.float32(1)
+    zero = np.float32(0)
     for i in prange(rgb.shape[0]):
         y = (np.float32(i) + half) / step + np.float32(margin) - half
         top = int(y)

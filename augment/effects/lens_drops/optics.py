@@ -35,7 +35,8 @@ from augment.sky import is_stand_in
 WATER = 1.33  # refractive index
 COVERED = 0.1  # share of a pixel's light from drops, from which the mask says so
 LEAST = 1e-3  # share from which a pixel changes
-_MAP_DEG, _MAP_REACH_DEG = 0.75, 81.0  # of the surroundings: cells, and how far from the axis
+_MAP_DEG = 0.75
+_MAP_REACH_DEG = 81.0  # of the surroundings: cells, and how far from the axis
 _CELLS_AT_ONCE = 1 << 20
 _BLUR_CELLS = 4.0  # radius of the aperture's disc in cells of the layer, if it has as many pixels
 
@@ -109,8 +110,10 @@ def draw_drops(
     margin = math.ceil(blur) + 2
     width, height = (math.ceil(side / step) + 2 * margin for side in (camera.width, camera.height))
     layer = np.zeros((height, width, 4), np.float32)
-    fx, fy = camera.fx / step, camera.fy / step
-    cx, cy = camera.cx / step + margin, camera.cy / step + margin
+    fx = camera.fx / step
+    fy = camera.fy / step
+    cx = camera.cx / step + margin
+    cy = camera.cy / step + margin
     reach = drops.radii_m * (1 + drops.bends[:, 0] + drops.bends[:, 2]) / glass_m
     at = drops.centres_m / glass_m * (fx, fy) + (cx, cy)
     windows = [
@@ -119,7 +122,8 @@ def draw_drops(
     ]
     sizes = [(y.stop - y.start) * (x.stop - x.start) for y, x in windows]
     seen = [number for number, size in enumerate(sizes) if size > 0]
-    numbers, cells = list[int](), 0
+    numbers = list[int]()
+    cells = 0
     for number in seen:
         numbers.append(number)
         cells += sizes[number]
@@ -131,7 +135,8 @@ def draw_drops(
         for window, premultiplied in zip(chosen, light, strict=True):
             layer[window] *= 1 - premultiplied[..., 3:]
             layer[window] += premultiplied
-        numbers, cells = list[int](), 0
+        numbers = list[int]()
+        cells = 0
     if blur > 0.5:
         layer = cv2.filter2D(layer, -1, _disc(blur), borderType=cv2.BORDER_CONSTANT)
     return layer, step, margin
@@ -160,12 +165,16 @@ def _drop_light(
     def of_cells(values: np.ndarray) -> np.ndarray:
         return np.repeat(values.astype(np.float32), counts, axis=0)
 
-    u, v = (columns - np.float32(cx)) / fx, (rows - np.float32(cy)) / fy
-    centres, radii_m = of_cells(drops.centres_m), of_cells(drops.radii_m)
-    right, down = u * glass_m - centres[:, 0], v * glass_m - centres[:, 1]
+    u = (columns - np.float32(cx)) / fx
+    v = (rows - np.float32(cy)) / fy
+    centres = of_cells(drops.centres_m)
+    radii_m = of_cells(drops.radii_m)
+    right = u * glass_m - centres[:, 0]
+    down = v * glass_m - centres[:, 1]
     # The rim's distance is the radius times 1 + a cos 2(t - t0) + b cos 3(t - t1), by direction t;
     # bends: a, 2 t0, b, 3 t1.
-    t, (a, t0, b, t1) = np.arctan2(down, right), of_cells(drops.bends).T
+    t = np.arctan2(down, right)
+    (a, t0, b, t1) = of_cells(drops.bends).T
     rims_m = radii_m * (1 + a * np.cos(2 * t - t0) + b * np.cos(3 * t - t1))
     rims_m = np.maximum(rims_m, np.float32(1e-12))  # radii may be below float32's least
     # A drop smaller than a cell covers its share of it.
@@ -193,7 +202,8 @@ def _refracted(
     it, the rim being at 1. contact: sine of the surface's tilt there. All [N].
     """
     length = np.sqrt(1 + u * u + v * v)
-    wx, wy = u / (WATER * length), v / (WATER * length)  # flat glass: Snell at its outer side
+    wx = u / (WATER * length)
+    wy = v / (WATER * length)  # flat glass: Snell at its outer side
     wz = np.sqrt(1 - wx * wx - wy * wy)
     away = np.hypot(right, down)
     tilt = np.minimum(away, 1) * contact
@@ -207,12 +217,15 @@ def _refracted(
     s = (WATER * inside - outside) / (WATER * inside + outside)
     p = (inside - WATER * outside) / (inside + WATER * outside)
     through = np.where(left > 0, 1 - (s * s + p * p) / 2, 0)
-    middle, wide = (len(surroundings) - 1) / 2, 1024  # OpenCV takes no row of more than 32767
+    middle = (len(surroundings) - 1) / 2
+    wide = 1024  # OpenCV takes no row of more than 32767
     columns, rows = (
-        np.resize(np.degrees(np.arctan2(along, np.maximum(z, 1e-6))) / _MAP_DEG + middle,
-                  (-(-len(u) // wide), wide)).astype(np.float32)
+        np.resize(
+            np.degrees(np.arctan2(along, np.maximum(z, 1e-6))) / _MAP_DEG + middle,
+            (-(-len(u) // wide), wide),
+        ).astype(np.float32)
         for along in (x, y)
-    )  # fmt: skip
+    )
     colors = cv2.remap(
         surroundings, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -255,7 +268,8 @@ def blend_drops(
     )
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
     found = F.grid_sample(cells.permute(2, 0, 1)[None], grid, align_corners=False)[0]
-    light, cover = found[:3].permute(1, 2, 0).clamp_min(0), found[3]
+    light = found[:3].permute(1, 2, 0).clamp_min(0)
+    cover = found[3]
     behind = (1 - cover).clamp_min(0)[..., None] * rgb.clamp_min(0).square()
     blended = torch.where((cover >= LEAST)[..., None], (behind + light).sqrt(), rgb)
     return blended, cover >= COVERED

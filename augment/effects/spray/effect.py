@@ -48,7 +48,9 @@ class PlacedSpray:
 class SprayEffect(Effect):
     """What vehicles lift from a wet road."""
 
-    name, section, model = "spray", "weather.rain", Rain
+    name = "spray"
+    section = "weather.rain"
+    model = Rain
 
     def reads_splats(self, recipe: Recipe) -> bool:
         return False
@@ -57,7 +59,8 @@ class SprayEffect(Effect):
         return (section.changes and section.spray) or None
 
     def place(self, recipe: Recipe, scene: Scene, later: Mapping[str, Placed]) -> Placed:
-        rain, why = self.of(recipe), ""
+        rain = self.of(recipe)
+        why = ""
         if rain is None or not rain.changes:
             why = "the recipe has no rain" if rain is None else "weather.rain.rate_mm_h is 0"
         elif not rain.spray:
@@ -80,7 +83,8 @@ class SprayEffect(Effect):
         )
 
     def in_view(self, own: Active, sight: Sight) -> InView:
-        puffs, camera = own.data.puffs(own.scene, sight.camera.timestamp_ns), sight.camera
+        puffs = own.data.puffs(own.scene, sight.camera.timestamp_ns)
+        camera = sight.camera
         windows = windows_of(puffs, camera)
         if not ((windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])).any():
             return InView(False, {SPRAY: "no spray can be in view"})
@@ -91,7 +95,11 @@ class SprayEffect(Effect):
         assert raster.alpha is not None and raster.expected_depth is not None
         with timed(SPRAY):
             rgb = blend_puffs(
-                *(drawn.rgb, raster.alpha, raster.expected_depth, camera, own.seen),
+                drawn.rgb,
+                raster.alpha,
+                raster.expected_depth,
+                camera,
+                own.seen,
                 glow_of(own.light).mean,
                 fog=drawn.layers.fog,
                 backend=own.backend,

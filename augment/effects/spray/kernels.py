@@ -32,12 +32,16 @@ def blend_puffs(rgb, depth, rays, puffs, windows, light, fog):
             x0 = puffs[n, 1] * v + puffs[n, 2]
             y0 = puffs[n, 4] * v + puffs[n, 5]
             z0 = puffs[n, 7] * v + puffs[n, 8]
-            cx, cy, cz = puffs[n, 9], puffs[n, 10], puffs[n, 11]
+            cx = puffs[n, 9]
+            cy = puffs[n, 10]
+            cz = puffs[n, 11]
             cc = cx * cx + cy * cy + cz * cz
             run = windows[n, 4]
             for first in range(windows[n, 2], windows[n, 3], run):
                 u = (np.float64(first) + 0.5 * run - rays[2]) / rays[0]
-                x, y, z = x0 + puffs[n, 0] * u, y0 + puffs[n, 3] * u, z0 + puffs[n, 6] * u
+                x = x0 + puffs[n, 0] * u
+                y = y0 + puffs[n, 3] * u
+                z = z0 + puffs[n, 6] * u
                 a = x * x + y * y + z * z
                 nearest = (x * cx + y * cy + z * cz) / a  # z where the ray comes closest
                 off = cc - a * nearest * nearest

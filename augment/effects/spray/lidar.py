@@ -23,11 +23,13 @@ _TOGETHER = 16  # puffs that beams are looked for together
 def spray_echoes(echoes: Echoes, puffs: Puffs, rng: np.random.Generator) -> None:
     """Echoes seen through the puffs, or lost to those of the droplets themselves."""
     count = len(echoes.ranges_m)
-    clumps, jitter = rng.standard_gamma(CLUMPS, count) / CLUMPS, rng.standard_normal(count)
+    clumps = rng.standard_gamma(CLUMPS, count) / CLUMPS
+    jitter = rng.standard_normal(count)
     rows = np.flatnonzero(beams_near(echoes, puffs))
     if not len(rows):
         return
-    origins, directions = echoes.origins[rows], echoes.directions[rows]
+    origins = echoes.origins[rows]
+    directions = echoes.directions[rows]
     ends_m = echoes.air_m[rows]
     tau, at_m = look_through(puffs, origins, directions, ends_m)
     before, _ = look_through(puffs, origins, directions, at_m)
@@ -67,7 +69,8 @@ def look_through(
     """
     tau, at_m, densest = np.zeros((3, len(ends_m)))
     for centre, whitening, extinction in zip(*puffs, strict=True):
-        ways, starts = directions @ whitening.T, (centre - origins) @ whitening.T
+        ways = directions @ whitening.T
+        starts = (centre - origins) @ whitening.T
         a = (ways * ways).sum(1)
         nearest = (ways * starts).sum(1) / a
         off = (starts * starts).sum(1) - a * nearest * nearest

@@ -27,7 +27,8 @@ from augment.render.composite import ROWS
 from augment.render.fog import Fog, optical_depth_of_arrays
 from augment.render.threads import kernel_threads
 
-_RUN_SD, _MAX_RUN = 12, 8  # runs of pixels: in standard deviations of a puff 1 / 12, and pixels
+_RUN_SD = 12
+_MAX_RUN = 8  # runs of pixels: in standard deviations of a puff 1 / 12, and pixels
 
 
 def windows_of(puffs: Puffs, camera: Camera) -> np.ndarray:
@@ -61,8 +62,10 @@ def _tangents(x: np.ndarray, z: np.ndarray, reach: np.ndarray) -> tuple[np.ndarr
     inside = b * b - a * c
     root = np.sqrt(np.maximum(inside, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = (b - root) / a, (b + root) / a
-    low, high = np.minimum(first, second), np.maximum(first, second)
+        first = (b - root) / a
+        second = (b + root) / a
+    low = np.minimum(first, second)
+    high = np.maximum(first, second)
     is_right = x - z * reach[:, 0, 1] / reach[:, 1, 1] > 0  # where it crosses z = 0
     crosses = a <= 0
     low, high = (
@@ -92,8 +95,10 @@ def blend_puffs(
     seen = (windows[:, 0] < windows[:, 1]) & (windows[:, 2] < windows[:, 3])
     if not seen.any():
         return rgb
-    puffs, windows = Puffs(*(array[seen] for array in puffs)), windows[seen]
-    numbers, before = _numbers(puffs, camera, fog), np.zeros(3)
+    puffs = Puffs(*(array[seen] for array in puffs))
+    windows = windows[seen]
+    numbers = _numbers(puffs, camera, fog)
+    before = np.zeros(3)
     if fog is not None:
         before = np.square(np.asarray(fog.rgb, np.float64))
     if kernels_for(backend, rgb, depth) == CPU and rgb.is_contiguous():
@@ -103,9 +108,14 @@ def blend_puffs(
         rays = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         with kernel_threads(ROWS):
             kernels.blend_puffs(
-                rgb.detach().numpy(), surfaces, rays, numbers, windows,
-                np.asarray(light, np.float64), before,
-            )  # fmt: skip
+                rgb.detach().numpy(),
+                surfaces,
+                rays,
+                numbers,
+                windows,
+                np.asarray(light, np.float64),
+                before,
+            )
         return rgb
     surfaces = torch.where((alpha >= 0.5) & (depth > 0), depth, torch.inf).float()
     return _blend_by_torch(rgb, surfaces, camera, numbers, windows, light, before)
@@ -113,13 +123,15 @@ def blend_puffs(
 
 def _numbers(puffs: Puffs, camera: Camera, fog: Fog | None) -> np.ndarray:
     """[N, 15], as of kernels.blend_puffs."""
-    rotation, eye = camera.camera_from_world[:3, :3].numpy(), camera.centre.numpy()
+    rotation = camera.camera_from_world[:3, :3].numpy()
+    eye = camera.centre.numpy()
     own = puffs.whitenings @ rotation.T
     offsets = puffs.centres_m - eye
     whitened = (puffs.whitenings @ offsets[:, :, None])[..., 0]
     clear = np.ones(len(own))
     if fog is not None:
-        away, heights = np.linalg.norm(offsets, axis=1), puffs.centres_m[:, 2]
+        away = np.linalg.norm(offsets, axis=1)
+        heights = puffs.centres_m[:, 2]
         clear = np.exp(-optical_depth_of_arrays(fog, away, np.full(len(own), eye[2]), heights))
     strength = math.sqrt(2 * math.pi) * puffs.extinction_per_m
     numbers = [own.reshape(-1, 9), whitened, strength[:, None], clear[:, None]]

@@ -26,13 +26,20 @@ from augment.rng import STEP_X, mix, rng_for
 from augment.scene import Actor, Scene
 
 FROM_MPS = 40 / 3.6
-_FULL_MPS, _FULL_SHARE, _MAX_SHARE = 90 / 3.6, 0.1, 0.2  # of the water, in the air
-_TYRE_M, _DROPLET_M = 0.2, 3e-4
+_FULL_MPS = 90 / 3.6
+_FULL_SHARE = 0.1
+_MAX_SHARE = 0.2  # of the water, in the air
+_TYRE_M = 0.2
+_DROPLET_M = 3e-4
 _USUAL_M = (4.5, 1.8)  # length and width of a car, by which others lift more or less
-_FLOW_M, _CROSSFALL = 5.0, 0.02  # of the road, where the water runs off
-INTERVAL_S, LIFE_S = 0.1, 3.5
-_SETTLE_S, _BORN_S = 1.2, 0.12  # in which droplets rain out, and a puff comes up
-_WAKE_SHARE, _WAKE_S = 0.35, 0.5  # of the vehicle's speed, and how soon that is gone
+_FLOW_M = 5.0
+_CROSSFALL = 0.02  # of the road, where the water runs off
+INTERVAL_S = 0.1
+LIFE_S = 3.5
+_SETTLE_S = 1.2
+_BORN_S = 0.12  # in which droplets rain out, and a puff comes up
+_WAKE_SHARE = 0.35
+_WAKE_S = 0.5  # of the vehicle's speed, and how soon that is gone
 _STEP_S = 0.25  # to either side, over which speeds are taken
 _MAX_MPS = 70.0  # what is faster has jumped
 THINNEST = 0.003  # optical depth below which a puff is left out
@@ -97,9 +104,12 @@ def spray_puffs(
 def _puffs_of(
     scene: Scene, number: int, time_ns: int, water_m: float, seed: int, wind_mps: np.ndarray
 ) -> Puffs:
-    actor, interval_ns = scene.actors[number], round(1e9 * INTERVAL_S)
-    births = np.arange((time_ns - round(1e9 * LIFE_S)) // interval_ns + 1,
-                       time_ns // interval_ns + 1) * interval_ns  # fmt: skip
+    actor = scene.actors[number]
+    interval_ns = round(1e9 * INTERVAL_S)
+    births = (
+        np.arange((time_ns - round(1e9 * LIFE_S)) // interval_ns + 1, time_ns // interval_ns + 1)
+        * interval_ns
+    )
     # A vehicle comes from where its track begins to lead, and is gone after its end.
     births = births[births <= int(actor.track.timestamps_ns[-1]) + actor.track.hold_ns]
     age_s = (time_ns - births) / 1e9
@@ -127,7 +137,8 @@ def _puffs_of(
     centres += (np.maximum(rise, 0.2) - height / 2)[:, None] * over
     centres += 0.6 * age_s[:, None] * wind_mps
     lengths = 0.3 + 0.4 * speed * INTERVAL_S + 0.9 * age_s
-    widths, heights = 0.35 * width + 0.4 * age_s, 0.25 + 0.35 * (1 - np.exp(-age_s))
+    widths = 0.35 * width + 0.4 * age_s
+    heights = 0.25 + 0.35 * (1 - np.exp(-age_s))
     scales = np.stack([lengths, widths, heights], 1)
     extinction = whole * left / ((2 * math.pi) ** 1.5 * scales.prod(1))
     axes = np.stack([ahead, aside, over], 1)

@@ -285,7 +285,8 @@ def _splat_colors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The constant colours of all Gaussians, float64 [N, 3], and their weights [N]: opacity times
     the mean over three sides of what is seen of an ellipsoid, m^2; 1 where all weigh nothing.
     """
-    colors, weights = [], []
+    colors = []
+    weights = []
     for part in scene.all_gaussians:
         colors.append(np.clip(0.5 + SH_C0 * part.sh[:, 0].detach().double().numpy(), 0, 1))
         a, b, c = part.scales.detach().double().numpy().T

@@ -21,7 +21,8 @@ from augment.timing import timed
 from recipes.schema import Recipe
 from recipes.style import Style
 
-ON_SCENE, ON_PICTURE = "style on the scene", "style on the picture"
+ON_SCENE = "style on the scene"
+ON_PICTURE = "style on the picture"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,9 @@ class PackedMaps:
 class StyleEffect(Effect):
     """The colours of an image or a preset, taken on by what stands in the weather, or by all."""
 
-    name, section, model = "style", "style", Style
+    name = "style"
+    section = "style"
+    model = Style
     folded: ClassVar = {ON_SCENE: ("style", None)}
 
     def kernels(self, section: Style) -> Hashable:

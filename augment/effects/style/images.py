@@ -46,7 +46,8 @@ def find_sky(rgb: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """
     if min(weights.shape) < _MIN_SIDE_PX:
         return np.zeros(weights.shape, bool)
-    small, small_weights = _small(rgb), _small(weights)
+    small = _small(rgb)
+    small_weights = _small(weights)
     steps = _color_steps(small)
     border = _best_border(small, small_weights, steps)
     sky = (np.arange(len(small))[:, None] < border) & (small_weights > 0)
@@ -144,7 +145,8 @@ def _is_sky(small: np.ndarray, sky: np.ndarray, steps: np.ndarray) -> bool:
 
     Numbers chosen by eye on photographs of skies and of walls, water, leaves and rooms.
     """
-    share, columns = sky.mean(), (sky.sum(0) > len(sky) // 25).mean()
+    share = sky.mean()
+    columns = (sky.sum(0) > len(sky) // 25).mean()
     if not _MIN_SHARE <= share <= 1 - _MIN_SHARE or columns < _MIN_COLUMNS:
         return False
     red, green, blue = small[sky].mean(0).tolist()
@@ -176,7 +178,9 @@ def _grown(small: np.ndarray, sky: np.ndarray, steps: np.ndarray, border: np.nda
 
 
 def _green(rgb: np.ndarray) -> np.ndarray:
-    red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    red = rgb[..., 0]
+    green = rgb[..., 1]
+    blue = rgb[..., 2]
     total = red + green + blue
     excess = 2 * green - red - blue > 0.1 * total
     return excess & (green > red) & (blue < 0.85 * green) & (total > 0.15) & (total < 2.4)
@@ -184,7 +188,8 @@ def _green(rgb: np.ndarray) -> np.ndarray:
 
 def _road(rgb: np.ndarray) -> np.ndarray:
     small = _small(rgb)
-    most, least = small.max(2), small.min(2)
+    most = small.max(2)
+    least = small.min(2)
     grey = (most - least < 0.2 * most) & (most > 0.1) & (_color_steps(small) < 0.08)
     grey[: len(grey) // 2] = False
     _, parts = cv2.connectedComponents(grey.astype(np.uint8), connectivity=4)
@@ -273,7 +278,8 @@ def _sums(image: StyleImage, parts: np.ndarray, count: int) -> np.ndarray:
 
 
 def _statistics(sums: np.ndarray, parts: list[int]) -> ColorStatistics:
-    total, own = sums[:, 0, 0].sum(), sums[parts].sum(0)
+    total = sums[:, 0, 0].sum()
+    own = sums[parts].sum(0)
     mean = own[0, 1:] / own[0, 0]
     covariance = own[1:, 1:] / own[0, 0] - np.outer(mean, mean)
     # A constant colour's variance is zero less rounding.

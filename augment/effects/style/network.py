@@ -39,7 +39,8 @@ from recipes.files import open_file
 ENCODERS = ("small", "b0")
 LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
 SMALL_CHANNELS = (16, 32, 64, 96, 96)
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 B0_WIDTH = 1280
 
 
@@ -269,7 +270,8 @@ def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
     levels = torch.stack([sample[:, :, place] for place in places], 2).clamp(-1, 2)  # [B, 3, L]
     found = [3 * (levels - 0.43).flatten(1)]
     for index in _PAIRED_LEVELS:
-        low, high = levels[:, :, index], levels[:, :, -1 - index]
+        low = levels[:, :, index]
+        high = levels[:, :, -1 - index]
         gain = 1 / (high - low).clamp_min(0.25)
         found += [gain - 1.2, -gain * low]
     return torch.cat(found, dim=1)
@@ -301,7 +303,8 @@ class Gscm(nn.Module):
             nn.init.zeros_(value)
         basis = _basis()
         self.basis = nn.Buffer(basis)  # [4, k], orthonormal: how T holds a map of colours
-        self.content_p, self.style_p = nn.Parameter(basis.clone()), nn.Parameter(basis.clone())
+        self.content_p = nn.Parameter(basis.clone())
+        self.style_p = nn.Parameter(basis.clone())
         self.content_q = nn.Parameter(basis[:3].T.clone())
         self.style_q = nn.Parameter(basis[:3].T.clone())
 

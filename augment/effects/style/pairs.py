@@ -156,7 +156,8 @@ def sample_pairs(
     first = torch.randint(count, (batch,), generator=generator)
     second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
     recoloring = sample_recolorings(batch, generator)
-    first, second = first.to(photos.device), second.to(photos.device)
+    first = first.to(photos.device)
+    second = second.to(photos.device)
     one = _varied(_cut(photos[first], generator, size_px), generator)
     two = _varied(_cut(photos[second], generator, size_px), generator)
     return PairBatch(one, recoloring(one), two, recoloring(two))
@@ -186,7 +187,8 @@ def _about_grey(
     """Turn colours about the grey axis, and scale their distance from it; grey stays as it is."""
     third = torch.full((3, 3), 1 / 3)
     cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 3**0.5
-    cos, sin = hue_rad.cos()[:, None, None], hue_rad.sin()[:, None, None]
+    cos = hue_rad.cos()[:, None, None]
+    sin = hue_rad.sin()[:, None, None]
     turned = third + cos * (torch.eye(3) - third) + sin * cross  # Rodrigues' formula
     luma = torch.tensor(GREY).expand(3, 3)
     return torch.lerp(luma.expand(len(saturation), 3, 3), turned, saturation[:, None, None])
@@ -200,7 +202,8 @@ def _cut(
     centres = (1 - sides) * (2 * torch.rand((count, 2), generator=generator) - 1)
     mirrored = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
     theta = torch.zeros(count, 2, 3)
-    theta[:, 0, 0], theta[:, 1, 1] = sides[:, 0] * mirrored, sides[:, 1]
+    theta[:, 0, 0] = sides[:, 0] * mirrored
+    theta[:, 1, 1] = sides[:, 1]
     theta[:, :, 2] = centres
     theta = theta.to(photos.device)
     grid = functional.affine_grid(theta, [count, 3, size_px, size_px], align_corners=False)
@@ -275,7 +278,8 @@ def score_pairs(
     method: Method, photos: Float[Tensor, "P 3 S S"], *, repeats: int
 ) -> dict[str, float]:
     """Means of PSNR (dB) by name, of each photo under `repeats` recolourings, always the same."""
-    count, half = len(photos), photos.shape[3] // 2
+    count = len(photos)
+    half = photos.shape[3] // 2
     generator = torch.Generator().manual_seed(0)
     found: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
     for repeat in range(repeats):

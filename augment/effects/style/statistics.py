@@ -17,8 +17,12 @@ from torch import Tensor
 from augment.effects.style.color_maps import CLASSES, StyleMaps
 from augment.semantics import SemanticClass
 
-WHOLE, SKY, LAND = "whole", "sky", "land"  # land: all but the sky
-VEGETATION, ROAD, REST = "vegetation", "road", "rest"  # of the land
+WHOLE = "whole"
+SKY = "sky"
+LAND = "land"  # land: all but the sky
+VEGETATION = "vegetation"
+ROAD = "road"
+REST = "rest"  # of the land
 
 # What a Gaussian's class says of its region; every other class is of the rest.
 REGION_OF_CLASS: Mapping[SemanticClass, str] = {
@@ -116,7 +120,8 @@ LAND_LIMITS = Limits()
 # A sky is smooth: gains show its steps of 8 bits; and a plain sky (overcast) is a wish.
 SKY_LIMITS = Limits(max_gain=2.0, min_contrast=0.2)
 
-_SMALL_SHARE, _LARGE_SHARE = 0.02, 0.15  # of a picture: where a region's own map begins and is full
+_SMALL_SHARE = 0.02
+_LARGE_SHARE = 0.15  # of a picture: where a region's own map begins and is full
 _ROOM = 2.0  # standard deviations that a limited map keeps between its mean and black or white
 
 

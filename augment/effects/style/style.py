@@ -160,7 +160,8 @@ def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
 
 def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
     """The map with no gain above that of the closed forms; the mean colour goes where it went."""
-    matrix, offset = color_map[:, :3], color_map[:, 3]
+    matrix = color_map[:, :3]
+    offset = color_map[:, 3]
     u, gains, v = torch.linalg.svd(matrix)
     if float(gains.max()) <= LAND_LIMITS.max_gain:
         return color_map
@@ -223,7 +224,8 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
     found: dict[str, ColorStatistics] = {}
     for region, share in SHARES.items():
         moments: _Moments = getattr(preset, region)
-        mean, covariance = np.array(moments.mean), np.array(moments.covariance)
+        mean = np.array(moments.mean)
+        covariance = np.array(moments.covariance)
         found[region] = ColorStatistics(mean, covariance, share)
     return {WHOLE: together(tuple(found.values())), **found}
 
@@ -231,7 +233,8 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
 def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
     """The statistics of disjoint parts as one, each by its share."""
     share = sum(part.share for part in parts)
-    mean, second = np.zeros(3), np.zeros((3, 3))
+    mean = np.zeros(3)
+    second = np.zeros((3, 3))
     for part in parts:
         mean += part.share / share * part.mean
     for part in parts:
@@ -266,7 +269,10 @@ class SceneStyle:
     @cached_property
     def on_photo(self) -> PhotoStyle:
         """The maps for a photo of the scene."""
-        splats, levels, rows, marks = self.maps.splats, None, None, None
+        splats = self.maps.splats
+        levels = None
+        rows = None
+        marks = None
         others = [m for m in torch.unique(splats, dim=0) if not torch.equal(m, splats[0])]
         if self.levels is not None:
             levels = torch.nn.functional.pad(self.levels.float() / LEVELS, (1, 1))
@@ -297,7 +303,8 @@ class SceneStyle:
 
     def _mapped(self, part: PosedGaussians, backend: str) -> PosedGaussians:
         if self.folds and part.gaussians.sh is self.bare.background.sh:
-            own, sh = part.gaussians, self._folded_on_gpu if backend == CUDA else self._folded
+            own = part.gaussians
+            sh = self._folded_on_gpu if backend == CUDA else self._folded
             folded = memo_of(own).get(  # one object, of which levels of detail are made once
                 ("folded", id(sh)), lambda: dataclasses.replace(own, sh=sh)
             )
@@ -338,7 +345,8 @@ def scene_style_of(scene: Scene, style: Style) -> SceneStyle:
     def find() -> SceneStyle:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
-        sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
+        sky = style_sky(scene.sky, maps.sky)
+        levels = sky_levels(scene, maps)
         return SceneStyle(maps, sky, bare, levels, folds=style.evaluated == "sh")
 
     return memo_of(scene).get(("scene style", style, maps), find)

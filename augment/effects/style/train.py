@@ -398,8 +398,12 @@ class StyleTrainer:
         self.pool = pool
         self.step = 0
         self._features = features.to(pool.device)
-        self._steps, self._seed, self._learning_rate = steps, seed, learning_rate
-        self._weights, self._batch, self._pair_batch = weights, batch, pair_batch
+        self._steps = steps
+        self._seed = seed
+        self._learning_rate = learning_rate
+        self._weights = weights
+        self._batch = batch
+        self._pair_batch = pair_batch
         self._paired = pool.pictures() if weights["pairs"] > 0 and len(pool) > 1 else None
         self._frozen_norm = frozen_norm
         self._parameters = {n: p for n, p in net.named_parameters() if p.requires_grad}
@@ -483,7 +487,8 @@ class StyleTrainer:
         warming_up = self.is_warming_up(self.step)
         terms = paper_terms(self.net, draw, self._features, only_cycle=warming_up)
         if self._paired is not None and not warming_up:
-            generator, size_px = generator_for(self._seed, self.step, "pairs"), draw.styles.shape[2]
+            generator = generator_for(self._seed, self.step, "pairs")
+            size_px = draw.styles.shape[2]
             pairs = sample_pairs(self._paired, generator, self._pair_batch, size_px=size_px)
             weights = PAIR_WEIGHTS | {"range": self._weights["range"]}
             terms["pairs"] = weighted_sum(pair_losses(self.net, pairs), weights)
