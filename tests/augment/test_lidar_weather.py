@@ -434,7 +434,7 @@ def test_a_shallow_bed_by_hand() -> None:
     """Straight down through 2 cm: 1 - F = 0.98, exp(-2 7.5 0.02), and 2 cm of water as 2.7."""
     found = meet_water(medium(), *beams(np.array([[0.0, 0.0, 0.0]])), np.array([0.3]))
     transmitted = 1 - ((1.333 - 1) / (1.333 + 1)) ** 2
-    assert found.kept[0] == pytest.approx(transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M))
+    assert found.bed_gain[0] == pytest.approx(transmitted**2 * math.exp(-0.04 * ABSORPTION_905_PER_M))
     assert found.range_m[0] == pytest.approx(1.78 + 1.333 * 0.02)
     assert found.surface_m[0] == pytest.approx(1.78) and found.is_bed[0]
 
