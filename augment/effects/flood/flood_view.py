@@ -68,10 +68,10 @@ def find_water(
     """
     if kernels_for(backend, alpha) == CPU:
         water = np.empty(tuple(alpha.shape), np.uint8)
-        shown = np.empty(len(alpha), np.float32)
+        max_shares = np.empty(len(alpha), np.float32)
         with kernel_threads(ROWS):
-            water_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
-        return torch.from_numpy(water).view(torch.bool), float(shown.max())
+            water_kernels.find_water(*_rays(camera), alpha.detach().numpy(), max_shares, water)
+        return torch.from_numpy(water).view(torch.bool), float(max_shares.max())
     share = torch.where(falling(camera, alpha.device), 1 - alpha, 0)
     return share > 0.5, float(share.max())  # waits for the GPU: the next layers depend on it
 

@@ -31,9 +31,9 @@ from augment.effects.flood.water_kernels import (
     MATCH_SHARE,
     MIN_COSINE,
     MIN_DEPTH,
-    SETTLED_M,
+    CONVERGED_M,
     SOLID_ALPHA,
-    STEEPEST,
+    MIN_NORMAL_Z2,
 )
 from augment.effects.flood.water_plane import image_coordinates, scale_and_offset
 from augment.effects.flood.waves import WaveField
@@ -321,7 +321,7 @@ def tilted_normals(
     dtype = surface.points.dtype
     nx = field.normal_x.to(dtype)
     ny = field.normal_y.to(dtype)
-    nz = torch.sqrt((1 - nx * nx - ny * ny).clamp_min(STEEPEST))
+    nz = torch.sqrt((1 - nx * nx - ny * ny).clamp_min(MIN_NORMAL_Z2))
     horizontal = surface.to_eye[..., :2]
     # A view straight down has no horizontal direction: nothing is tilted then.
     horizontal = horizontal / horizontal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
@@ -427,7 +427,7 @@ def _search(
         is_moving = is_moving & is_found
         previous_depth = depth
         depth = torch.where(is_moving, _depth_below(surface, point), depth)
-        is_moving = is_moving & ((depth - previous_depth).abs() > SETTLED_M)
+        is_moving = is_moving & ((depth - previous_depth).abs() > CONVERGED_M)
     column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
     colors = bilinear(image, column, row)
     is_found = is_found & is_inside(bed.camera, column, row) & (colors[..., 3] >= SOLID_ALPHA)
