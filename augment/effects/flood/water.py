@@ -23,6 +23,7 @@ from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.water_kernels import (
     BED_STEPS,
+    CONVERGED_M,
     EDGE,
     FAINT,
     FARTHEST,
@@ -31,9 +32,8 @@ from augment.effects.flood.water_kernels import (
     MATCH_SHARE,
     MIN_COSINE,
     MIN_DEPTH,
-    CONVERGED_M,
-    SOLID_ALPHA,
     MIN_NORMAL_Z2,
+    SOLID_ALPHA,
 )
 from augment.effects.flood.water_plane import image_coordinates, scale_and_offset
 from augment.effects.flood.waves import WaveField

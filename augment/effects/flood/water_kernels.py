@@ -323,14 +323,14 @@ def _colors(typingctx, rgb, alpha, firsts, start, row, column, width, across, do
     """Look up like `_texels`, in a flat image of three channels and one of alpha."""
 
     def codegen(context, builder, sig, args):
-        found = _squares(context, builder, sig, args)
-        (rgb, alpha), above, below, right, down, left, up = found
+        loaded = _squares(context, builder, sig, args)
+        (rgb, alpha), above, below, right, down, left, up = loaded
         fours = []
         for lane in range(0, v8.LANES, 2):
 
             def pairs(indices, lane=lane):
                 """Return rgb of a pixel and the next one, and their alphas, for two lanes."""
-                found = []
+                loaded = []
                 for k in (lane, lane + 1):
                     at, kind = _pointer_to(builder, rgb, indices, k, 3, 4)
                     first = builder.load(builder.bitcast(at, kind), align=4)
@@ -340,8 +340,8 @@ def _colors(typingctx, rgb, alpha, firsts, start, row, column, width, across, do
                         builder.load(builder.bitcast(p, kind), align=4) for p in (at, alpha_pointer)
                     ]
                     last = _shuffled(builder, *ends, [*range(4)])
-                    found.append(_shuffled(builder, first, last, [*range(8)]))
-                return _shuffled(builder, *found, [*range(16)])
+                    loaded.append(_shuffled(builder, first, last, [*range(8)]))
+                return _shuffled(builder, *loaded, [*range(16)])
 
             order = [k + 8 * (n in (3, 4, 5, 7)) for k in (lane, lane + 1) for n in range(8)]
             sides = [[0, 1, 2, 6, 8, 9, 10, 14], [3, 4, 5, 7, 11, 12, 13, 15]]
@@ -368,7 +368,7 @@ def _pixels(typingctx, alpha, depth, row, column, width):
         int64 = ir.IntType(64)
         int_lanes = ir.VectorType(int32, v8.LANES)
         rows, columns = (builder.fptosi(arg, int_lanes) for arg in args[2:4])
-        found = [ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)] * 2
+        values = [ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)] * 2
         arrays = [
             context.make_array(kind)(context, builder, array).data
             for kind, array in zip(sig.args[:2], args[:2], strict=True)
@@ -378,8 +378,8 @@ def _pixels(typingctx, alpha, depth, row, column, width):
             at = builder.add(builder.mul(builder.zext(r, int64), args[4]), builder.zext(c, int64))
             for k, array in enumerate(arrays):
                 value = builder.load(builder.gep(array, [at]))
-                found[k] = builder.insert_element(found[k], value, int32(lane))
-        return context.make_tuple(builder, sig.return_type, found)
+                values[k] = builder.insert_element(values[k], value, int32(lane))
+        return context.make_tuple(builder, sig.return_type, values)
 
     result = types.UniTuple(v8.float8, 2)
     return result(alpha, depth, v8.float8, v8.float8, types.uint64), codegen
