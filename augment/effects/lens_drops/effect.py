@@ -1,4 +1,4 @@
-"""Drops of water on the camera's glass: the last of what stands between scene and sensor."""
+"""The effect lens drops: drops of water on the camera's glass, the last thing before the sensor."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ def moments(feature: Float[Tensor, "B C H W"]) -> tuple[Tensor, Tensor]:
 
 
 def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Of the terms that weigh something; the others may be anything.
+    """Return the weighted sum of the terms with a weight; the other terms may have any value.
 
     Raises:
         StyleError: there are none.

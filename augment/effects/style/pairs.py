@@ -158,9 +158,11 @@ def sample_pairs(
     recoloring = sample_recolorings(batch, generator)
     first = first.to(photos.device)
     second = second.to(photos.device)
-    one = _varied(_cut(photos[first], generator, size_px), generator)
-    two = _varied(_cut(photos[second], generator, size_px), generator)
-    return PairBatch(one, recoloring(one), two, recoloring(two))
+    first_photos = _varied(_cut(photos[first], generator, size_px), generator)
+    second_photos = _varied(_cut(photos[second], generator, size_px), generator)
+    return PairBatch(
+        first_photos, recoloring(first_photos), second_photos, recoloring(second_photos)
+    )
 
 
 def _varied(
@@ -177,8 +179,8 @@ def _varied(
     foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
     mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
     usual = vars(RecolorSettings()).items()
-    little = RecolorSettings(**{n: 0.0 if "share" in n else VARIED * v for n, v in usual})
-    return sample_recolorings(count, generator, little)(mixed)
+    small_settings = RecolorSettings(**{n: 0.0 if "share" in n else VARIED * v for n, v in usual})
+    return sample_recolorings(count, generator, small_settings)(mixed)
 
 
 def _about_grey(
@@ -281,12 +283,12 @@ def score_pairs(
     count = len(photos)
     half = photos.shape[3] // 2
     generator = torch.Generator().manual_seed(0)
-    found: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
+    scores: dict[str, list[float]] = {name: [] for name in ("same", "half", "below", "look")}
     for repeat in range(repeats):
-        all_of_them = sample_recolorings(count, generator)
+        recolorings = sample_recolorings(count, generator)
         for index, photo in enumerate(photos):
-            one = slice(index, index + 1)
-            look = Recoloring(all_of_them.maps[one], all_of_them.gamma[one], all_of_them.curve[one])
+            row = slice(index, index + 1)
+            look = Recoloring(recolorings.maps[row], recolorings.gamma[row], recolorings.curve[row])
             recolored = look(photo[None])[0]
             other = look(photos[(index + 1 + repeat % (count - 1)) % count][None])[0]
             for name, content, style, target in (
@@ -296,8 +298,8 @@ def score_pairs(
                 ("look", photo, other, recolored),
             ):
                 mapped = mapped_picture(method(content, style), content).clamp(0, 1)
-                found[name].append(_psnr_db(mapped, target))
-    return {name: float(np.mean(values)) for name, values in found.items()}
+                scores[name].append(_psnr_db(mapped, target))
+    return {name: float(np.mean(values)) for name, values in scores.items()}
 
 
 def network_method(net: Gscm) -> Method:

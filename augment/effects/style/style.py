@@ -1,4 +1,4 @@
-"""A scene in a style, as pictures need it: mapped parts and sky, and what lights the snow."""
+"""A scene in a style: mapped parts and sky, and the scene that lights the snow."""
 
 from __future__ import annotations
 
@@ -73,18 +73,18 @@ def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None =
         return StyleMaps(torch.eye(3, 4)[None], torch.eye(3, 4), torch.eye(3, 4))
     memo = memo_of(scene)
 
-    def find() -> StyleMaps:
+    def compute() -> StyleMaps:
         key = ("style maps of cameras", style, content_key(scene, cameras))
         return memo.get(key, lambda: _find_maps(scene, style, cameras))
 
     shared = ("style maps", style)
-    return memo.get(shared, find) if memo.known(shared) else find()
+    return memo.get(shared, compute) if memo.known(shared) else compute()
 
 
 def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
     if style.method == "gscm":
-        found = _network_map(scene, style, cameras)
-        return StyleMaps(found[None], found, found)
+        color_map = _network_map(scene, style, cameras)
+        return StyleMaps(color_map[None], color_map, color_map)
     preset = style.preset
     return closed_maps(
         content_statistics(scene, cameras, per_region=style.per_region),
@@ -109,14 +109,14 @@ def _network_map(
     picture = _style_picture(_style_image(style))
     net = _network(style.checkpoint, _stamp(style.checkpoint))
     content = content_pictures(scene, cameras)
-    found = compose(style_side(net, picture), _content_side(scene, net, content)).double()
-    if not bool(torch.isfinite(found).all()):
+    color_map = compose(style_side(net, picture), _content_side(scene, net, content)).double()
+    if not bool(torch.isfinite(color_map).all()):
         raise StyleError(
-            f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
+            f"the network gives no finite map for style image {style.image}: {color_map.tolist()}; "
             f"use another checkpoint, or method mkl"
         )
     mean = content.double().mean((0, 2, 3))
-    full = _limited(found, mean)
+    full = _limited(color_map, mean)
     # The identity at strength 0, the map at 1, straight between and beyond.
     return _limited(torch.lerp(torch.eye(3, 4).double(), full, style.strength), mean).float()
 
@@ -140,11 +140,11 @@ def _network(path: str | None, _stamp: tuple[int, int]) -> Gscm:
 
 
 def _stamp(path: str | None) -> tuple[int, int]:
-    """What changes with a file; of one that is not there, nothing: reading it says so."""
+    """Return a stamp that changes with a file; (0, 0) without a file, which reading reports."""
     if path is None or not Path(path).is_file():
         return (0, 0)
-    found = Path(path).stat()
-    return (found.st_mtime_ns, found.st_size)
+    status = Path(path).stat()
+    return (status.st_mtime_ns, status.st_size)
 
 
 def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
@@ -165,8 +165,8 @@ def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float
     u, gains, v = torch.linalg.svd(matrix)
     if float(gains.max()) <= LAND_LIMITS.max_gain:
         return color_map
-    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.max_gain)) @ v
-    return torch.cat([tamed, (offset + (matrix - tamed) @ mean)[:, None]], 1)
+    limited_matrix = u @ torch.diag(gains.clamp(max=LAND_LIMITS.max_gain)) @ v
+    return torch.cat([limited_matrix, (offset + (matrix - limited_matrix) @ mean)[:, None]], 1)
 
 
 # ---- Styles that come with the package: colour statistics of a mood, in place of an image --------
@@ -198,7 +198,7 @@ class _Preset(Closed):
 
 
 def preset_statistics(name: str) -> Statistics:
-    """Of LAND, SKY and, put together from SHARES of both, WHOLE.
+    """Return the statistics of LAND and SKY, and of WHOLE, which combines SHARES of both.
 
     Raises:
         StyleError: there is no style of that name, or its file is not as it should be.
@@ -221,13 +221,13 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
         raise StyleError(str(error)) from None
     except ValidationError as error:
         raise StyleError(f"{source}: {'; '.join(readable(error))}") from None
-    found: dict[str, ColorStatistics] = {}
+    regions: dict[str, ColorStatistics] = {}
     for region, share in SHARES.items():
         moments: _Moments = getattr(preset, region)
         mean = np.array(moments.mean)
         covariance = np.array(moments.covariance)
-        found[region] = ColorStatistics(mean, covariance, share)
-    return {WHOLE: together(tuple(found.values())), **found}
+        regions[region] = ColorStatistics(mean, covariance, share)
+    return {WHOLE: together(tuple(regions.values())), **regions}
 
 
 def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
